@@ -1,0 +1,52 @@
+"""What a sensor says and what six sensors say together."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+class ImuSample(NamedTuple):
+    """One reading of one sensor, in SI units.
+
+    Attributes:
+        sensor: index into `edgepose.placements.PLACEMENTS`.
+        time_s: time of the measurement on the source's clock, seconds. Live sources map device clocks to Unix time; files keep
+            their own times.
+        quat: unit quaternion w, x, y, z, sensor frame to inertial frame I (Z up); None where the device measures no orientation.
+        acc: specific force in the sensor frame, m/s^2 (a level sensor at rest reads +9.81 on its up axis); None if absent.
+        gyr: angular rate in the sensor frame, rad/s; None if absent.
+        mag: magnetic field in the sensor frame, uT; None if absent.
+    """
+
+    sensor: int
+    time_s: float
+    quat: Quaternion | None = None
+    acc: Vector3 | None = None
+    gyr: Vector3 | None = None
+    mag: Vector3 | None = None
+
+
+class ImuFrame(NamedTuple):
+    """All six sensors at one instant of the frame clock.
+
+    Attributes:
+        index: frame number from 0, counting every tick of the clock.
+        time_s: time of the tick on the source's clock, seconds.
+        orientation: (6, 4) unit quaternions w, x, y, z, sensor to inertial (R_IS), in the order of PLACEMENTS.
+        force: (6, 3) specific force averaged over the frame, inertial frame, m/s^2: (0, 0, 9.81) at rest.
+        held: (6,) bool, True where a sensor had nothing new and its last values are repeated.
+        ready_s: time on the source's clock at which the frame's last packet had arrived (for latency), seconds.
+    """
+
+    index: int
+    time_s: float
+    orientation: NDArray[np.float64]
+    force: NDArray[np.float64]
+    held: NDArray[np.bool_]
+    ready_s: float

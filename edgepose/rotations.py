@@ -1,0 +1,191 @@
+"""All rotation arithmetic, on numpy arrays with any leading dimensions.
+
+Quaternions are w, x, y, z. `R_AB` maps vectors from frame B to frame A: `v_A = R_AB @ v_B`. Angles are radians.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def _unit(v: Array) -> Array:
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+# --- quaternions -----------------------------------------------------------------------------------------------------------
+
+
+def quat_multiply(p: ArrayLike, q: ArrayLike) -> Array:
+    """Hamilton product (..., 4): first q, then p."""
+    pw, px, py, pz = np.moveaxis(np.asarray(p, float), -1, 0)
+    qw, qx, qy, qz = np.moveaxis(np.asarray(q, float), -1, 0)
+    return np.stack(
+        [
+            pw * qw - px * qx - py * qy - pz * qz,
+            pw * qx + px * qw + py * qz - pz * qy,
+            pw * qy - px * qz + py * qw + pz * qx,
+            pw * qz + px * qy - py * qx + pz * qw,
+        ],
+        axis=-1,
+    )
+
+
+def quat_conjugate(q: ArrayLike) -> Array:
+    """Inverse of unit quaternions (..., 4)."""
+    return np.asarray(q, float) * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def quat_rotate(q: ArrayLike, v: ArrayLike) -> Array:
+    """Vectors (..., 3) turned by unit quaternions (..., 4)."""
+    q, v = np.asarray(q, float), np.asarray(v, float)
+    u = q[..., 1:]
+    t = 2.0 * np.cross(u, v)
+    return v + q[..., :1] * t + np.cross(u, t)
+
+
+def quat_continuous(q: ArrayLike) -> Array:
+    """The same rotations (T, ..., 4) with signs chosen so that neighbours in time lie on one side of the sphere."""
+    q = np.asarray(q, float)
+    flips = np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=-1, keepdims=True) < 0, -1.0, 1.0), axis=0)
+    return np.concatenate([q[:1], q[1:] * flips])
+
+
+def slerp(q0: ArrayLike, q1: ArrayLike, t: ArrayLike) -> Array:
+    """Spherical interpolation from q0 (..., 4) at t = 0 to q1 at t = 1 along the shorter arc; t broadcasts over (...)."""
+    q0 = np.asarray(q0, float)
+    return quat_multiply(q0, rotvec_to_quat(quat_to_rotvec(quat_multiply(quat_conjugate(q0), q1)) * np.asarray(t, float)[..., None]))
+
+
+def mean_rotation(quats: ArrayLike) -> Array:
+    """Mean unit quaternion (4,) of (N, 4): largest eigenvector of the sum of outer products (Markley et al. 2007)."""
+    q = np.asarray(quats, float)
+    mean: Array = np.linalg.eigh(q.T @ q)[1][:, -1]
+    return mean if mean[0] >= 0 else -mean
+
+
+def heading(q: ArrayLike) -> Array:
+    """Angle (...) of the part of unit quaternions (..., 4) that turns about the vertical axis Z (swing-twist split)."""
+    q = np.asarray(q, float)
+    return 2.0 * np.arctan2(q[..., 3], q[..., 0])
+
+
+def about_z(angle: ArrayLike) -> Array:
+    """Unit quaternions (..., 4) of turns about Z."""
+    half = np.asarray(angle, float) / 2.0
+    zero = np.zeros_like(half)
+    return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)
+
+
+# --- conversions -----------------------------------------------------------------------------------------------------------
+
+
+def quat_to_matrix(q: ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
+    w, x, y, z = np.moveaxis(np.asarray(q, float), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def matrix_to_quat(r: ArrayLike) -> Array:
+    """Unit quaternions (..., 4), w >= 0, of rotation matrices (..., 3, 3); stable for every angle (Shepperd 1978)."""
+    r = np.asarray(r, float)
+    m = {(i, j): r[..., i, j] for i in range(3) for j in range(3)}
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    # The four rows of 4 q q^T; the one with the largest diagonal has the least rounding error.
+    rows = np.stack(
+        [
+            np.stack([1 + trace, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]], -1),
+            np.stack([m[2, 1] - m[1, 2], 1 + 2 * m[0, 0] - trace, m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]], -1),
+            np.stack([m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], 1 + 2 * m[1, 1] - trace, m[1, 2] + m[2, 1]], -1),
+            np.stack([m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 1 + 2 * m[2, 2] - trace], -1),
+        ],
+        axis=-2,
+    )
+    best = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
+    q = _unit(np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :])
+    return np.where(q[..., :1] < 0, -q, q)
+
+
+def rotvec_to_quat(v: ArrayLike) -> Array:
+    """Unit quaternions (..., 4) of axis-angle vectors (..., 3), radians."""
+    v = np.asarray(v, float)
+    angle = np.linalg.norm(v, axis=-1, keepdims=True)
+    return np.concatenate([np.cos(angle / 2), 0.5 * np.sinc(angle / (2 * np.pi)) * v], axis=-1)
+
+
+def quat_to_rotvec(q: ArrayLike) -> Array:
+    """Axis-angle vectors (..., 3) of unit quaternions (..., 4); angles from 0 to pi."""
+    q = np.asarray(q, float)
+    q = np.where(q[..., :1] < 0, -q, q)
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, q[..., :1])
+    small = sine < 1e-12
+    return q[..., 1:] * np.where(small, 2.0, angle / np.where(small, 1.0, sine))
+
+
+def rotvec_to_matrix(v: ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) of axis-angle vectors (..., 3)."""
+    return quat_to_matrix(rotvec_to_quat(v))
+
+
+def matrix_to_rotvec(r: ArrayLike) -> Array:
+    """Axis-angle vectors (..., 3) of rotation matrices (..., 3, 3)."""
+    return quat_to_rotvec(matrix_to_quat(r))
+
+
+def about_axis(axis: str, angle: ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) of turns about one coordinate axis, `axis` one of "x", "y", "z"."""
+    direction = np.zeros(3)
+    direction["xyz".index(axis)] = 1.0
+    return rotvec_to_matrix(np.asarray(angle, float)[..., None] * direction)
+
+
+def euler_to_matrix(angles: ArrayLike, order: str) -> Array:
+    """Rotation matrices (..., 3, 3) of angles (..., len(order)) multiplied in the written order: "zyx" is Rz Ry Rx."""
+    angles = np.asarray(angles, float)
+    result = about_axis(order[0], angles[..., 0])
+    for i, axis in enumerate(order[1:], start=1):
+        result = result @ about_axis(axis, angles[..., i])
+    return result
+
+
+# --- matrices --------------------------------------------------------------------------------------------------------------
+
+
+def transpose(r: Array) -> Array:
+    """Inverse of rotation matrices (..., 3, 3)."""
+    return np.swapaxes(r, -1, -2)
+
+
+def angle_between(a: ArrayLike, b: ArrayLike) -> Array:
+    """Geodesic distance (...) between rotation matrices (..., 3, 3), from 0 to pi."""
+    # The chord ||A - B||_F = 2 sqrt(2) sin(angle / 2) keeps its precision at small angles, where arccos of the trace does not.
+    chord = np.linalg.norm(np.asarray(a, float) - np.asarray(b, float), axis=(-2, -1))
+    return 2.0 * np.arcsin(np.clip(chord / np.sqrt(8.0), 0.0, 1.0))
+
+
+def nearest_rotation(m: ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) nearest to any matrices in the Frobenius norm (SVD, determinant kept at +1)."""
+    u, _, vt = np.linalg.svd(np.asarray(m, float))
+    u[..., :, -1] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return u @ vt
+
+
+def minimal_rotation(a: ArrayLike, b: ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) with the smallest angle that turn directions a (..., 3) to b.
+
+    Raises:
+        ValueError: a and b point in opposite directions, where the smallest turn is not unique.
+    """
+    a, b = _unit(np.asarray(a, float)), _unit(np.asarray(b, float))
+    w = 1.0 + np.sum(a * b, axis=-1, keepdims=True)
+    if np.any(w < 1e-9):
+        raise ValueError("directions are opposite: the smallest rotation between them is not unique")
+    return quat_to_matrix(_unit(np.concatenate([w, np.cross(a, b)], axis=-1)))
