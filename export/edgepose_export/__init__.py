@@ -1,0 +1,1 @@
+"""Where edgepose models come from: motion capture, synthesis, training, export."""

@@ -1,0 +1,1 @@
+"""Wire formats of body-worn IMUs, byte for byte."""
