@@ -1,35 +1,46 @@
 """The body that is posed: SMPL's 24 joints, a default body from a wearer's height, forward kinematics.
 
-Body frame T is SMPL's: X to the wearer's left, Y up, Z forward. In the zero pose (T-pose) every bone frame equals T.
+Body frame T is SMPL's: X to the wearer's left, Y up, Z forward. In the zero pose (T-pose) every bone frame
+equals T.
 """
 
 from __future__ import annotations
 
+import json
+from functools import cache
+from importlib import resources
+from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from edgepose.errors import EdgeposeError
 
 Array = NDArray[np.float64]
 
 JOINTS = (
-    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle", "spine3",
-    "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder", "right_shoulder", "left_elbow",
-    "right_elbow", "left_wrist", "right_wrist", "left_hand", "right_hand",
+    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle",
+    "right_ankle", "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head",
+    "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
+    "left_hand", "right_hand",
 )  # fmt: skip
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
 
 PREDICTED = (1, 2, 3, 4, 5, 6, 9, 12, 13, 14, 15, 16, 17, 18, 19)
-"""Joints that a network predicts (DIP 3.4); feet, toes, wrists and hands stay at rest, joint 0 is measured."""
+"""Joints that a network predicts (DIP 3.4); feet, toes, wrists, hands stay at rest, joint 0 is measured."""
 
 UNOBSERVED = (1, 2, 3, 6, 9, 12, 13, 14, 16, 17)
 """Predicted joints whose bones carry no sensor."""
 
 
-def forward_kinematics(local: ArrayLike, offsets: ArrayLike, translation: ArrayLike | None = None) -> tuple[Array, Array]:
+def forward_kinematics(
+    local: ArrayLike, offsets: ArrayLike, translation: ArrayLike | None = None
+) -> tuple[Array, Array]:
     """Global joint rotations and positions of a posed body.
 
     Args:
         local: (..., 24, 3, 3) rotation of each joint against its parent; joint 0 against the body frame T.
-        offsets: (24, 3) joint position minus its parent's in the zero pose, metres; row 0 is the pelvis itself.
+        offsets: (24, 3) joint position minus its parent's in the zero pose, metres; row 0 the pelvis itself.
         translation: (..., 3) added to all positions, metres.
 
     Returns:
@@ -47,8 +58,62 @@ def forward_kinematics(local: ArrayLike, offsets: ArrayLike, translation: ArrayL
 
 
 def local_from_global(rotations: ArrayLike) -> Array:
-    """Local rotations (..., 24, 3, 3) of global ones: the inverse of the rotation part of `forward_kinematics`."""
+    """Local rotations (..., 24, 3, 3) of global ones: undoes the rotations of `forward_kinematics`."""
     rotations = np.asarray(rotations, float)
     local = np.swapaxes(rotations[..., list(PARENTS), :, :], -1, -2) @ rotations
     local[..., 0, :, :] = rotations[..., 0, :, :]
     return local
+
+
+# --- the default body ------------------------------------------------------------------------------------
+
+MIN_HEIGHT, MAX_HEIGHT = 0.8, 2.5
+"""Statures, metres, that `default_body` believes; others are slips, mostly centimetres given for metres."""
+
+
+class Body(NamedTuple):
+    """Bone lengths of one wearer and the points on the skin where virtual sensors sit, metres."""
+
+    offsets: Array
+    """(24, 3) joint position minus its parent's in the zero pose, axes of T; row 0, the pelvis, is zero."""
+    sensors: Array
+    """(6, 3) sensor position minus the carrying joint's, in that bone's frame, in the order of PLACEMENTS."""
+    height_m: float
+    """Stature, crown to sole, metres."""
+
+
+@cache
+def _table() -> dict[str, Any]:
+    text = resources.files("edgepose").joinpath("body.json").read_text(encoding="utf-8")
+    table: dict[str, Any] = json.loads(text)
+    return table
+
+
+def default_body(height_m: float = 1.75, sex: str = "neutral") -> Body:
+    """An average body of a stature in metres; `sex` is "neutral", "male" or "female".
+
+    Linear between the statures of `body.json`, scaled in proportion beyond them.
+
+    Raises:
+        EdgeposeError: a stature that no wearer has, or an unknown sex.
+    """
+    table = _table()
+    if sex not in table["sexes"]:
+        raise EdgeposeError(f"unknown sex {sex!r}: use one of {', '.join(table['sexes'])}")
+    if not MIN_HEIGHT <= height_m <= MAX_HEIGHT:  # also true of NaN
+        limits = f"{MIN_HEIGHT} and {MAX_HEIGHT} m"
+        raise EdgeposeError(
+            f"height {height_m:g} m is not between {limits}: give the wearer's height in metres"
+        )
+    statures = np.array(table["statures"], float)
+    inside = float(np.clip(height_m, statures[0], statures[-1]))
+    i = int(np.clip(np.searchsorted(statures, inside) - 1, 0, len(statures) - 2))
+    t = (inside - statures[i]) / (statures[i + 1] - statures[i])
+
+    def at(rows: Any) -> Array:
+        low, high = np.array(rows[i], float), np.array(rows[i + 1], float)
+        blend: Array = ((1 - t) * low + t * high) * (height_m / inside)
+        return blend
+
+    body = table["sexes"][sex]
+    return Body(at(body["offsets"]), at(body["sensors"]), float(height_m))

