@@ -1,0 +1,479 @@
+"""The native packet of self-built sensors, serial form: COBS(body + CRC-16) + 00.
+
+Layouts are in README.md next to this file; `c/edgepose_packet.h` is the sender for firmware. Everything is
+little-endian.
+"""
+
+from __future__ import annotations
+
+import struct
+from binascii import crc_hqx
+from collections.abc import Iterable
+from dataclasses import dataclass
+from math import floor, isfinite, sqrt
+from typing import NamedTuple
+
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+DATA_TYPE = 0x11
+"""First body byte of a measurement: version 1 in the high half, type 1 in the low half."""
+
+INFO_TYPE = 0x12
+"""First body byte of a description of a sensor: version 1, type 2."""
+
+FRAMES = ("unknown", "ENU", "NWU", "NED", "Z-up")
+"""Inertial frames of quaternions; the index is the code on the wire. "Z-up" has an arbitrary heading."""
+
+MAX_FIRMWARE = 32
+"""Longest firmware string of an INFO packet, bytes."""
+
+MAX_BODY = 66
+"""Longest body, bytes: header, every block, vectors as floats."""
+
+MAX_FRAME = MAX_BODY + 2 + 1
+"""Longest frame without its closing 00, bytes: body, CRC, one byte that COBS adds."""
+
+
+class Packet(NamedTuple):
+    """One measurement of one sensor, SI units, in the sensor frame. Absent quantities are None.
+
+    Attributes:
+        sensor_id: 0..255.
+        seq: counter of this sensor's packets, wraps at 65536.
+        t_us: device clock at the measurement, microseconds, wraps at 2^32.
+        quat: unit quaternion w, x, y, z, sensor to inertial frame.
+        acc: specific force, m/s^2.
+        gyr: angular rate, rad/s.
+        mag: magnetic field, uT.
+        temperature: degC.
+        battery: charge in percent (0..100) and eight status bits whose meaning is up to the device.
+    """
+
+    sensor_id: int
+    seq: int
+    t_us: int
+    quat: Quaternion | None = None
+    acc: Vector3 | None = None
+    gyr: Vector3 | None = None
+    mag: Vector3 | None = None
+    temperature: float | None = None
+    battery: tuple[int, int] | None = None
+
+
+class Info(NamedTuple):
+    """What a sensor says about itself, every few seconds.
+
+    Attributes:
+        sensor_id: 0..255.
+        firmware: name and version, printable ASCII, at most MAX_FIRMWARE characters.
+        segment: SMPL joint (0..23) whose bone carries the sensor; None if the device does not know.
+        frame: inertial frame of its quaternions, one of FRAMES.
+        rate_hz: packets a second, steps of 0.1 up to 6553.5; 0 if unknown.
+    """
+
+    sensor_id: int
+    firmware: str
+    segment: int | None = None
+    frame: str = "unknown"
+    rate_hz: float = 0.0
+
+
+@dataclass
+class Counters:
+    """What a decoder has seen since it was made.
+
+    Attributes:
+        bytes: bytes fed.
+        packets: measurements returned.
+        infos: INFO packets kept.
+        bad_frames: frames that are too short, too long or not COBS.
+        bad_crc: frames whose checksum is wrong.
+        rejected: intact frames with a content that is not allowed.
+        resyncs: times a good packet followed one or more bad frames.
+        lost: packets missing from the sequences.
+        late: packets dropped as duplicates or older than the last one of their sensor.
+        restarts: times a sensor's sequence and clock began anew, or paused too long to count what is missing.
+    """
+
+    bytes: int = 0
+    packets: int = 0
+    infos: int = 0
+    bad_frames: int = 0
+    bad_crc: int = 0
+    rejected: int = 0
+    resyncs: int = 0
+    lost: int = 0
+    late: int = 0
+    restarts: int = 0
+
+
+# --- framing --------------------------------------------------------------------------------------
+
+
+def cobs_encode(data: bytes) -> bytes:
+    """Consistent Overhead Byte Stuffing: the same bytes without any 00, and without the closing 00."""
+    out = bytearray()
+    runs = data.split(b"\0")
+    for last, run in zip([False] * (len(runs) - 1) + [True], runs, strict=True):
+        start = 0
+        while len(run) - start >= 254:
+            out.append(255)
+            out += run[start : start + 254]
+            start += 254
+        # A full block stands for no 00, so the end of the data after one needs no code byte of its own.
+        if not last or start < len(run) or not start:
+            out.append(len(run) - start + 1)
+            out += run[start:]
+    return bytes(out)
+
+
+def cobs_decode(data: bytes) -> bytes:
+    """Inverse of `cobs_encode`.
+
+    Raises:
+        ValueError: data contains a 00 or ends inside a block.
+    """
+    if 0 in data:
+        raise ValueError("COBS data contains a zero byte")
+    out = bytearray(data)
+    after_full = []
+    code_at, end = 0, len(data)
+    while code_at < end:
+        code = data[code_at]
+        out[code_at] = 0
+        code_at += code
+        if code == 255:
+            after_full.append(code_at)
+    if code_at > end:
+        raise ValueError("COBS data ends inside a block")
+    # Each code byte stands for a 00, except the first one and those behind a full block.
+    for code_at in reversed(after_full):
+        del out[code_at : code_at + 1]
+    return bytes(out[1:])
+
+
+# --- bodies ---------------------------------------------------------------------------------------
+
+_HEADER = "<BBHHI"
+_INFO = struct.Struct("<BBBBHB")
+
+_QUAT, _ACC, _GYR, _MAG = 0x001, 0x002, 0x004, 0x008
+_TEMPERATURE = 0x010
+_QUAT_F, _ACC_F, _GYR_F, _MAG_F = 0x020, 0x040, 0x080, 0x100
+_BATTERY = 0x200
+
+_QUAT_SCALE, _ACC_SCALE, _GYR_SCALE, _MAG_SCALE, _TEMPERATURE_SCALE = 32767, 100, 900, 10, 100
+_NO_SEGMENT = 255
+
+_BLOCKS = ("4h", "3h", "3h", "3h", "h", "4f", "3f", "3f", "3f", "BB")  # in the order of the mask bits
+
+# 324 masks are legal: known bits only, and no quantity in both forms.
+_LAYOUTS = {
+    mask: struct.Struct(_HEADER + "".join(block for bit, block in enumerate(_BLOCKS) if mask >> bit & 1))
+    for mask in range(1 << len(_BLOCKS))
+    if not mask & mask >> 5 & 0xF
+}
+
+
+def _fixed(values: Iterable[float], scale: int) -> list[int]:
+    """Values times scale as int16: to the nearest, halves away from zero, held at the ends of the range."""
+    result = []
+    for value in values:
+        if not isfinite(value):
+            raise ValueError(f"cannot send {value}")
+        # Firmware has binary32 floats: round to one first, so that both sides see the same ties. Its product
+        # with the scale has at most 39 bits and is exact here; the bound keeps huge values inside binary32.
+        (single,) = struct.unpack("<f", struct.pack("<f", min(max(value, -1e6), 1e6)))
+        size = floor(abs(single) * scale + 0.5)
+        result.append(min(size, 32767) if single > 0 else -min(size, 32768))
+    return result
+
+
+def _finite(values: Iterable[float]) -> list[float]:
+    values = list(values)
+    if not all(map(isfinite, values)):
+        raise ValueError(f"cannot send {values}")
+    return values
+
+
+def encode_body(packet: Packet, *, floats: bool = False) -> bytes:
+    """Body of a measurement without CRC and framing.
+
+    Args:
+        packet: quantities beyond the range of int16 are held at its ends, a battery charge at 0 and 100.
+        floats: send vectors and quaternion as binary32 instead of int16.
+
+    Raises:
+        ValueError: a quantity is NaN, infinite or too large for binary32, or a whole number does not fit.
+    """
+    mask = 0
+    values: list[float] = []
+    tail: list[float] = []
+    for bit, scale, vector in (
+        (_QUAT, _QUAT_SCALE, packet.quat),
+        (_ACC, _ACC_SCALE, packet.acc),
+        (_GYR, _GYR_SCALE, packet.gyr),
+        (_MAG, _MAG_SCALE, packet.mag),
+    ):
+        if vector is None:
+            continue
+        if floats:
+            mask |= bit << 5
+            tail += _finite(vector)
+        else:
+            mask |= bit
+            values += _fixed(vector, scale)
+    if packet.temperature is not None:
+        mask |= _TEMPERATURE
+        values += _fixed([packet.temperature], _TEMPERATURE_SCALE)
+    if packet.battery is not None:
+        percent, status = packet.battery
+        mask |= _BATTERY
+        tail += [min(max(percent, 0), 100), status]
+    try:
+        return _LAYOUTS[mask].pack(DATA_TYPE, packet.sensor_id, mask, packet.seq, packet.t_us, *values, *tail)
+    except (struct.error, OverflowError) as error:
+        raise ValueError(f"cannot send {packet}: {error}") from None
+
+
+def encode_info_body(info: Info) -> bytes:
+    """Body of an INFO packet without CRC and framing.
+
+    Raises:
+        ValueError: a field is outside of what `Info` allows.
+    """
+    if not _is_text(info.firmware.encode("utf-8")):
+        raise ValueError(
+            f"firmware must be printable ASCII of at most {MAX_FIRMWARE} characters, not {info.firmware!r}"
+        )
+    if info.segment is not None and not 0 <= info.segment < 24:
+        raise ValueError(f"segment must be an SMPL joint from 0 to 23, not {info.segment}")
+    if info.frame not in FRAMES:
+        raise ValueError(f"frame must be one of {', '.join(FRAMES)}, not {info.frame!r}")
+    if not 0 <= info.rate_hz <= 6553.5:
+        raise ValueError(f"rate_hz must be from 0 to 6553.5, not {info.rate_hz}")
+    segment = _NO_SEGMENT if info.segment is None else info.segment
+    firmware = info.firmware.encode("ascii")
+    try:
+        head = _INFO.pack(
+            INFO_TYPE,
+            info.sensor_id,
+            segment,
+            FRAMES.index(info.frame),
+            floor(info.rate_hz * 10 + 0.5),
+            len(firmware),
+        )
+    except struct.error as error:
+        raise ValueError(f"cannot send {info}: {error}") from None
+    return head + firmware
+
+
+def frame_body(body: bytes) -> bytes:
+    """The bytes that go over the line for a body: checksum, COBS, closing 00."""
+    return cobs_encode(body + crc_hqx(body, 0xFFFF).to_bytes(2, "little")) + b"\0"
+
+
+def encode(packet: Packet, *, floats: bool = False) -> bytes:
+    """The bytes that go over the line for a measurement; see `encode_body`."""
+    return frame_body(encode_body(packet, floats=floats))
+
+
+def encode_info(info: Info) -> bytes:
+    """The bytes that go over the line for an INFO packet; see `encode_info_body`."""
+    return frame_body(encode_info_body(info))
+
+
+def decode_body(body: bytes) -> Packet | Info:
+    """Packet or Info of a body without CRC and framing. Quaternions come out with norm 1.
+
+    Raises:
+        ValueError: unknown version, type or mask bits, wrong length, or values that cannot be true.
+    """
+    kind = body[0] if body else None
+    if kind == DATA_TYPE:
+        return _decode_packet(body)
+    if kind == INFO_TYPE:
+        return _decode_info(body)
+    raise ValueError("unknown version or type")
+
+
+def _decode_packet(body: bytes) -> Packet:
+    mask = body[2] | body[3] << 8 if len(body) > 3 else -1
+    layout = _LAYOUTS.get(mask)
+    if layout is None:
+        raise ValueError("unknown field mask")
+    if layout.size != len(body):
+        raise ValueError("length does not fit the field mask")
+    v = layout.unpack(body)
+    quat: Quaternion | None = None
+    acc: Vector3 | None = None
+    gyr: Vector3 | None = None
+    mag: Vector3 | None = None
+    temperature: float | None = None
+    battery: tuple[int, int] | None = None
+    i = 5  # after the header
+    if mask & _QUAT:
+        quat = _unit(v[i], v[i + 1], v[i + 2], v[i + 3], _QUAT_SCALE)
+        i += 4
+    if mask & _ACC:
+        acc = (v[i] / _ACC_SCALE, v[i + 1] / _ACC_SCALE, v[i + 2] / _ACC_SCALE)
+        i += 3
+    if mask & _GYR:
+        gyr = (v[i] / _GYR_SCALE, v[i + 1] / _GYR_SCALE, v[i + 2] / _GYR_SCALE)
+        i += 3
+    if mask & _MAG:
+        mag = (v[i] / _MAG_SCALE, v[i + 1] / _MAG_SCALE, v[i + 2] / _MAG_SCALE)
+        i += 3
+    if mask & _TEMPERATURE:
+        temperature = v[i] / _TEMPERATURE_SCALE
+        i += 1
+    if mask & (_QUAT_F | _ACC_F | _GYR_F | _MAG_F):
+        # Sums of a few binary32 values cannot overflow here, so one is finite only if all its terms are.
+        if not isfinite(sum(v[i:])):
+            raise ValueError("NaN or infinity")
+        if mask & _QUAT_F:
+            quat = _unit(v[i], v[i + 1], v[i + 2], v[i + 3], 1)
+            i += 4
+        if mask & _ACC_F:
+            acc = v[i : i + 3]
+            i += 3
+        if mask & _GYR_F:
+            gyr = v[i : i + 3]
+            i += 3
+        if mask & _MAG_F:
+            mag = v[i : i + 3]
+            i += 3
+    if mask & _BATTERY:
+        battery = v[i:]
+        if v[i] > 100:
+            raise ValueError("battery above 100 percent")
+    return Packet(v[1], v[3], v[4], quat, acc, gyr, mag, temperature, battery)
+
+
+def _unit(w: float, x: float, y: float, z: float, one: int) -> Quaternion:
+    norm = sqrt(w * w + x * x + y * y + z * z)
+    # A sensor that is still starting sends zeros or nonsense: normalising those would invent an orientation.
+    if not 0.9 * one <= norm <= 1.1 * one:
+        raise ValueError("quaternion is not of unit length")
+    return (w / norm, x / norm, y / norm, z / norm)
+
+
+def _decode_info(body: bytes) -> Info:
+    if len(body) < _INFO.size:
+        raise ValueError("INFO packet is too short")
+    _, sensor_id, segment, frame, rate, length = _INFO.unpack_from(body)
+    firmware = body[_INFO.size :]
+    if len(firmware) != length or not _is_text(firmware):
+        raise ValueError("bad firmware string")
+    if frame >= len(FRAMES) or (segment >= 24 and segment != _NO_SEGMENT):
+        raise ValueError("unknown frame or segment")
+    return Info(
+        sensor_id,
+        firmware.decode("ascii"),
+        None if segment == _NO_SEGMENT else segment,
+        FRAMES[frame],
+        rate / 10,
+    )
+
+
+def _is_text(text: bytes) -> bool:
+    # Printable only: the string ends up on terminals and in logs.
+    return len(text) <= MAX_FIRMWARE and all(0x20 <= byte <= 0x7E for byte in text)
+
+
+# --- the stream -----------------------------------------------------------------------------------
+
+# A sequence counter can be believed if the pause between two packets is too short for it to go around at the
+# highest rate (2 kHz: 33 s) and the step is no larger than that rate allows, plus some for a coarse clock.
+_MAX_PAUSE_US = 30_000_000
+_MIN_PERIOD_US = 500
+_SLACK = 64
+_LATE_US = 1_000_000
+
+
+class Decoder:
+    """Packets out of a byte stream that may be cut anywhere, start anywhere and contain noise.
+
+    Attributes:
+        infos: the last INFO packet of each sensor id.
+        counters: what has been seen so far.
+    """
+
+    def __init__(self) -> None:
+        """Start with nothing seen."""
+        self.infos: dict[int, Info] = {}
+        self.counters = Counters()
+        self._rest = b""  # the frame under way; at most MAX_FRAME + 1 bytes, the last of a longer one
+        self._in_sync = True
+        self._last: dict[int, tuple[int, int]] = {}  # seq, t_us by sensor id
+
+    def feed(self, data: bytes) -> list[Packet]:
+        """Measurements completed by the next bytes of the stream, in the order they came."""
+        self.counters.bytes += len(data)
+        *frames, rest = (self._rest + data).split(b"\0")
+        self._rest = rest[-MAX_FRAME - 1 :]
+        packets = []
+        for frame in frames:
+            # Nothing between two 00 is legal: senders may open with a 00 to end any noise.
+            message = self._message(frame) if frame else None
+            if message is None:
+                continue
+            if not self._in_sync:
+                self._in_sync = True
+                self.counters.resyncs += 1
+            if isinstance(message, Info):
+                self.infos[message.sensor_id] = message
+                self.counters.infos += 1
+            elif self._is_new(message):
+                packets.append(message)
+                self.counters.packets += 1
+        return packets
+
+    def _message(self, frame: bytes) -> Packet | Info | None:
+        try:
+            body = cobs_decode(frame) if len(frame) <= MAX_FRAME else b""
+        except ValueError:
+            body = b""
+        if len(body) < 3:
+            self.counters.bad_frames += 1
+        elif crc_hqx(body[:-2], 0xFFFF) != body[-2] | body[-1] << 8:
+            self.counters.bad_crc += 1
+        else:
+            try:
+                return decode_body(body[:-2])
+            except ValueError:
+                self.counters.rejected += 1
+                return None
+        self._in_sync = False
+        return _at_end(frame[-MAX_FRAME:])
+
+    def _is_new(self, packet: Packet) -> bool:
+        seq, t_us = packet.seq, packet.t_us
+        last_seq, last_t = self._last.get(packet.sensor_id, (seq - 1, t_us))
+        step = (seq - last_seq) & 0xFFFF
+        pause = ((t_us - last_t + 0x80000000) & 0xFFFFFFFF) - 0x80000000
+        if -_LATE_US <= pause <= 0 and (-step) & 0xFFFF <= _SLACK:
+            self.counters.late += 1
+            return False
+        self._last[packet.sensor_id] = (seq, t_us)
+        if -_LATE_US <= pause <= _MAX_PAUSE_US and step <= _SLACK + max(pause, 0) // _MIN_PERIOD_US:
+            # A step of 0 with a new time is a sensor that does not count.
+            self.counters.lost += max(step - 1, 0)
+        else:
+            self.counters.restarts += 1
+        return True
+
+
+def _at_end(frame: bytes) -> Packet | Info | None:
+    """The packet at the end of a bad frame, where noise or a packet without its 00 ran into it, or None."""
+    # The first body byte is known, which leaves few places to try.
+    for start in range(len(frame) - 2):
+        if frame[start + 1] in (DATA_TYPE, INFO_TYPE):
+            try:
+                body = cobs_decode(frame[start:])
+                if crc_hqx(body[:-2], 0xFFFF) == int.from_bytes(body[-2:], "little"):
+                    return decode_body(body[:-2])
+            except ValueError:
+                continue
+    return None
