@@ -228,8 +228,8 @@ def read_smpl(path: str | Path) -> Body:
     """The body of an SMPL model file, .npz or .pkl, that the user has a licence for.
 
     Joints are the file's `J`, or `J_regressor @ v_template`. Stature is the height of `v_template`, or
-    follows from the bones. Sensor points are the default body's, scaled with the bones. No code in the file is
-    run.
+    follows from the bones. Sensor points are the default body's, scaled with the bones. No code in the file
+    is run.
 
     Raises:
         EdgeposeError: the file cannot be read, asks for code, or is not a 24-joint SMPL model in metres.
