@@ -1,0 +1,165 @@
+"""How far poses are from reference poses, in the measures of the literature.
+
+Every measure gives one value a frame, so that a mean can stand with its deviation and number of frames. Poses
+are local rotations (T, 24, 3, 3). "Root-aligned" means that the pelvis of both bodies has the identity for
+its orientation and stands at the origin: where a person faces, what the pelvis sensor says, does not count.
+
+Sources: DIP is Huang et al., Deep Inertial Poser, 2018; SIP is von Marcard et al., Sparse Inertial Poser,
+2017; equations, tables and sections have the numbers of these papers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from edgepose.rotations import angle_between
+from edgepose.skeleton import PREDICTED, UNOBSERVED, forward_kinematics
+
+Array = NDArray[np.float64]
+
+SIP_JOINTS = (1, 2, 16, 17)
+"""Hips and shoulders: the joints of thighs and upper arms, which carry SIP's four validation sensors."""
+
+LABELS = {
+    "sip_error_deg": "SIP error, deg",
+    "joint_angle_error_15_deg": "joint angle error, 15 predicted joints, deg",
+    "joint_angle_error_10_deg": "joint angle error, 10 joints without a sensor, deg",
+    "position_error_cm": "position error, cm",
+    "jitter_km_s3": "jitter, km/s^3",
+    "jitter_reference_km_s3": "jitter of the reference, km/s^3",
+}
+"""The keys of `per_frame` and `summary` and how a person reads them."""
+
+
+class Measure(NamedTuple):
+    """Mean and standard deviation of a measure over a number of frames; NaN where there are none."""
+
+    mean: float
+    std: float
+    frames: int
+
+
+def sip_error(predicted: ArrayLike, true: ArrayLike) -> Array:
+    """SIP error (T,), degrees: mean geodesic distance of hips' and shoulders' root-aligned global rotations.
+
+    SIP eq. 33 without the square. The authors' evaluation of DIP takes its joint angle error over these four
+    joints, so the angles in DIP's tables 2 to 5 compare with this.
+    """
+    return joint_angle_error(predicted, true, SIP_JOINTS)
+
+
+def joint_angle_error(predicted: ArrayLike, true: ArrayLike, joints: Sequence[int] = PREDICTED) -> Array:
+    """Mean geodesic distance (T,), degrees, of the root-aligned global rotations of some joints.
+
+    The field's usage; say with each number which joints it is about.
+
+    Args:
+        predicted: (T, 24, 3, 3) local rotations.
+        true: (T, 24, 3, 3) local rotations.
+        joints: the 15 that a network predicts, or `UNOBSERVED`, the 10 of them without a sensor.
+    """
+    predicted, true = _same_shape(predicted, true)
+    no_offsets = np.zeros((24, 3))
+    rotations, _ = _root_aligned(predicted, no_offsets)
+    reference, _ = _root_aligned(true, no_offsets)
+    chosen = list(joints)
+    return np.rad2deg(angle_between(rotations[:, chosen], reference[:, chosen])).mean(axis=-1)
+
+
+def position_error(predicted: ArrayLike, true: ArrayLike, offsets: ArrayLike) -> Array:
+    """Mean distance (T,), cm, of the root-aligned positions of all 24 joints.
+
+    The pelvis, always at the origin, is one of the 24. DIP 5.1; SIP eq. 34 without the square. `offsets`
+    (24, 3), metres, is the body that both poses are put on.
+    """
+    predicted, true = _same_shape(predicted, true)
+    _, positions = _root_aligned(predicted, offsets)
+    _, reference = _root_aligned(true, offsets)
+    return 100.0 * np.linalg.norm(positions - reference, axis=-1).mean(axis=-1)
+
+
+def jitter(local: ArrayLike, offsets: ArrayLike, rate: float) -> Array:
+    """Mean norm (T - 3,), km/s^3, of the third time derivative of joint positions; the field's usage.
+
+    Third differences of consecutive frames at `rate` Hz over dt^3, of all 24 joints of the body `offsets`
+    (24, 3), metres, with the pelvis at one place and turning as it does.
+    """
+    _, positions = forward_kinematics(local, offsets)
+    return np.linalg.norm(np.diff(positions, n=3, axis=0), axis=-1).mean(axis=-1) * rate**3 / 1000.0
+
+
+def measure(values: ArrayLike) -> Measure:
+    """Mean, deviation and number of per-frame values, of one sequence or of several joined together."""
+    values = np.asarray(values, float)
+    if not len(values):
+        return Measure(float("nan"), float("nan"), 0)
+    return Measure(float(values.mean()), float(values.std()), len(values))
+
+
+def per_frame(predicted: ArrayLike, true: ArrayLike, offsets: ArrayLike, rate: float) -> dict[str, Array]:
+    """All measures of one sequence, frame by frame: arguments as in `summary`, keys as in `LABELS`."""
+    return {
+        "sip_error_deg": sip_error(predicted, true),
+        "joint_angle_error_15_deg": joint_angle_error(predicted, true, PREDICTED),
+        "joint_angle_error_10_deg": joint_angle_error(predicted, true, UNOBSERVED),
+        "position_error_cm": position_error(predicted, true, offsets),
+        "jitter_km_s3": jitter(predicted, offsets, rate),
+        "jitter_reference_km_s3": jitter(true, offsets, rate),
+    }
+
+
+def summary(predicted: ArrayLike, true: ArrayLike, offsets: ArrayLike, rate: float) -> dict[str, Measure]:
+    """All measures of one sequence.
+
+    Args:
+        predicted: (T, 24, 3, 3) local rotations.
+        true: (T, 24, 3, 3) local rotations at the same instants.
+        offsets: (24, 3) joint position minus its parent's in the zero pose, metres.
+        rate: frames a second, Hz.
+
+    Returns:
+        A `Measure` for each key of `LABELS`.
+    """
+    return {key: measure(values) for key, values in per_frame(predicted, true, offsets, rate).items()}
+
+
+def format_table(summaries: Mapping[str, Mapping[str, Measure]]) -> str:
+    """A table to print: a line a measure, a column a summary, in each cell "mean ± deviation (frames)"."""
+    keys = [key for key in LABELS if any(key in column for column in summaries.values())]
+    table = [["measure", *(LABELS[key] for key in keys)]]
+    for name, column in summaries.items():
+        table.append([name, *(_cell(column[key]) if key in column else "-" for key in keys)])
+    widths = [max(map(len, column)) for column in table]
+    lines = []
+    for row in zip(*table, strict=True):
+        cells = [row[0].ljust(widths[0])] + [
+            cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True)
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)
+
+
+def _cell(m: Measure) -> str:
+    return f"{m.mean:.2f} ± {m.std:.2f} ({m.frames})"
+
+
+def _same_shape(predicted: ArrayLike, true: ArrayLike) -> tuple[Array, Array]:
+    # Broadcasting one frame against many would give numbers that look right.
+    predicted, true = np.asarray(predicted, float), np.asarray(true, float)
+    if predicted.shape != true.shape or predicted.shape[1:] != (24, 3, 3):
+        raise ValueError(
+            f"poses of shapes {predicted.shape} and {true.shape}, expected two (T, 24, 3, 3) alike"
+        )
+    return predicted, true
+
+
+def _root_aligned(local: Array, offsets: ArrayLike) -> tuple[Array, Array]:
+    """Global rotations and positions with the pelvis unturned at the origin."""
+    local, offsets = local.copy(), np.array(offsets, float)
+    local[:, 0] = np.eye(3)
+    offsets[0] = 0.0
+    return forward_kinematics(local, offsets)

@@ -1,0 +1,172 @@
+"""Poses as comma-separated values, one row a frame. The columns are described in docs/outputs.md."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import select
+import stat
+import sys
+import time
+from io import RawIOBase
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from edgepose.errors import EdgeposeError
+from edgepose.pose import PoseFrame
+from edgepose.rotations import matrix_to_quat, matrix_to_rotvec
+from edgepose.sinks import Sink
+from edgepose.skeleton import JOINTS
+
+FORMS = {
+    "axis-angle": ("x", "y", "z"),
+    "quat": ("w", "x", "y", "z"),
+    "matrix": ("r00", "r01", "r02", "r10", "r11", "r12", "r20", "r21", "r22"),
+    "euler": ("rz", "rx", "ry"),
+}
+"""Column endings of each representation; euler: R = Rz Rx Ry, turns about the axes as they have moved."""
+
+FLUSH_S = 1.0
+"""A killed run loses at most the rows of this time, seconds."""
+
+
+def pose_columns(rotations: str, std: bool) -> list[str]:
+    """Names of all columns, in order; `rotations` is a key of `FORMS`."""
+    names = ["frame", "time_s", "status"] + [f"{joint}_{end}" for joint in JOINTS for end in FORMS[rotations]]
+    return names + [f"{joint}_std" for joint in JOINTS] if std else names
+
+
+def matrix_to_euler_zxy(r: ArrayLike) -> NDArray[np.float64]:
+    """Angles (..., 3) about z, x, y, radians, of rotation matrices (..., 3, 3) = Rz Rx Ry; |x| <= pi/2."""
+    r = np.asarray(r, float)
+    z = np.arctan2(-r[..., 0, 1], r[..., 1, 1])
+    c, s = np.cos(z), np.sin(z)
+    # What is left after undoing z is Rx Ry. Taking x and y from it, not from R, stays exact where x is near
+    # +-pi/2 and z by itself means little.
+    x = np.arctan2(r[..., 2, 1], c * r[..., 1, 1] - s * r[..., 0, 1])
+    y = np.arctan2(c * r[..., 0, 2] + s * r[..., 1, 2], c * r[..., 0, 0] + s * r[..., 1, 0])
+    return np.stack([z, x, y], axis=-1)
+
+
+def _numbers(rotations: str, matrices: NDArray[Any]) -> NDArray[Any]:
+    """Rotation matrices (24, 3, 3) in the representation `rotations`, (24, n)."""
+    if rotations == "axis-angle":
+        return matrix_to_rotvec(matrices)
+    if rotations == "quat":
+        return matrix_to_quat(matrices)
+    if rotations == "euler":
+        return matrix_to_euler_zxy(matrices)
+    return matrices
+
+
+class CsvSink(Sink):
+    """Writes poses to a file, or to standard output for the path "-".
+
+    Rows to a file are gathered and written about once a second; a pipe or terminal gets each at once, so that
+    a program that reads along has no added latency. After an error a file ends at a whole row.
+    """
+
+    def __init__(self, path: str | Path, rotations: str = "axis-angle", std: bool = False) -> None:
+        """Open the file and write the header.
+
+        Args:
+            path: file to write, replaced if it exists; "-" is standard output.
+            rotations: a key of `FORMS`; angles are in radians.
+            std: add the network's standard deviation of each joint, radians.
+
+        Raises:
+            EdgeposeError: the file cannot be written.
+        """
+        if rotations not in FORMS:
+            raise EdgeposeError(f"unknown rotations {rotations!r}: choose one of {', '.join(FORMS)}")
+        self._rotations, self._std = rotations, std
+        columns = pose_columns(rotations, std)
+        self._format = ",".join(["%d,%.6f,%s"] + ["%.6f"] * (len(columns) - 3)) + "\n"
+        self._ours = str(path) != "-"
+        self._name = str(path) if self._ours else "standard output"
+        self._closed = False
+        self._file = self._open(Path(path)) if self._ours else _raw_stdout()
+        self._regular = _is_regular(self._file)
+        self._rows = [",".join(columns) + "\n"]
+        try:
+            self._flush()
+        except EdgeposeError:
+            self.close()
+            raise
+
+    def write(self, pose: PoseFrame) -> None:
+        """Add a row; a file has it on disk within about a second."""
+        numbers = _numbers(self._rotations, pose.rotations).ravel().tolist()
+        if self._std:
+            numbers += pose.std.tolist()
+        self._rows.append(self._format % (pose.index, pose.time_s, pose.status, *numbers))
+        if not self._regular or time.monotonic() - self._flushed >= FLUSH_S:
+            self._flush()
+
+    def close(self) -> None:
+        """Write what is still held back and close the file; standard output stays open."""
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            self._flush()
+        finally:
+            if self._ours:
+                try:
+                    self._file.close()
+                except OSError as error:  # Network file systems may report a full disk only here.
+                    raise EdgeposeError(self._explain(error)) from error
+
+    def _open(self, path: Path) -> RawIOBase:
+        try:
+            return path.open("wb", buffering=0)
+        except OSError as error:
+            raise EdgeposeError(self._explain(error)) from error
+
+    def _flush(self) -> None:
+        rows, self._rows = "".join(self._rows).encode(), []
+        self._flushed = time.monotonic()
+        done = 0
+        try:
+            while done < len(rows):
+                count = self._file.write(rows[done:])
+                if count is None:  # A pipe that another program has made non-blocking, and it is full.
+                    select.select([], [self._file], [])
+                done += count or 0
+        except OSError as error:
+            if self._regular:
+                self._drop_end(done - (rows.rfind(b"\n", 0, done) + 1))
+            raise EdgeposeError(self._explain(error)) from error
+
+    def _drop_end(self, count: int) -> None:
+        """Take the last `count` bytes, the beginning of a row, off the file."""
+        with contextlib.suppress(OSError):  # The error that led here is the one to report.
+            size = self._file.seek(0, os.SEEK_CUR) - count
+            self._file.truncate(size)
+            self._file.seek(size)
+
+    def _explain(self, error: OSError) -> str:
+        if isinstance(error, BrokenPipeError):
+            return f"the program that read the poses from {self._name} has ended"
+        if error.errno == errno.ENOENT:
+            return f"cannot write poses to {self._name}: its folder does not exist, create it first"
+        if error.errno == errno.ENOSPC:
+            return f"cannot write poses to {self._name}: the disk is full; rows written before are complete"
+        return f"cannot write poses to {self._name}: {error.strerror or error}"
+
+
+def _raw_stdout() -> Any:
+    """Standard output below Python's buffers: what they still held would fail at exit without a reader."""
+    sys.stdout.flush()
+    return getattr(sys.stdout.buffer, "raw", sys.stdout.buffer)
+
+
+def _is_regular(file: RawIOBase) -> bool:
+    try:
+        return stat.S_ISREG(os.fstat(file.fileno()).st_mode)
+    except OSError:  # Not a file of the operating system, such as a captured standard output.
+        return False

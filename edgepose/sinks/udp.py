@@ -1,0 +1,187 @@
+"""Poses over UDP, one datagram a frame, as JSON or binary. The layouts are described in docs/outputs.md."""
+
+from __future__ import annotations
+
+import json
+import socket
+import struct
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from edgepose.errors import EdgeposeError
+from edgepose.placements import PLACEMENTS
+from edgepose.pose import PoseFrame
+from edgepose.rotations import matrix_to_quat, matrix_to_rotvec, quat_to_matrix
+from edgepose.sinks import Sink
+from edgepose.skeleton import JOINTS
+
+MAGIC = b"EPOS"
+VERSION = 1
+FILLING_WINDOW = 1
+"""Bit of the flags byte: the network has seen fewer frames than its window holds."""
+
+_JSON = '{"frame":%d,"time_s":%.6f,"status":%s,"pose":[' + ",".join(["%.6f"] * 72) + "]}\n"
+# Magic, version, flags, held sensors, joints, time, frame, quaternions: each at a multiple of its size.
+_BINARY = struct.Struct("<4sBBBBdI96f")
+
+
+class Destination(NamedTuple):
+    """Where datagrams go: host name or address, port, format "json" or "binary"."""
+
+    host: str
+    port: int
+    format: str
+
+
+def parse_destination(text: str) -> Destination:
+    """Destination written as "HOST:PORT[,format=json|binary]", an IPv6 address in brackets; JSON by default.
+
+    Raises:
+        EdgeposeError: not such a text.
+    """
+    address, *options = text.split(",")
+    host, colon, port = address.rpartition(":")
+    if not colon or not port or address.endswith("]"):
+        raise EdgeposeError(f"no port in {text!r}: write HOST:PORT, for example 127.0.0.1:9000")
+    if host.startswith("[") and host.endswith("]"):
+        host = host[1:-1]
+    elif ":" in host:
+        raise EdgeposeError(f"cannot tell address from port in {text!r}: write an IPv6 address as [::1]:9000")
+    if not host or any(c in "[]" or c.isspace() for c in host):
+        raise EdgeposeError(f"no host in {text!r}: write HOST:PORT, for example 127.0.0.1:9000")
+    if not (port.isascii() and port.isdigit() and len(port) <= 5 and 1 <= int(port) <= 65535):
+        raise EdgeposeError(f"port {port!r} in {text!r} is not a number from 1 to 65535")
+    form = "json"
+    for option in options:
+        key, _, value = option.partition("=")
+        if key != "format":
+            raise EdgeposeError(
+                f"unknown option {option!r} in {text!r}: the only one is format=json or format=binary"
+            )
+        if value not in ("json", "binary"):
+            raise EdgeposeError(f"unknown format {value!r} in {text!r}: choose json or binary")
+        form = value
+    return Destination(host, int(port), form)
+
+
+def encode_json(pose: PoseFrame) -> bytes:
+    """One line of JSON: frame, time_s, status, pose (72 axis-angle numbers in SMPL order, radians)."""
+    numbers = matrix_to_rotvec(pose.rotations).ravel().tolist()
+    return (_JSON % (pose.index, pose.time_s, _quoted(pose.status), *numbers)).encode()
+
+
+def encode_binary(pose: PoseFrame) -> bytes:
+    """The binary datagram of a pose, 404 bytes."""
+    flags, held = _status_bits(pose.status)
+    quats = matrix_to_quat(pose.rotations).ravel().tolist()
+    index = pose.index & 0xFFFFFFFF  # Wraps after two years at 60 Hz.
+    return _BINARY.pack(MAGIC, VERSION, flags, held, len(JOINTS), pose.time_s, index, *quats)
+
+
+def decode_binary(datagram: bytes) -> PoseFrame:
+    """The pose in a binary datagram; `std`, which is not sent, is NaN.
+
+    Raises:
+        EdgeposeError: not a datagram of this kind and version, or its numbers are no rotations.
+    """
+    if len(datagram) != _BINARY.size or not datagram.startswith(MAGIC):
+        raise EdgeposeError(f"not a pose datagram: {len(datagram)} bytes that begin with {datagram[:4]!r}")
+    _, version, flags, held, joints, time_s, index, *numbers = _BINARY.unpack(datagram)
+    if version != VERSION or joints != len(JOINTS):
+        raise EdgeposeError(
+            f"pose datagram of version {version} with {joints} joints, this program knows 1 with 24"
+        )
+    quats = np.array(numbers).reshape(-1, 4)
+    norms = np.linalg.norm(quats, axis=-1, keepdims=True)
+    if not np.isfinite(time_s) or not np.all(np.abs(norms - 1.0) < 1e-3):
+        raise EdgeposeError(
+            f"damaged pose datagram: time or quaternions of frame {index} are not valid numbers"
+        )
+    rotations = quat_to_matrix(quats / norms).astype(np.float32)
+    return PoseFrame(
+        index, time_s, _status_text(flags, held), rotations, np.full(len(JOINTS), np.nan, np.float32)
+    )
+
+
+class UdpSink(Sink):
+    """Sends each pose to one address.
+
+    A run goes on whether or not anybody listens: datagrams that could not be sent are counted in `unsent`.
+    """
+
+    def __init__(self, host: str, port: int, format: str = "json") -> None:
+        """Resolve the host, once.
+
+        Args:
+            host: name or address. A name with addresses of both kinds stands for its IPv4 one, which most
+                receivers listen on.
+            port: UDP port.
+            format: "json" or "binary".
+
+        Raises:
+            EdgeposeError: unknown host or no network to reach it.
+        """
+        self._encode = {"json": encode_json, "binary": encode_binary}[format]
+        self.unsent = 0
+        try:
+            found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+        except (OSError, UnicodeError) as error:
+            raise EdgeposeError(f"cannot find host {host!r} to send poses to: {error}") from error
+        family, kind, protocol, _, address = min(found, key=lambda entry: entry[0] != socket.AF_INET)
+        self._socket = socket.socket(family, kind, protocol)
+        self._socket.setblocking(False)  # A full network queue costs a datagram, not the time of a frame.
+        try:
+            self._socket.connect(address)
+        except OSError as error:
+            self._socket.close()
+            raise EdgeposeError(
+                f"cannot send poses to {host} port {port}: {error.strerror or error}"
+            ) from error
+
+    def write(self, pose: PoseFrame) -> None:
+        """Send a pose."""
+        datagram = self._encode(pose)
+        try:
+            self._send(datagram)
+        except OSError:
+            self.unsent += 1
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+    def _send(self, datagram: bytes) -> None:
+        try:
+            self._socket.send(datagram)
+        except ConnectionRefusedError:
+            # The answer to the datagram before, with nobody listening then; this one has not left yet.
+            self.unsent += 1
+            self._socket.send(datagram)
+
+
+@lru_cache(maxsize=64)
+def _quoted(text: str) -> str:
+    return json.dumps(text)
+
+
+@lru_cache(maxsize=256)
+def _status_bits(status: str) -> tuple[int, int]:
+    """Flags byte and held-sensor mask (bit i: PLACEMENTS[i]) of a status text."""
+    flags = held = 0
+    for part in status.split("; "):
+        if part == "filling window":
+            flags |= FILLING_WINDOW
+        elif part.startswith("held "):
+            held |= sum(1 << PLACEMENTS.index(name) for name in part.split()[1:])
+    return flags, held
+
+
+def _status_text(flags: int, held: int) -> str:
+    """Inverse of `_status_bits`."""
+    names = [name for i, name in enumerate(PLACEMENTS) if held >> i & 1]
+    parts = [" ".join(["held", *names])] if names else []
+    if flags & FILLING_WINDOW:
+        parts.append("filling window")
+    return "; ".join(parts) or "ok"
