@@ -72,8 +72,8 @@ def _recognise(header: list[str], name: str) -> tuple[str, int]:
             if header == pose_columns(form, std):
                 return form, len(header)
     raise EdgeposeError(
-        f"{name} is not a file of poses: its first line must be 'frame,time_s,status,pelvis_...' and name the "
-        "24 joints in SMPL order"
+        f"{name} is not a file of poses: its first line must be 'frame,time_s,status,pelvis_...' and name "
+        "the 24 joints in SMPL order"
     )
 
 
