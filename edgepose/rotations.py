@@ -56,7 +56,12 @@ def quat_continuous(q: ArrayLike) -> Array:
 def slerp(q0: ArrayLike, q1: ArrayLike, t: ArrayLike) -> Array:
     """Spherical interpolation from q0 (..., 4) at t = 0 to q1 at t = 1 along the shorter arc; t broadcasts over (...)."""
     q0 = np.asarray(q0, float)
-    return quat_multiply(q0, rotvec_to_quat(quat_to_rotvec(quat_multiply(quat_conjugate(q0), q1)) * np.asarray(t, float)[..., None]))
+    return quat_multiply(
+        q0,
+        rotvec_to_quat(
+            quat_to_rotvec(quat_multiply(quat_conjugate(q0), q1)) * np.asarray(t, float)[..., None]
+        ),
+    )
 
 
 def mean_rotation(quats: ArrayLike) -> Array:

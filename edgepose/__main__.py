@@ -1,0 +1,5 @@
+"""`python -m edgepose`: the same as the `edgepose` command."""
+
+from edgepose.cli import main
+
+main()

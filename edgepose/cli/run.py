@@ -1,0 +1,188 @@
+"""`edgepose run`: the main job."""
+
+from __future__ import annotations
+
+import sys
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from edgepose.cli.options import check_source, source_options
+from edgepose.errors import EdgeposeError
+from edgepose.placements import PLACEMENTS
+
+if TYPE_CHECKING:
+    from edgepose.pipeline import RunSummary
+    from edgepose.sources import Source
+
+
+@click.command()
+@source_options
+@click.option(
+    "--calibration",
+    "calibration_path",
+    required=True,
+    type=click.Path(path_type=Path),
+    help="Calibration that `edgepose calibrate` wrote.",
+)
+@click.option(
+    "--model",
+    default="birnn",
+    show_default=True,
+    help="Shipped model (see `edgepose models`) or an archive's path.",
+)
+@click.option(
+    "--trust", is_flag=True, help="Load --model although its sum is not known: you vouch for the code in it."
+)
+@click.option(
+    "--online",
+    type=click.Choice(["window", "stream"]),
+    default="window",
+    show_default=True,
+    help="How a bidirectional model runs: anew over a window for each frame, or with its forward state carried on (cheaper). "
+    "A unidirectional one always carries its state.",
+)
+@click.option(
+    "--past",
+    type=click.IntRange(0, 600),
+    help="Frames before the present one that a window holds  [default: the model's]",
+)
+@click.option(
+    "--future",
+    type=click.IntRange(0, 120),
+    help="Frames after the present one that a bidirectional model waits for; each adds 1/60 s of latency  [default: the model's]",
+)
+@click.option("--csv", "csv_path", metavar="FILE", help="Write poses as CSV; - is standard output.")
+@click.option(
+    "--rotations",
+    type=click.Choice(["axis-angle", "quat", "matrix", "euler"]),
+    default="axis-angle",
+    show_default=True,
+    help="Representation of rotations in the CSV.",
+)
+@click.option(
+    "--std", is_flag=True, help="Add the network's standard deviation of each joint to the CSV, radians."
+)
+@click.option("--udp", metavar="HOST:PORT[,format=json|binary]", help="Send each pose as a datagram.")
+def run(
+    port: str | None,
+    baud: int,
+    path: Path | None,
+    realtime: bool,
+    protocol: str,
+    calibration_path: Path,
+    model: str,
+    trust: bool,
+    online: str,
+    past: int | None,
+    future: int | None,
+    csv_path: str | None,
+    rotations: str,
+    std: bool,
+    udp: str | None,
+) -> None:
+    """Turn packets or a recording into poses until the source ends or Ctrl-C.
+
+    \b
+    Examples:
+      edgepose run --port /dev/ttyUSB0 --calibration calib.json --csv poses.csv --udp 127.0.0.1:9000
+      edgepose run --port COM3 --calibration calib.json --model rnn --udp 10.0.0.5:9000,format=binary
+      edgepose run --file walk.csv --calibration calib.json --csv - | head
+    """
+    check_source(port, path)
+    if csv_path is None and udp is None:
+        raise click.UsageError("give at least one output: --csv FILE or --udp HOST:PORT")
+
+    from edgepose import archive
+    from edgepose.calibration import load_calibration
+    from edgepose.sinks import Sink
+    from edgepose.sinks.csv_file import CsvSink
+    from edgepose.sinks.udp import UdpSink, parse_destination
+    from edgepose.sources import open_source
+
+    destination = parse_destination(udp) if udp else None
+    calibration = load_calibration(calibration_path)
+    info = archive.inspect(archive.find(model))
+    kind, rate = info.metadata["kind"], float(info.metadata["rate_hz"])
+    past = info.metadata["past"] if past is None else past
+    future = info.metadata["future"] if future is None else future
+    if kind == "rnn" and future:
+        raise click.UsageError(f"{model} is unidirectional: --future must be 0")
+    with ExitStack() as stack:
+        # The source is opened before the model is loaded: a wrong port is told at once.
+        source = stack.enter_context(
+            open_source(port=port, baud=baud, file=path, realtime=realtime, protocol=protocol)
+        )
+        module = archive.load(info, trust)
+        from edgepose.engine import StreamEngine, WindowEngine
+        from edgepose.pipeline import run as run_pipeline
+        from edgepose.sync import FrameClock
+
+        engine = (StreamEngine if kind == "rnn" or online == "stream" else WindowEngine)(module, past, future)
+        sinks: list[Sink] = []
+        if csv_path:
+            sinks.append(stack.enter_context(CsvSink(csv_path, rotations, std)))
+        if destination:
+            sinks.append(stack.enter_context(UdpSink(*destination)))
+        clock = FrameClock(rate)
+        _say(
+            f"running {model} ({kind}, {'stream' if isinstance(engine, StreamEngine) else 'window'}); Ctrl-C ends the run"
+        )
+        summary = run_pipeline(source, clock, calibration, engine, sinks, _progress())
+    _report(summary, source, clock.dropped, rate, future, live=port is not None or realtime)
+    if summary.error:
+        raise summary.error
+    if source.damage:
+        raise EdgeposeError(source.damage)
+
+
+def _say(text: str) -> None:
+    click.echo(text, err=True)
+
+
+def _progress(every_s: float = 1.0):  # type: ignore[no-untyped-def]
+    """A callback that keeps one line on a terminal up to date; elsewhere it is silent."""
+    if not sys.stderr.isatty():
+        return lambda summary: None
+    shown = [time.monotonic(), 0]
+
+    def show(summary: RunSummary) -> None:
+        now = time.monotonic()
+        if now - shown[0] >= every_s:
+            rate = (summary.poses - shown[1]) / (now - shown[0])
+            shown[:] = [now, summary.poses]
+            click.echo(
+                f"\r{summary.poses} poses, {rate:.0f} a second, {summary.held} with a held sensor  ",
+                nl=False,
+                err=True,
+            )
+
+    return show
+
+
+def _report(summary: RunSummary, source: Source, dropped: int, rate: float, future: int, live: bool) -> None:
+    """Prints the counts of a finished run."""
+    import numpy as np
+
+    if sys.stderr.isatty():
+        _say("")
+    speed = summary.poses / summary.seconds if summary.seconds else 0.0
+    _say(
+        f"poses    {summary.poses} in {summary.seconds:.1f} s, {speed:.1f} a second; {summary.filling} while the window was filling"
+    )
+    counts = source.counters
+    _say(
+        f"packets  {counts.packets} good, {counts.lost} lost, {counts.bad} bad; {dropped} samples too late or twice"
+    )
+    if summary.held:
+        worst = sorted(zip(summary.held_by_sensor, PLACEMENTS, strict=True), reverse=True)
+        _say("held     " + ", ".join(f"{name} in {count} frames" for count, name in worst if count))
+    if summary.latencies_s and live:
+        p50, p99, most = np.percentile(np.array(summary.latencies_s) * 1e3, [50, 99, 100])
+        ahead = f" plus {future} frames of look-ahead, {future / rate * 1e3:.0f} ms" if future else ""
+        _say(
+            f"latency  {p50:.1f} ms median, {p99:.1f} ms p99, {most:.1f} ms max from last packet to pose sent{ahead}"
+        )

@@ -1,0 +1,127 @@
+"""Runs a model archive frame by frame: window, stream or step (DIP 3.4, 5.1.3, 5.1.4).
+
+Every frame that goes in comes out, in order: the first ones seen with the past that there is, the last ones, at `finish`, with the future
+that there is.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+
+WARM_UP = 5
+"""Frames run through a module before the first real one; TorchScript compiles and specialises during its first calls."""
+
+
+class EngineOutput(NamedTuple):
+    """The pose of one frame.
+
+    Attributes:
+        tag: what `push` was given with that frame.
+        rotations: (24, 3, 3) local rotations, joint 0 against T.
+        std: (24,) standard deviations, radians.
+        filling: fewer frames have been seen than the network's past asks for.
+    """
+
+    tag: Any
+    rotations: Array
+    std: Array
+    filling: bool
+
+
+class Engine(Protocol):
+    """What `window_engine` and `stream_engine` give."""
+
+    def push(self, tag: Any, orientation: Array, acceleration: Array) -> list[EngineOutput]:
+        """Takes a frame ((6, 3, 3) R_TB, (6, 3) m/s^2 in T without gravity) and gives the poses that are due: none or one."""
+
+    def finish(self) -> list[EngineOutput]:
+        """Gives the poses of the frames that still wait for their future."""
+
+
+def _output(tag: Any, rotations: torch.Tensor, std: torch.Tensor, filling: bool) -> EngineOutput:
+    return EngineOutput(tag, rotations.numpy(), std.numpy(), filling)
+
+
+class WindowEngine:
+    """For each frame the network runs over the `past` frames before it, itself and `future` frames after it."""
+
+    def __init__(self, module: torch.jit.ScriptModule, past: int, future: int) -> None:
+        self._module, self._past, self._future = module, past, future
+        self._tags: deque[Any] = deque()
+        self._seen = 0
+        self._orientation = torch.zeros(1, 0, 6, 3, 3)
+        self._acceleration = torch.zeros(1, 0, 6, 3)
+        length = past + 1 + future
+        with torch.inference_mode():
+            for _ in range(WARM_UP):
+                module.window(torch.eye(3).expand(1, length, 6, 3, 3), torch.zeros(1, length, 6, 3), past)
+
+    def push(self, tag: Any, orientation: Array, acceleration: Array) -> list[EngineOutput]:
+        """See `Engine.push`."""
+        longest = self._past + self._future
+        self._orientation = torch.cat([self._orientation[:, -longest:], _tensor(orientation)], dim=1)
+        self._acceleration = torch.cat([self._acceleration[:, -longest:], _tensor(acceleration)], dim=1)
+        self._tags.append(tag)
+        self._seen += 1
+        return [self._oldest(self._future)] if self._seen > self._future else []
+
+    def finish(self) -> list[EngineOutput]:
+        """See `Engine.finish`."""
+        return [self._oldest(future) for future in range(len(self._tags) - 1, -1, -1)]
+
+    def _oldest(self, future: int) -> EngineOutput:
+        """Pose of the oldest frame that has no pose yet, `future` frames behind the newest."""
+        length = self._orientation.shape[1]
+        index = length - 1 - future
+        first = max(0, index - self._past)
+        with torch.inference_mode():
+            rotations, std = self._module.window(
+                self._orientation[:, first:], self._acceleration[:, first:], index - first
+            )
+        return _output(self._tags.popleft(), rotations[0], std[0], index < self._past)
+
+
+class StreamEngine:
+    """One step a frame with carried state; a unidirectional network with `future` 0, a bidirectional one with any."""
+
+    def __init__(self, module: torch.jit.ScriptModule, past: int, future: int) -> None:
+        self._module, self._past = module, past
+        self._tags: deque[Any] = deque()
+        self._done = 0
+        with torch.inference_mode():
+            state = module.start(1, future)
+            for _ in range(WARM_UP + future):
+                state = module.stream(torch.eye(3).expand(1, 6, 3, 3), torch.zeros(1, 6, 3), state)[2]
+            self._state = module.start(1, future)
+
+    def push(self, tag: Any, orientation: Array, acceleration: Array) -> list[EngineOutput]:
+        """See `Engine.push`."""
+        self._tags.append(tag)
+        with torch.inference_mode():
+            rotations, std, self._state = self._module.stream(
+                _tensor(orientation)[0], _tensor(acceleration)[0], self._state
+            )
+        return self._outputs(rotations, std)
+
+    def finish(self) -> list[EngineOutput]:
+        """See `Engine.finish`."""
+        with torch.inference_mode():
+            return self._outputs(*self._module.drain(self._state))
+
+    def _outputs(self, rotations: torch.Tensor, std: torch.Tensor) -> list[EngineOutput]:
+        outputs = []
+        for pose, deviation in zip(rotations[0], std[0], strict=True):
+            outputs.append(_output(self._tags.popleft(), pose, deviation, self._done < self._past))
+            self._done += 1
+        return outputs
+
+
+def _tensor(array: Array) -> torch.Tensor:
+    return torch.from_numpy(np.asarray(array, np.float32))[None, None]

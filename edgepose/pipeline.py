@@ -1,0 +1,116 @@
+"""Joins the steps of the walk, from samples to poses; the only place that knows them all."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from edgepose.calibration import Calibration, apply
+from edgepose.engine import Engine, EngineOutput
+from edgepose.errors import EdgeposeError
+from edgepose.imu import ImuFrame, ImuSample
+from edgepose.placements import PLACEMENTS
+from edgepose.pose import PoseFrame
+from edgepose.sinks import Sink
+from edgepose.sync import FrameClock
+
+
+@dataclass
+class RunSummary:
+    """Counts of a run.
+
+    Attributes:
+        poses: poses written.
+        filling: of these, poses made before the network's past was full.
+        held: of these, poses in which a sensor's last values were repeated.
+        held_by_sensor: frames in which each sensor was held, in the order of PLACEMENTS.
+        seconds: wall time from the first samples to the end.
+        latencies_s: for each frame that gave a pose, seconds from the arrival of its newest packet here to the pose's being sent.
+        error: what ended the run early, if anything did.
+    """
+
+    poses: int = 0
+    filling: int = 0
+    held: int = 0
+    held_by_sensor: list[int] = field(default_factory=lambda: [0] * len(PLACEMENTS))
+    seconds: float = 0.0
+    latencies_s: list[float] = field(default_factory=list)
+    error: EdgeposeError | None = None
+
+
+def status(frame: ImuFrame, filling: bool) -> str:
+    """The `status` of a pose, see `PoseFrame`."""
+    parts = []
+    if frame.held.any():
+        parts.append(
+            "held " + " ".join(name for name, held in zip(PLACEMENTS, frame.held, strict=True) if held)
+        )
+    if filling:
+        parts.append("filling window")
+    return "; ".join(parts) or "ok"
+
+
+def run(
+    source: Iterable[tuple[float, list[ImuSample]]],
+    clock: FrameClock,
+    calibration: Calibration,
+    engine: Engine,
+    sinks: list[Sink],
+    on_pose: Callable[[RunSummary], None] = lambda summary: None,
+) -> RunSummary:
+    """Runs a source to its end, or until Ctrl-C, and writes every pose to every sink.
+
+    What the source gave before an error or Ctrl-C comes out; an error is kept in the summary for the caller to report.
+
+    Args:
+        source: batches (time on the source's clock, samples that came).
+        clock: makes frames.
+        calibration: of the wearer.
+        engine: makes poses.
+        sinks: written in order.
+        on_pose: called after each pose was written.
+    """
+    summary = RunSummary()
+    started = arrived = time.perf_counter()
+
+    def write(outputs: list[EngineOutput]) -> None:
+        for output in outputs:
+            frame: ImuFrame = output.tag
+            pose = PoseFrame(
+                frame.index, frame.time_s, status(frame, output.filling), output.rotations, output.std
+            )
+            for sink in sinks:
+                sink.write(pose)
+            summary.poses += 1
+            summary.filling += output.filling
+            if frame.held.any():
+                summary.held += 1
+                for i in np.flatnonzero(frame.held):
+                    summary.held_by_sensor[i] += 1
+            summary.latencies_s.append(time.perf_counter() - arrived)
+            on_pose(summary)
+
+    def push(frames: list[ImuFrame]) -> None:
+        for frame in frames:
+            write(engine.push(frame, *apply(calibration, frame.orientation, frame.force)))
+
+    try:
+        try:
+            for now_s, samples in source:
+                arrived = time.perf_counter()
+                if samples:
+                    clock.push(samples, now_s)
+                push(clock.frames(now_s))
+        except KeyboardInterrupt:
+            pass
+        except EdgeposeError as error:
+            summary.error = error
+        push(clock.flush())
+        write(engine.finish())
+    except EdgeposeError as error:
+        summary.error = summary.error or error
+    summary.seconds = time.perf_counter() - started
+    return summary

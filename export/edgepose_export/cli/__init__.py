@@ -1,0 +1,1 @@
+"""Commands that make models; found by the entry-point group `edgepose.commands`."""

@@ -1,0 +1,37 @@
+"""Progress on a terminal as a bar, elsewhere as a plain line now and then."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TypeVar
+
+import click
+
+T = TypeVar("T")
+
+PLAIN_EVERY_S = 10.0
+
+
+def progress(items: Sequence[T], label: str) -> Iterator[T]:
+    """Yields the items and shows on stderr how many are done."""
+    if sys.stderr.isatty():
+        with click.progressbar(items, label=label, show_pos=True, file=sys.stderr) as bar:
+            yield from bar
+        return
+    last = time.monotonic()
+    for i, item in enumerate(items):
+        yield item
+        if time.monotonic() - last > PLAIN_EVERY_S:
+            last = time.monotonic()
+            click.echo(f"{label}: {i + 1} of {len(items)}", err=True)
+
+
+def labelled(label: str):  # type: ignore[no-untyped-def]
+    """`progress` with a label, as a function of the items."""
+
+    def show(items: Iterable[T]) -> Iterator[T]:
+        return progress(list(items), label)
+
+    return show

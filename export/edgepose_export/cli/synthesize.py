@@ -1,0 +1,144 @@
+"""`edgepose synthesize`: virtual IMU recordings from motion capture."""
+
+from __future__ import annotations
+
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+import click
+
+from edgepose.errors import EdgeposeError
+
+KINDS = (".bvh", ".amc", ".npz")
+
+LICENSES = {
+    "cmu": "CMU Graphics Lab Motion Capture Database (mocap.cs.cmu.edu, NSF EIA-0196217), free for all use",
+    "bandai-namco": "Bandai-Namco Research Motiondataset, CC BY-NC 4.0",
+    "amass": "the licence of the AMASS subset",
+}
+
+
+class Job(NamedTuple):
+    """What to make of each motion file; fields are the command's flags."""
+
+    out: Path
+    root: Path
+    rate: float
+    height_m: float
+    hold_s: float
+    mounting_seed: int | None
+
+
+@click.command()
+@click.argument("inputs", nargs=-1, required=True, type=click.Path(path_type=Path, exists=True))
+@click.option(
+    "--out",
+    required=True,
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Folder for the recordings (.npz).",
+)
+@click.option(
+    "--rate", type=click.FloatRange(1, 1000), default=60.0, show_default=True, help="Samples a second."
+)
+@click.option(
+    "--height",
+    type=click.FloatRange(0.8, 2.5),
+    default=1.75,
+    show_default=True,
+    help="Wearer's height, metres.",
+)
+@click.option(
+    "--hold",
+    type=click.FloatRange(0, 600),
+    default=0.0,
+    show_default=True,
+    help="Seconds of straight standing before the motion.",
+)
+@click.option(
+    "--mounting",
+    "mounting_seed",
+    type=int,
+    metavar="SEED",
+    help="Strap the sensors on at random angles drawn with this seed  [default: along the bones]",
+)
+@click.option(
+    "--jobs", type=click.IntRange(1), default=1, show_default=True, help="Files to work on at once."
+)
+def synthesize(
+    inputs: tuple[Path, ...],
+    out: Path,
+    rate: float,
+    height: float,
+    hold: float,
+    mounting_seed: int | None,
+    jobs: int,
+) -> None:
+    """Make IMU recordings with true poses from motion capture (.bvh, .amc, AMASS .npz; folders are searched).
+
+    Training reads them with the default flags. A recording with --hold can be calibrated and run like a real one.
+
+    \b
+    Examples:
+      edgepose synthesize mocap/ --out recordings/ --jobs 2
+      edgepose synthesize walk.bvh --out . --hold 6 --mounting 1 --rate 100
+    """
+    from edgepose_export.cli.progress import progress
+
+    files = [(root, path) for root in inputs for path in _motion_files(root)]
+    if not files:
+        raise EdgeposeError(f"no motion files ({', '.join(KINDS)}) in {', '.join(map(str, inputs))}")
+    tasks = [
+        (path, Job(out, root if root.is_dir() else root.parent, rate, height, hold, mounting_seed))
+        for root, path in files
+    ]
+    failed = []
+    with ProcessPoolExecutor(jobs) as pool:
+        futures = [pool.submit(convert, *task) for task in tasks]
+        for future, (_, path) in progress(list(zip(futures, files, strict=True)), "synthesizing"):
+            problem = future.result()
+            if problem:
+                failed.append(path)
+                click.echo(f"left out: {problem}", err=True)
+    click.echo(f"{len(files) - len(failed)} of {len(files)} recordings written to {out}", err=True)
+    if failed:
+        raise EdgeposeError(
+            f"{len(failed)} of {len(files)} files could not be converted; they are named above"
+        )
+
+
+def _motion_files(root: Path) -> list[Path]:
+    if root.is_file():
+        return [root]
+    return sorted(path for path in root.rglob("*") if path.suffix.lower() in KINDS)
+
+
+def convert(path: Path, job: Job) -> str | None:
+    """Converts one file; what was wrong with it, or None."""
+    import numpy as np
+
+    from edgepose.rotations import rotvec_to_matrix
+    from edgepose.skeleton import default_body
+    from edgepose_export.mocap import read_motion, resample
+    from edgepose_export.synthesis import recording_arrays, virtual_imus, with_hold
+
+    try:
+        motion = resample(read_motion(path), job.rate)
+        if len(motion.rotations) < 3:
+            return f"{path}: only {len(motion.rotations)} frames"
+        if job.hold_s:
+            motion = with_hold(motion, job.hold_s)
+        mounting = None
+        if job.mounting_seed is not None:
+            mounting = rotvec_to_matrix(
+                np.random.default_rng(job.mounting_seed).uniform(-np.pi, np.pi, (6, 3))
+            )
+        imus = virtual_imus(motion, default_body(job.height_m), mounting)
+        target = job.out / path.relative_to(job.root).with_suffix(".npz")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(target, **recording_arrays(motion, imus, LICENSES[motion.source]))
+    except EdgeposeError as error:
+        return str(error)
+    except OSError as error:
+        return f"{path}: {error}"
+    return None

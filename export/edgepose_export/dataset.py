@@ -1,0 +1,145 @@
+"""Synthetic recordings on disk to tensors for training and evaluation."""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from edgepose import rotations as rot
+from edgepose.errors import EdgeposeError
+from edgepose.placements import PLACEMENTS
+from edgepose.skeleton import PARENTS
+from edgepose_export.synthesis import GRAVITY, INERTIAL_FROM_BODY
+
+
+class Take(NamedTuple):
+    """One synthetic recording.
+
+    Attributes:
+        name: file name without folder and ending.
+        orientation: (T, 6, 3, 3) float32 bone orientations R_TB.
+        acceleration: (T, 6, 3) float32 accelerations in T without gravity, m/s^2.
+        pose: (T, 24, 3, 3) float32 true local rotations.
+        license: the licence of the motion it was made from.
+    """
+
+    name: str
+    orientation: NDArray[np.float32]
+    acceleration: NDArray[np.float32]
+    pose: NDArray[np.float32]
+    license: str
+
+
+def read_take(path: Path) -> Take:
+    """A recording that `edgepose synthesize` wrote with sensors aligned with the bones.
+
+    Raises:
+        EdgeposeError: not such a file.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            quats = np.stack([data[f"{name}_quat"] for name in PLACEMENTS], axis=1)
+            force = np.stack([data[f"{name}_acc"] for name in PLACEMENTS], axis=1)
+            poses = data["poses"].reshape(-1, 24, 3)
+            license_note = str(data["license"])
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise EdgeposeError(
+            f"{path}: not a recording with true poses ({error}); make it with edgepose synthesize"
+        ) from error
+    inertial = rot.quat_to_matrix(quats)
+    body_from_inertial = INERTIAL_FROM_BODY.T
+    force_inertial = np.einsum("tsij,tsj->tsi", inertial, force.astype(float))
+    acceleration = (force_inertial - [0.0, 0.0, GRAVITY]) @ INERTIAL_FROM_BODY
+    return Take(
+        path.stem,
+        (body_from_inertial @ inertial).astype(np.float32),
+        acceleration.astype(np.float32),
+        rot.rotvec_to_matrix(poses).astype(np.float32),
+        license_note,
+    )
+
+
+PARTS = ("train", "validation", "cmu-walk-run", "cmu-02", "bandai-styles")
+"""Parts of the split; the last three are held out and named in every card."""
+
+
+def part_of(name: str) -> str:
+    """Part that a take belongs to, by its name.
+
+    CMU subjects 07, 08, 09 (walking, running) and 02 (bends, punches, sword) and Bandai-Namco's styles "exhausted" and "tired" are held
+    out. CMU subject 03 and the style "not-confident" tell training when to stop. Other splits leak: Bandai-Namco's takes of one
+    style resemble each other so closely that a nearest-neighbour look-up would win.
+    """
+    if match := re.fullmatch(r"(\d\d)_\d\d", name):
+        return {
+            "07": "cmu-walk-run",
+            "08": "cmu-walk-run",
+            "09": "cmu-walk-run",
+            "02": "cmu-02",
+            "03": "validation",
+        }.get(match[1], "train")
+    if re.search(r"_(exhausted|tired)_", name):
+        return "bandai-styles"
+    return "validation" if "_not-confident_" in name else "train"
+
+
+def read_takes(
+    folder: Path, wanted: Callable[[str], bool], progress: Callable[[list[Path]], Iterable[Path]] = iter
+) -> list[Take]:
+    """All takes below a folder whose names are wanted, in the order of their names.
+
+    Raises:
+        EdgeposeError: none found.
+    """
+    paths = sorted((p for p in folder.rglob("*.npz") if wanted(p.stem)), key=lambda p: p.stem)
+    if not paths:
+        raise EdgeposeError(
+            f"{folder}: no recordings of the wanted part; make them with edgepose synthesize --out {folder}"
+        )
+    return [read_take(path) for path in progress(paths)]
+
+
+class Tape(NamedTuple):
+    """Takes one after the other, as tensors.
+
+    Attributes:
+        orientation: (N, 6, 3, 3) R_TB.
+        acceleration: (N, 6, 3) in T, m/s^2.
+        relative: (N, 24, 3, 3) true global rotations in the root's frame.
+        starts: first frame of each take; one more entry holds N.
+        names: of the takes.
+    """
+
+    orientation: Tensor
+    acceleration: Tensor
+    relative: Tensor
+    starts: Tensor
+    names: list[str]
+
+
+def tape(takes: list[Take]) -> Tape:
+    """Joins takes."""
+    lengths = [len(take.pose) for take in takes]
+    return Tape(
+        torch.from_numpy(np.concatenate([take.orientation for take in takes])),
+        torch.from_numpy(np.concatenate([take.acceleration for take in takes])),
+        torch.cat([root_relative_pose(torch.from_numpy(take.pose)) for take in takes]),
+        torch.tensor([0, *np.cumsum(lengths)]),
+        [take.name for take in takes],
+    )
+
+
+def root_relative_pose(local: Tensor) -> Tensor:
+    """Global rotations (..., 24, 3, 3) in the root's frame of local ones."""
+    result = [torch.eye(3, dtype=local.dtype).expand(local.shape[:-3] + (3, 3))]
+    for joint in range(1, 24):
+        result.append(result[PARENTS[joint]] @ local[..., joint, :, :])
+    return torch.stack(result, dim=-3)

@@ -1,0 +1,351 @@
+"""The networks of DIP 3.4 in two forms: one that trains fast, one that runs as a TorchScript archive.
+
+Both hold the same weights. `PoseNetwork` uses `torch.nn.LSTM`, which is quickest over long batched sequences. `RnnArchive` and
+`BirnnArchive` write the cells out, one matrix product over input and state, which is several times quicker for one frame at a
+time, and carry everything between calibration and pose: root normalisation, statistics, network, projection to rotations.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from edgepose.features import (
+    ACCELERATIONS,
+    INPUTS,
+    local_rotations,
+    nearest_rotation,
+    network_input,
+    rotation_from_6d,
+)
+from edgepose.placements import BONES, ROOT
+from edgepose.skeleton import PARENTS, PREDICTED, UNOBSERVED
+
+SIGMA_FLOOR = 0.02
+"""Smallest standard deviation a network may claim, in normalised units: without it, joints that never move take all gradient."""
+
+
+class NetworkShape(NamedTuple):
+    """What decides the weights' shapes and the meaning of the outputs.
+
+    Attributes:
+        kind: "birnn" or "rnn".
+        hidden: units of the dense layer and of each LSTM direction; 512 in the paper.
+        targets: "local-matrix" (the paper: 9 numbers of each local rotation) or "global-6d" (6 numbers of each rotation in the root's
+            frame).
+        measured: "predicted" (the paper: all 15 joints come from the network) or "passed" (bones that carry a sensor take its
+            orientation; the network predicts the other 10). "passed" needs "global-6d".
+    """
+
+    kind: str = "birnn"
+    hidden: int = 512
+    targets: str = "local-matrix"
+    measured: str = "predicted"
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        """SMPL joints that the network predicts."""
+        return UNOBSERVED if self.measured == "passed" else PREDICTED
+
+    @property
+    def numbers(self) -> int:
+        """Numbers a joint."""
+        return 9 if self.targets == "local-matrix" else 6
+
+    @property
+    def pose_outputs(self) -> int:
+        """Numbers of the pose part of the output."""
+        return len(self.joints) * self.numbers
+
+
+class PoseNetwork(nn.Module):
+    """Dense layer with ReLU, two LSTM layers, a head for means and one for standard deviations (DIP figure 12)."""
+
+    def __init__(self, shape: NetworkShape) -> None:
+        super().__init__()
+        self.shape = shape
+        both = shape.kind == "birnn"
+        width = shape.hidden * (2 if both else 1)
+        outputs = shape.pose_outputs + ACCELERATIONS
+        self.dense = nn.Linear(INPUTS, shape.hidden)
+        self.lstm1 = nn.LSTM(shape.hidden, shape.hidden, batch_first=True, bidirectional=both)
+        self.lstm2 = nn.LSTM(width, shape.hidden, batch_first=True, bidirectional=both)
+        self.mean = nn.Linear(width, outputs)
+        self.deviation = nn.Linear(width, outputs)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Means and standard deviations (B, T, outputs) of z-scored inputs (B, T, 60), in normalised units."""
+        x = torch.relu(self.dense(x))
+        x, _ = self.lstm1(x)
+        x, _ = self.lstm2(x)
+        return self.mean(x), nn.functional.softplus(self.deviation(x)) + SIGMA_FLOOR
+
+
+class PoseDecoder(nn.Module):
+    """Network outputs to SMPL's 24 local rotations; differentiable, scriptable."""
+
+    def __init__(self, shape: NetworkShape, target_mean: Tensor, target_std: Tensor) -> None:
+        super().__init__()
+        self.local = shape.targets == "local-matrix"
+        self.passed = shape.measured == "passed"
+        self.joints = len(shape.joints)
+        self.numbers = shape.numbers
+        self.register_buffer("target_mean", target_mean)
+        self.register_buffer("target_std", target_std)
+        self.register_buffer("source", torch.tensor(_sources(shape)))
+        self.register_buffer("parents", torch.tensor(PARENTS[1:]))
+        self.register_buffer("std_source", torch.tensor(_std_sources(shape)))
+        # A small rotation by d turns a matrix's entries by a vector of norm sqrt(2) d, its first two columns by sqrt(4/3) d on average.
+        self.spread = 2.0 if self.local else 4.0 / 3.0
+
+    def forward(self, orientation: Tensor, mean: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
+        """Poses of frames.
+
+        Args:
+            orientation: (..., 6, 3, 3) calibrated bone orientations R_TB.
+            mean: (..., pose outputs + 15) means in normalised units.
+            deviation: the same shape, standard deviations.
+
+        Returns:
+            (..., 24, 3, 3) local rotations, joint 0 the pelvis sensor's orientation; (..., 24) standard deviations, radians.
+        """
+        size = self.joints * self.numbers
+        y = mean[..., :size] * self.target_std + self.target_mean
+        sigma = (deviation[..., :size] * self.target_std).unflatten(-1, (self.joints, self.numbers))
+        std = torch.sqrt(sigma.square().sum(-1) / self.spread)
+        std = torch.cat([torch.zeros_like(std[..., :1]), std], dim=-1).index_select(-1, self.std_source)
+        y = y.unflatten(-1, (self.joints, self.numbers))
+        root = orientation[..., -1, :, :]
+        identity = torch.eye(3, dtype=y.dtype).expand(y.shape[:-2] + (1, 3, 3))
+        if self.local:
+            rotations = nearest_rotation(y.unflatten(-1, (3, 3)))
+            local = torch.cat([identity, rotations], dim=-3).index_select(-3, self.source)
+            return torch.cat([root.unsqueeze(-3), local[..., 1:, :, :]], dim=-3), std
+        known = [identity, rotation_from_6d(y)]
+        if self.passed:
+            known.append(torch.matmul(root.unsqueeze(-3).transpose(-1, -2), orientation[..., :-1, :, :]))
+        relative = torch.cat(known, dim=-3).index_select(-3, self.source)
+        return local_rotations(relative, root, self.parents), std
+
+
+def _sources(shape: NetworkShape) -> list[int]:
+    """For each of the 24 joints the row of [identity, predicted..., measured...] that holds its rotation."""
+    rows = {joint: 1 + i for i, joint in enumerate(shape.joints)}
+    if shape.measured == "passed":
+        rows |= {bone: 1 + len(shape.joints) + i for i, bone in enumerate(BONES[:ROOT])}
+    result = [0]
+    for joint in range(1, 24):
+        # Feet, toes, wrists and hands rest: locally the identity, globally their parent's rotation.
+        rest = 0 if shape.targets == "local-matrix" else result[PARENTS[joint]]
+        result.append(rows.get(joint, rest))
+    return result
+
+
+def _std_sources(shape: NetworkShape) -> list[int]:
+    rows = {joint: 1 + i for i, joint in enumerate(shape.joints)}
+    return [rows.get(joint, 0) for joint in range(24)]
+
+
+class LstmCell(nn.Module):
+    """One LSTM direction as one Linear over input and state."""
+
+    def __init__(self, lstm: nn.LSTM, suffix: str) -> None:
+        super().__init__()
+        weights = [getattr(lstm, f"weight_{part}_l0{suffix}").detach() for part in ("ih", "hh")]
+        biases = [getattr(lstm, f"bias_{part}_l0{suffix}").detach() for part in ("ih", "hh")]
+        self.size = lstm.hidden_size
+        self.gates = nn.Linear(weights[0].shape[1] + self.size, 4 * self.size)
+        self.gates.weight = nn.Parameter(torch.cat(weights, dim=1))
+        self.gates.bias = nn.Parameter(biases[0] + biases[1])
+
+    def forward(self, x: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+        """New h and c (B, hidden) from input x (B, inputs) and the old ones."""
+        i, f, g, o = self.gates(torch.cat([x, h], dim=-1)).chunk(4, dim=-1)
+        c = torch.sigmoid(f) * c + torch.sigmoid(i) * torch.tanh(g)
+        return torch.sigmoid(o) * torch.tanh(c), c
+
+    @torch.jit.export
+    def run(self, x: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Outputs (B, T, hidden) over x (B, T, inputs) in order, and the last state."""
+        outputs: list[Tensor] = []
+        for frame in x.unbind(1):
+            h, c = self.forward(frame, h, c)
+            outputs.append(h)
+        return torch.stack(outputs, dim=1), h, c
+
+    @torch.jit.export
+    def run_back(self, x: Tensor) -> Tensor:
+        """Outputs (B, T, hidden) over x (B, T, inputs) from the last frame to the first, from a zero state."""
+        zero = x.new_zeros(x.shape[0], self.size)
+        return self.run(x.flip(1), zero, zero)[0].flip(1)
+
+    @torch.jit.export
+    def run_from_zero(self, x: Tensor) -> Tensor:
+        """Outputs (B, T, hidden) over x (B, T, inputs) in order, from a zero state."""
+        zero = x.new_zeros(x.shape[0], self.size)
+        return self.run(x, zero, zero)[0]
+
+
+class Ends(nn.Module):
+    """What both archives share: inputs before the recurrent layers, poses after them."""
+
+    def __init__(
+        self, network: PoseNetwork, input_mean: Tensor, input_std: Tensor, decoder: PoseDecoder
+    ) -> None:
+        super().__init__()
+        self.register_buffer("input_mean", input_mean)
+        self.register_buffer("input_std", input_std)
+        self.dense, self.mean, self.deviation = network.dense, network.mean, network.deviation
+        self.decoder = decoder
+        self.floor = SIGMA_FLOOR
+
+    def forward(self, orientation: Tensor, acceleration: Tensor) -> Tensor:
+        """First hidden layer (..., hidden) of calibrated frames."""
+        x = (network_input(orientation, acceleration) - self.input_mean) / self.input_std
+        return torch.relu(self.dense(x))
+
+    @torch.jit.export
+    def pose(self, orientation: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+        """Local rotations (..., 24, 3, 3) and deviations (..., 24) from the last recurrent outputs."""
+        deviation = nn.functional.softplus(self.deviation(hidden)) + self.floor
+        return self.decoder(orientation, self.mean(hidden), deviation)
+
+
+class RnnArchive(nn.Module):
+    """Unidirectional network: one step a frame, no look-ahead. Methods and shapes as in `BirnnArchive`."""
+
+    def __init__(self, network: PoseNetwork, ends: Ends) -> None:
+        super().__init__()
+        self.ends = ends
+        self.cell1 = LstmCell(network.lstm1, "")
+        self.cell2 = LstmCell(network.lstm2, "")
+
+    def forward(self, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
+        """Poses of a whole sequence."""
+        x = self.cell1.run_from_zero(self.ends(orientation, acceleration))
+        return self.ends.pose(orientation, self.cell2.run_from_zero(x))
+
+    @torch.jit.export
+    def window(self, orientation: Tensor, acceleration: Tensor, index: int) -> tuple[Tensor, Tensor]:
+        """Pose of frame `index` of a window; later frames are not used."""
+        rotations, std = self.forward(orientation[:, : index + 1], acceleration[:, : index + 1])
+        return rotations[:, -1], std[:, -1]
+
+    @torch.jit.export
+    def start(self, batch: int, future: int) -> list[Tensor]:
+        """State before the first frame; `future` must be 0."""
+        if future != 0:
+            raise ValueError("a unidirectional network has no future frames")
+        zero = torch.zeros(batch, self.cell1.size)
+        return [zero, zero, zero, zero]
+
+    @torch.jit.export
+    def stream(
+        self, orientation: Tensor, acceleration: Tensor, state: list[Tensor]
+    ) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """One frame on."""
+        h1, c1 = self.cell1(self.ends(orientation, acceleration), state[0], state[1])
+        h2, c2 = self.cell2(h1, state[2], state[3])
+        rotations, std = self.ends.pose(orientation, h2)
+        return rotations.unsqueeze(1), std.unsqueeze(1), [h1, c1, h2, c2]
+
+    @torch.jit.export
+    def drain(self, state: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Nothing is ever left."""
+        batch = state[0].shape[0]
+        return torch.zeros(batch, 0, 24, 3, 3), torch.zeros(batch, 0, 24)
+
+
+class BirnnArchive(nn.Module):
+    """Bidirectional network: whole sequence, exact window, or stream with carried forward states.
+
+    Everywhere `orientation` is (B, [T,] 6, 3, 3), calibrated bone orientations R_TB, and `acceleration` (B, [T,] 6, 3), m/s^2 in T
+    without gravity; B counts wearers. Poses are (B, [T,] 24, 3, 3) local rotations with (B, [T,] 24) standard deviations in radians.
+    """
+
+    def __init__(self, network: PoseNetwork, ends: Ends) -> None:
+        super().__init__()
+        self.ends = ends
+        self.forward1, self.backward1 = LstmCell(network.lstm1, ""), LstmCell(network.lstm1, "_reverse")
+        self.forward2, self.backward2 = LstmCell(network.lstm2, ""), LstmCell(network.lstm2, "_reverse")
+
+    def forward(self, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
+        """Poses of a whole sequence."""
+        x = self.ends(orientation, acceleration)
+        x = torch.cat([self.forward1.run_from_zero(x), self.backward1.run_back(x)], dim=-1)
+        x = torch.cat([self.forward2.run_from_zero(x), self.backward2.run_back(x)], dim=-1)
+        return self.ends.pose(orientation, x)
+
+    @torch.jit.export
+    def window(self, orientation: Tensor, acceleration: Tensor, index: int) -> tuple[Tensor, Tensor]:
+        """Pose of frame `index` of a window (DIP 3.4), the same as `forward` over the window gives there.
+
+        The second layer runs only over the frames that reach `index`.
+        """
+        x = self.ends(orientation, acceleration)
+        x = torch.cat([self.forward1.run_from_zero(x), self.backward1.run_back(x)], dim=-1)
+        before = self.forward2.run_from_zero(x[:, : index + 1])[:, -1]
+        after = self.backward2.run_back(x[:, index:])[:, 0]
+        return self.ends.pose(orientation[:, index], torch.cat([before, after], dim=-1))
+
+    @torch.jit.export
+    def start(self, batch: int, future: int) -> list[Tensor]:
+        """State before the first frame of a stream in which each pose sees `future` later frames.
+
+        The state is [h1, c1, h2, c2, waiting inputs, waiting layer-1 outputs, waiting orientations, a tensor whose length is
+        `future`]; frames wait until their future has come.
+        """
+        size = self.forward1.size
+        zero = torch.zeros(batch, size)
+        waiting = torch.zeros(batch, 0, size)
+        return [zero, zero, zero, zero, waiting, waiting, torch.zeros(batch, 0, 6, 3, 3), torch.zeros(future)]
+
+    @torch.jit.export
+    def oldest(self, state: list[Tensor]) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """Pose of the oldest waiting frame, seen with all that wait behind it, and the state without that frame.
+
+        Forward states are carried; backward passes start anew at the newest frame (latency-controlled bidirectional LSTM).
+        """
+        x = torch.cat([state[5], self.backward1.run_back(state[4])], dim=-1)
+        h2, c2 = self.forward2(x[:, 0], state[2], state[3])
+        after = self.backward2.run_back(x)[:, 0]
+        rotations, std = self.ends.pose(state[6][:, 0], torch.cat([h2, after], dim=-1))
+        rest = [state[0], state[1], h2, c2, state[4][:, 1:], state[5][:, 1:], state[6][:, 1:], state[7]]
+        return rotations, std, rest
+
+    @torch.jit.export
+    def stream(
+        self, orientation: Tensor, acceleration: Tensor, state: list[Tensor]
+    ) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """One frame on: the pose of the frame `future` frames ago, (B, 1, 24, 3, 3), or (B, 0, 24, 3, 3) while too few have come."""
+        x = self.ends(orientation, acceleration)
+        h1, c1 = self.forward1(x, state[0], state[1])
+        state = [
+            h1,
+            c1,
+            state[2],
+            state[3],
+            torch.cat([state[4], x.unsqueeze(1)], dim=1),
+            torch.cat([state[5], h1.unsqueeze(1)], dim=1),
+            torch.cat([state[6], orientation.unsqueeze(1)], dim=1),
+            state[7],
+        ]
+        if state[4].shape[1] <= state[7].shape[0]:
+            batch = x.shape[0]
+            return x.new_zeros(batch, 0, 24, 3, 3), x.new_zeros(batch, 0, 24), state
+        rotations, std, state = self.oldest(state)
+        return rotations.unsqueeze(1), std.unsqueeze(1), state
+
+    @torch.jit.export
+    def drain(self, state: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Poses of all frames that still wait when a stream ends, oldest first."""
+        batch = state[0].shape[0]
+        rotations: list[Tensor] = [torch.zeros(batch, 0, 24, 3, 3)]
+        stds: list[Tensor] = [torch.zeros(batch, 0, 24)]
+        while state[4].shape[1] > 0:
+            rotation, std, state = self.oldest(state)
+            rotations.append(rotation.unsqueeze(1))
+            stds.append(std.unsqueeze(1))
+        return torch.cat(rotations, dim=1), torch.cat(stds, dim=1)

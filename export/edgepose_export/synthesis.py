@@ -1,0 +1,115 @@
+"""Virtual IMUs on a body that motion capture moves (DIP 3.2)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgepose import rotations as rot
+from edgepose.placements import BONES, PLACEMENTS
+from edgepose.skeleton import Body, forward_kinematics, local_from_global
+from edgepose_export.mocap import Motion
+
+Array = NDArray[np.float64]
+
+GRAVITY = 9.81
+
+INERTIAL_FROM_BODY = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""R_IT of synthetic recordings: a wearer who faces +Z of T faces +X of I, so `heading:0` is their body frame."""
+
+BLEND_S = 1.0
+"""Seconds in which a held pose turns into the first pose of the take."""
+
+
+def straight_pose() -> Array:
+    """Global rotations (24, 3, 3) of the straight pose (N-pose): arms hang, everything else as in the zero pose."""
+    pose = np.tile(np.eye(3), (24, 1, 1))
+    pose[[16, 18, 20, 22]] = rot.about_axis("z", -np.pi / 2)
+    pose[[17, 19, 21, 23]] = rot.about_axis("z", np.pi / 2)
+    return pose
+
+
+def with_hold(motion: Motion, seconds: float) -> Motion:
+    """The take with the wearer standing straight for some seconds before it, facing as its first frame faces.
+
+    The pelvis stays where the first frame has it; the last `BLEND_S` seconds are added to get from one pose to the other.
+    """
+    first = motion.rotations[0]
+    forward = first[0, :, 2]
+    pose = rot.about_axis("y", np.arctan2(forward[0], forward[2])) @ straight_pose()
+    steps = round(BLEND_S * motion.rate)
+    # A smooth start and end (smoothstep), so that the virtual accelerometers see no jolt.
+    t = np.linspace(0.0, 1.0, steps, endpoint=False)
+    t = t * t * (3.0 - 2.0 * t)
+    way = rot.quat_to_matrix(
+        rot.slerp(rot.matrix_to_quat(pose)[None], rot.matrix_to_quat(first)[None], t[:, None])
+    )
+    hold = np.broadcast_to(pose, (round(seconds * motion.rate), 24, 3, 3))
+    still = np.broadcast_to(motion.translation[0], (len(hold) + steps, 3))
+    return motion._replace(
+        rotations=np.concatenate([hold, way, motion.rotations]),
+        translation=np.concatenate([still, motion.translation]),
+    )
+
+
+class VirtualImus(NamedTuple):
+    """What six virtual sensors measure.
+
+    Attributes:
+        orientation: (T, 6, 4) unit quaternions, sensor to inertial (R_IS), in the order of PLACEMENTS.
+        force: (T, 6, 3) specific force in the sensor frames, m/s^2.
+        rate_of_turn: (T, 6, 3) angular rates in the sensor frames, rad/s.
+    """
+
+    orientation: Array
+    force: Array
+    rate_of_turn: Array
+
+
+def virtual_imus(motion: Motion, body: Body, mounting: Array | None = None) -> VirtualImus:
+    """Sensors at the body's six skin points.
+
+    Accelerations are central differences over neighbouring frames, DIP eq. 3 with n = 1; the first and last frame repeat theirs.
+
+    Args:
+        motion: at the rate that is wanted of the sensors.
+        body: whose joints and sensor points are moved.
+        mounting: (6, 3, 3) R_BS, sensor frames in bone frames; aligned with the bones when None.
+    """
+    if len(motion.rotations) < 3:
+        raise ValueError("a take needs at least 3 frames for accelerations")
+    rotations, joints = forward_kinematics(
+        local_from_global(motion.rotations), body.offsets, motion.translation
+    )
+    bones = rotations[:, list(BONES)]
+    points = joints[:, list(BONES)] + np.einsum("tsij,sj->tsi", bones, body.sensors)
+    acceleration = (points[:-2] + points[2:] - 2.0 * points[1:-1]) * motion.rate**2
+    acceleration = np.concatenate([acceleration[:1], acceleration, acceleration[-1:]])
+    sensors = INERTIAL_FROM_BODY @ bones
+    if mounting is not None:
+        sensors = sensors @ mounting
+    force_inertial = acceleration @ INERTIAL_FROM_BODY.T + [0.0, 0.0, GRAVITY]
+    turns = rot.matrix_to_rotvec(rot.transpose(sensors[:-1]) @ sensors[1:]) * motion.rate
+    return VirtualImus(
+        orientation=rot.quat_continuous(rot.matrix_to_quat(sensors)),
+        force=np.einsum("tsji,tsj->tsi", sensors, force_inertial),
+        rate_of_turn=np.concatenate([turns, turns[-1:]]),
+    )
+
+
+def recording_arrays(motion: Motion, imus: VirtualImus, license_note: str) -> dict[str, NDArray]:
+    """Keys of an npz that is an IMU recording and an AMASS-like motion file at once: sensors, and the pose they were made from."""
+    arrays: dict[str, NDArray] = {"t": np.arange(len(motion.rotations)) / motion.rate}
+    for i, name in enumerate(PLACEMENTS):
+        arrays[f"{name}_quat"] = imus.orientation[:, i].astype(np.float32)
+        arrays[f"{name}_acc"] = imus.force[:, i].astype(np.float32)
+        arrays[f"{name}_gyr"] = imus.rate_of_turn[:, i].astype(np.float32)
+    poses = rot.matrix_to_rotvec(local_from_global(motion.rotations))
+    arrays["poses"] = poses.reshape(len(poses), 72).astype(np.float32)
+    arrays["trans"] = motion.translation.astype(np.float32)
+    arrays["mocap_framerate"] = np.array(motion.rate)
+    arrays["source"] = np.array(motion.source)
+    arrays["license"] = np.array(license_note)
+    return arrays
