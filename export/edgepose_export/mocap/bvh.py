@@ -1,0 +1,190 @@
+"""Reader for BVH files: any hierarchy, any channel order, position channels at any joint."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgepose.errors import EdgeposeError
+from edgepose.rotations import euler_to_matrix
+
+from .recording import LARGEST, Recording, tidy_rate
+
+Array = NDArray[np.float64]
+
+_CHANNELS = {
+    f"{axis}{kind}": (kind, "xyz".index(axis.lower())) for axis in "XYZ" for kind in ("position", "rotation")
+}
+
+
+def read_bvh(path: str | Path) -> Recording:
+    """All frames of a BVH file, lengths in the file's own unit (the format names none).
+
+    Rotation channels are multiplied in the order in which they are listed. Position channels of a joint
+    replace its offset: files that write both, write the offset into the channels again.
+
+    Raises:
+        EdgeposeError: the file cannot be read, breaks the format, is cut short, or holds a number that is not
+            finite.
+    """
+    path = Path(path)
+    try:
+        lines = path.read_bytes().decode("utf-8-sig").splitlines()
+    except OSError as error:
+        raise EdgeposeError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except UnicodeDecodeError:
+        raise EdgeposeError(f"{path}: not a text file, so not BVH") from None
+    names, parents, offsets, channels, start = _hierarchy(path, lines)
+    frame_time, table = _motion(path, lines, start, sum(map(len, channels)))
+
+    rotations = np.broadcast_to(np.eye(3), (len(table), len(names), 3, 3)).copy()
+    positions = np.broadcast_to(offsets, (len(table), len(names), 3)).copy()
+    column = 0
+    turning: dict[str, tuple[list[int], list[int]]] = {}  # rotation order -> joints, first columns
+    for joint, kinds in enumerate(channels):
+        turns = [column + i for i, (kind, _) in enumerate(kinds) if kind == "rotation"]
+        for i, (kind, axis) in enumerate(kinds):
+            if kind == "position":
+                positions[:, joint, axis] = table[:, column + i]
+        if turns:
+            order = "".join("xyz"[axis] for kind, axis in kinds if kind == "rotation")
+            joints, columns = turning.setdefault(order, ([], []))
+            joints.append(joint)
+            columns.extend(turns)
+        column += len(kinds)
+    for order, (joints, columns) in turning.items():
+        angles = np.radians(table[:, columns]).reshape(len(table), len(joints), len(order))
+        rotations[:, joints] = euler_to_matrix(angles, order)
+    return Recording(tuple(names), tuple(parents), offsets, rotations, positions, tidy_rate(frame_time))
+
+
+def _fail(path: Path, line: int, problem: str) -> NoReturn:
+    """Raise the error for a problem in a line, counted from 0 here and from 1 in the message."""
+    raise EdgeposeError(f"{path}, line {line + 1}: {problem}")
+
+
+def _numbers(path: Path, line: int, words: list[str], count: int) -> list[float]:
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        _fail(path, line, "a number was expected")
+    if len(values) != count:
+        _fail(path, line, f"{count} numbers were expected, {len(values)} found")
+    if not all(abs(value) < LARGEST for value in values):
+        _fail(path, line, "a number is not finite, or far too large")
+    return values
+
+
+def _hierarchy(
+    path: Path, lines: list[str]
+) -> tuple[list[str], list[int], Array, list[list[tuple[str, int]]], int]:
+    """Names, parents, offsets (J, 3), channels (kind, axis) of each joint, index of the line after MOTION."""
+    names: list[str] = []
+    parents: list[int] = []
+    offsets: list[list[float] | None] = []
+    channels: list[list[tuple[str, int]] | None] = []
+    open_joints: list[int] = []  # -1 stands for an end site, which holds an offset that nothing here needs
+    pending: int | None = None  # a joint that is named and not opened by its brace yet
+    seen_header = False
+    for number, line in enumerate(lines):
+        words = line.split()
+        if not words:
+            continue
+        key, rest = words[0], words[1:]
+        if not seen_header:
+            if key != "HIERARCHY":
+                _fail(path, number, "not a BVH file: HIERARCHY was expected")
+            seen_header = True
+        elif key == "{":
+            if pending is None:
+                _fail(path, number, "a brace opens without a joint")
+            open_joints.append(pending)
+            pending = None
+        elif pending is not None:
+            _fail(path, number, "an opening brace was expected")
+        elif key == "}":
+            if not open_joints:
+                _fail(path, number, "a brace closes that was not opened")
+            joint = open_joints.pop()
+            if joint >= 0 and (offsets[joint] is None or channels[joint] is None):
+                _fail(path, number, f"joint {names[joint]} has no OFFSET or no CHANNELS")
+        elif key in ("ROOT", "JOINT"):
+            if (key == "ROOT") != (not names) or (key == "JOINT") != bool(open_joints):
+                _fail(path, number, f"{key} at this place: one ROOT is expected, with each JOINT inside it")
+            name = " ".join(rest)
+            if not name or name in names:
+                _fail(path, number, f"joint name {name!r} is missing or used twice")
+            if open_joints[-1:] == [-1]:
+                _fail(path, number, "a joint inside an end site")
+            pending = len(names)
+            names.append(name)
+            parents.append(open_joints[-1] if open_joints else -1)
+            offsets.append(None)
+            channels.append(None)
+        elif key == "End":
+            if not open_joints or open_joints[-1] == -1:
+                _fail(path, number, "an end site outside a joint")
+            pending = -1
+        elif key == "OFFSET" and open_joints:
+            values = _numbers(path, number, rest, 3)
+            if open_joints[-1] >= 0:
+                offsets[open_joints[-1]] = values
+        elif key == "CHANNELS" and open_joints and open_joints[-1] >= 0:
+            kinds = [_CHANNELS.get(word) for word in rest[1:]]
+            known = [kind for kind in kinds if kind is not None]
+            if (
+                not rest
+                or rest[0] != str(len(known))
+                or len(known) != len(kinds)
+                or len(set(known)) != len(known)
+            ):
+                _fail(
+                    path,
+                    number,
+                    "CHANNELS needs their count, then that many different names such as Xrotation",
+                )
+            channels[open_joints[-1]] = known
+        elif key == "MOTION":
+            if open_joints or not names:
+                _fail(path, number, "MOTION before the hierarchy is closed")
+            table = np.array([offset for offset in offsets if offset is not None])
+            return names, parents, table, [kinds for kinds in channels if kinds is not None], number + 1
+        else:
+            _fail(path, number, f"{key!r} is not expected here")
+    raise EdgeposeError(
+        f"{path}: ends within the hierarchy, before MOTION" if seen_header else f"{path}: empty file"
+    )
+
+
+def _motion(path: Path, lines: list[str], start: int, width: int) -> tuple[float, Array]:
+    """Frame time in seconds and the table (T, width) of channel values as printed."""
+    body = [(number, words) for number in range(start, len(lines)) if (words := lines[number].split())]
+    if len(body) < 2:
+        raise EdgeposeError(f"{path}: ends before the first frame")
+    (at_count, count), (at_time, time) = body[:2]
+    if len(count) != 2 or count[0] != "Frames:" or not count[1].isdecimal() or len(count[1]) > 15:
+        _fail(path, at_count, "'Frames: <count>' was expected")
+    if time[:2] != ["Frame", "Time:"]:
+        _fail(path, at_time, "'Frame Time: <seconds>' was expected")
+    frame_time = _numbers(path, at_time, time[2:], 1)[0]
+    if not 1e-5 < frame_time < 1e2:
+        _fail(path, at_time, f"a frame time of {frame_time:g} s is not possible")
+    frames = body[2:]
+    for number, words in frames:
+        if len(words) != width:
+            _fail(path, number, f"a frame needs {width} numbers, this line has {len(words)}")
+    if len(frames) != int(count[1]) or not frames:
+        raise EdgeposeError(f"{path}: {count[1]} frames are announced, {len(frames)} are there (cut short?)")
+    try:
+        table = np.array([words for _, words in frames], dtype=float)
+    except ValueError:
+        for number, words in frames:
+            _numbers(path, number, words, width)
+        raise
+    bad = np.flatnonzero(~(np.abs(table) < LARGEST).all(axis=1))
+    if len(bad):
+        _fail(path, frames[bad[0]][0], "a number is not finite, or far too large")
+    return frame_time, table

@@ -1,0 +1,53 @@
+"""What a motion-capture file holds before its skeleton is known: a tree of joints and their local poses."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+LARGEST = 1e6
+"""Numbers of a file beyond this are taken for damage: no angle and no length in any unit comes near."""
+
+
+class Recording(NamedTuple):
+    """Poses of one skeleton over time. Lengths are in the unit of the file that was read (see the reader)."""
+
+    names: tuple[str, ...]
+    """Joint names (J); each joint comes after its parent."""
+    parents: tuple[int, ...]
+    """Index of each joint's parent; -1 for the root, which is joint 0."""
+    offsets: Array
+    """(J, 3) joint position in its parent's frame when all angles are zero."""
+    rotations: Array
+    """(T, J, 3, 3) rotation of each joint's frame against its parent's; the root's against the world."""
+    positions: Array
+    """(T, J, 3) joint position in its parent's frame; the root's in the world."""
+    rate: float
+    """Frames per second."""
+
+
+def forward(recording: Recording) -> tuple[Array, Array]:
+    """Global joint rotations (T, J, 3, 3) and positions (T, J, 3) in the file's world and unit."""
+    rotations = np.empty_like(recording.rotations)
+    positions = np.empty_like(recording.positions)
+    for j, parent in enumerate(recording.parents):
+        if parent < 0:
+            rotations[:, j] = recording.rotations[:, j]
+            positions[:, j] = recording.positions[:, j]
+        else:
+            rotations[:, j] = rotations[:, parent] @ recording.rotations[:, j]
+            moved = rotations[:, parent] @ recording.positions[:, j, :, None]
+            positions[:, j] = positions[:, parent] + moved[..., 0]
+    return rotations, positions
+
+
+def tidy_rate(frame_time: float) -> float:
+    """Frames per second of a frame time in seconds that was printed with few digits: .0083333 is 120 Hz."""
+    rate = 1.0 / frame_time
+    whole = round(rate)
+    return float(whole) if abs(rate - whole) < 1e-4 * rate else rate
