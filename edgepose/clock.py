@@ -1,0 +1,123 @@
+"""Device clocks on the source's time line: jitter of arrival taken out, drift followed, reboots survived.
+
+A device stamps samples with microseconds in 32 bits, which start at any value and wrap after 71.6 minutes.
+"""
+
+from __future__ import annotations
+
+from math import inf
+
+WRAP_US = 1 << 32
+STEP_S = 1e-6
+"""Smallest step between two times of one sensor, seconds."""
+
+_DRIFT = 200e-6
+_LATE_S = 0.05
+_LATE_FOR_S = 1.0
+_AHEAD_S = 1.0
+_BACK_S = 0.1
+
+
+def unwrap(t_us: int, expected_s: float) -> float:
+    """Seconds of a 32 bit microsecond clock, in the turn that comes nearest to the expected time."""
+    turns = round((expected_s * 1e6 - t_us) / WRAP_US)
+    return (t_us + turns * WRAP_US) * 1e-6
+
+
+class DeviceClock:
+    """Maps the clock of one sensor to host time.
+
+    A packet can come late but never early, so `arrival - device time` is the clocks' offset plus a delay that
+    is often near its smallest value. The offset is therefore a leaky minimum: it drops at once and rises by
+    200 ppm, more than quartz clocks drift apart. A device that rebooted (its time jumps back, or ahead of
+    what has passed here) starts a new offset, and so does one that has been later than 50 ms for a whole
+    second: its clock stood still, or it runs on something worse than quartz.
+
+    Attributes:
+        resets: times the offset began anew.
+    """
+
+    def __init__(self) -> None:
+        """Start with no packet seen."""
+        self.resets = 0
+        self._started = False
+        self._device_s = 0.0  # newest device time, unwrapped
+        self._arrival_s = 0.0
+        self._offset = 0.0
+        self._result = 0.0
+        self._window_s = 0.0  # arrival time at which the present look-out for lateness began
+        self._least_late = 0.0
+
+    def host_time(self, t_us: int, arrival_s: float) -> float:
+        """Host time of a measurement, seconds; always larger than that of the call before.
+
+        Args:
+            t_us: device time, microseconds modulo 2^32.
+            arrival_s: host time at which the packet came, seconds.
+        """
+        if not self._started:
+            self._started = True
+            self._restart(t_us, arrival_s)
+            self._result = arrival_s
+            return arrival_s
+        device_s = unwrap(t_us, self._device_s + arrival_s - self._arrival_s)
+        step = device_s - self._device_s
+        late = arrival_s - device_s - self._offset
+        if step < -_BACK_S or late < -_AHEAD_S:
+            self.resets += 1
+            self._restart(t_us, arrival_s)
+        elif step > 0:
+            if arrival_s - self._arrival_s > _LATE_FOR_S:
+                # One packet after a pause is no proof: a second of them is.
+                self._window_s, self._least_late = arrival_s, inf
+            self._device_s, self._arrival_s = device_s, arrival_s
+            rise = min(_DRIFT * step, late)  # negative where this packet came faster than any before
+            self._offset += rise
+            self._least_late = min(self._least_late, late - rise)
+            if arrival_s - self._window_s > _LATE_FOR_S:
+                if self._least_late > _LATE_S:
+                    self.resets += 1
+                    self._offset += self._least_late
+                self._window_s, self._least_late = arrival_s, inf
+        # Not the arrival: a packet can be measured long before it comes.
+        self._result = max(self._result + STEP_S, self._time(t_us))
+        return self._result
+
+    def _time(self, t_us: int) -> float:
+        return unwrap(t_us, self._device_s) + self._offset
+
+    def _restart(self, t_us: int, arrival_s: float) -> None:
+        self._device_s = t_us * 1e-6
+        self._arrival_s = self._window_s = arrival_s
+        self._offset = arrival_s - self._device_s
+        self._least_late = inf
+
+
+class CaptureClock:
+    """Device clocks of a raw capture, where arrival times are not known: device time is the time line.
+
+    The first sensor's clock leads. Another one that is more than a second away from it, and any that jumps
+    back or ahead (reboot; a pause over a minute), is set to the newest time reached.
+    """
+
+    def __init__(self) -> None:
+        """Start with no packet seen."""
+        self._now: float | None = None
+        self._offsets: dict[int, float] = {}
+        self._last: dict[int, float] = {}  # result of each sensor's last packet
+
+    def time(self, sensor: int, t_us: int) -> float:
+        """Time of a measurement, seconds; always larger than that of the sensor's packet before."""
+        last = self._last.get(sensor)
+        now = t_us * 1e-6 if self._now is None else self._now
+        offset = self._offsets.get(sensor, 0.0)
+        result = unwrap(t_us, (now if last is None else last) - offset) + offset
+        strange = abs(result - now) > 1.0 if last is None else not -_BACK_S < result - last < 60.0
+        if strange:
+            self._offsets[sensor] = now - t_us * 1e-6
+            result = now
+        if last is not None:
+            result = max(result, last + STEP_S)
+        self._last[sensor] = result
+        self._now = max(now, result)
+        return result

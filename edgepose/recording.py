@@ -1,0 +1,449 @@
+"""IMU recordings on disk: CSV, one row a sample, and NPZ, one array a quantity.
+
+Files are hostile until checked: what `read_recording` returns is finite, in time order and of unit length
+where it must be.
+"""
+
+from __future__ import annotations
+
+import csv
+import heapq
+import sys
+import zipfile
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import nullcontext
+from math import inf, nan
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, NamedTuple, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgepose.errors import EdgeposeError
+from edgepose.imu import ImuSample
+from edgepose.placements import PLACEMENTS
+
+Array = NDArray[np.float64]
+
+COLUMNS = "time_s,sensor,qw,qx,qy,qz,ax,ay,az,gx,gy,gz,mx,my,mz"
+"""Header of the CSV form."""
+
+QUANTITIES = {"quat": 4, "acc": 3, "gyr": 3, "mag": 3}
+"""Numbers in each quantity of a sample, in the order of the columns."""
+
+MAX_SAMPLES = 20_000_000
+"""Most samples that are read into memory: 9 hours of six sensors at 100 Hz."""
+
+_WIDTH = COLUMNS.count(",") + 1
+_MAX_LINE = 4096
+_MAX_BYTES = 2 << 30
+_FREE_BYTES = 256 << 20  # unpacked sizes up to which the ratio does not matter: a simulated rest packs well
+_MAX_RATIO = 100  # real recordings pack less than 3:1
+_MAX_VALUE = 1e6  # no sensor measures more, in any of the units
+_MAX_TIME_S = 1e11
+_CHUNK = 4096
+
+
+class SensorData(NamedTuple):
+    """Samples of one sensor.
+
+    Attributes:
+        time_s: (N,) times, never decreasing, seconds.
+        quat: (N, 4) unit quaternions w, x, y, z, sensor to inertial; None if not measured.
+        acc: (N, 3) specific force, sensor frame, m/s^2; None if not measured.
+        gyr: (N, 3) angular rate, sensor frame, rad/s; None if not measured.
+        mag: (N, 3) magnetic field, sensor frame, uT; None if not measured.
+
+    A row of NaN means not measured at that time (a magnetometer slower than the rest).
+    """
+
+    time_s: Array
+    quat: Array | None = None
+    acc: Array | None = None
+    gyr: Array | None = None
+    mag: Array | None = None
+
+
+class Recording(NamedTuple):
+    """What six sensors measured.
+
+    Attributes:
+        sensors: data by placement name, in the order of PLACEMENTS.
+        metadata: rate, frame, units, placements and what else the file says about itself.
+        damage: one line for the user if the file's end is cut off (file, row, what to do); the rest is here.
+    """
+
+    sensors: dict[str, SensorData]
+    metadata: dict[str, str]
+    damage: str | None = None
+
+
+def read_recording(path: Path | str) -> Recording:
+    """Recording of a .npz file, or of a CSV file of any other name; "-" is CSV on stdin.
+
+    Raises:
+        EdgeposeError: the file cannot be read, or holds anything else than a recording of all six sensors.
+    """
+    path = Path(path)
+    try:
+        recording = _read_npz(path) if path.suffix.lower() == ".npz" else _read_csv(path)
+    except (OSError, UnicodeDecodeError) as error:
+        raise EdgeposeError(f"{path}: cannot read it: {getattr(error, 'strerror', None) or error}") from None
+    missing = [name for name in PLACEMENTS if name not in recording.sensors]
+    if missing:
+        raise EdgeposeError(f"{path}: no samples of {', '.join(missing)}; a recording needs all six sensors")
+    return recording._replace(sensors={name: recording.sensors[name] for name in PLACEMENTS})
+
+
+def samples(recording: Recording) -> Iterator[ImuSample]:
+    """All samples of a recording in time order."""
+    streams = [_sensor_samples(PLACEMENTS.index(name), data) for name, data in recording.sensors.items()]
+    return heapq.merge(*streams, key=attrgetter("time_s"))
+
+
+def from_samples(rows: Iterable[ImuSample], metadata: Mapping[str, str] | None = None) -> Recording:
+    """Recording of samples, each sensor's in time order."""
+    table = _Table("samples")
+    for number, sample in enumerate(rows, start=1):
+        row = [sample.time_s]
+        empty = 0
+        for name, size in QUANTITIES.items():
+            values = getattr(sample, name)
+            row += (nan,) * size if values is None else values
+            empty += size if values is None else 0
+        table.add(PLACEMENTS[sample.sensor], number, row, empty)
+    return Recording(table.sensors(), dict(metadata or {}))
+
+
+def _sensor_samples(index: int, data: SensorData) -> Iterator[ImuSample]:
+    for start in range(0, len(data.time_s), _CHUNK):
+        rows = slice(start, start + _CHUNK)
+        times = data.time_s[rows].tolist()
+        # A number that is NaN differs from itself.
+        columns = [
+            [None] * len(times)
+            if q is None
+            else [tuple(v) if v[0] == v[0] else None for v in q[rows].tolist()]
+            for q in data[1:]
+        ]
+        for time_s, *quantities in zip(times, *columns, strict=True):
+            yield ImuSample(index, time_s, *quantities)
+
+
+# --- CSV ----------------------------------------------------------------------------------------------------
+
+
+def csv_header(metadata: Mapping[str, str]) -> str:
+    """First lines of a CSV recording, up to its column names."""
+    comments = [f"# {key}: {value}\n" for key, value in metadata.items()]
+    return "".join(comments) + COLUMNS + "\n"
+
+
+def csv_row(sample: ImuSample) -> str:
+    """One line of a CSV recording: times to the microsecond, numbers to nine digits."""
+    cells = [f"{sample.time_s:.6f}", PLACEMENTS[sample.sensor]]
+    for quantity, size in ((sample.quat, 4), (sample.acc, 3), (sample.gyr, 3), (sample.mag, 3)):
+        cells += [""] * size if quantity is None else [f"{v:.9g}" for v in quantity]
+    return ",".join(cells) + "\n"
+
+
+def write_csv(path: Path | str, recording: Recording) -> None:
+    """Write a recording as CSV, all sensors merged in time order."""
+    with Path(path).open("w", encoding="utf-8", newline="") as file:
+        file.write(csv_header(recording.metadata))
+        file.writelines(map(csv_row, samples(recording)))
+
+
+def _read_csv(path: Path) -> Recording:
+    # Bytes that are no UTF-8 become a mark that is no number either.
+    opened = (
+        nullcontext(sys.stdin)
+        if str(path) == "-"
+        else path.open(encoding="utf-8-sig", errors="replace", newline="")
+    )
+    with opened as file:
+        lines = _Lines(path, file)
+        metadata = _read_metadata(path, lines)
+        table, damage = _read_rows(path, lines)
+    return Recording(table.sensors(), metadata, damage)
+
+
+class _Lines:
+    """Lines of a text file, counted, none longer than a recording's can be."""
+
+    def __init__(self, path: Path, file: TextIO) -> None:
+        self._path, self._file = path, file
+        self.number = 0
+        self.line = ""
+
+    def __iter__(self) -> _Lines:
+        return self
+
+    def __next__(self) -> str:
+        line = self._file.readline(_MAX_LINE)
+        if not line:
+            raise StopIteration
+        self.line = line
+        self.number += 1
+        if len(self.line) == _MAX_LINE:
+            raise EdgeposeError(
+                f"{self._path}: row {self.number} is longer than {_MAX_LINE} characters; is it a CSV file?"
+            )
+        return self.line
+
+    @property
+    def cut(self) -> bool:
+        """Whether the present line is the last one and has no end."""
+        return not self.line.endswith(("\n", "\r"))
+
+
+def _read_metadata(path: Path, lines: _Lines) -> dict[str, str]:
+    metadata: dict[str, str] = {}
+    for line in lines:
+        if not line.startswith("#"):
+            header = line.strip().replace('"', "").replace(" ", "")
+            if header == COLUMNS:
+                return metadata
+            raise EdgeposeError(
+                f"{path}: row {lines.number} has the columns {_short(line)}; a recording has {COLUMNS}"
+            )
+        key, _, value = line[1:].partition(":")
+        metadata[key.strip()] = value.strip()
+    raise EdgeposeError(f"{path}: the file is empty; a recording starts with the columns {COLUMNS}")
+
+
+def _read_rows(path: Path, lines: _Lines) -> tuple[_Table, str | None]:
+    table = _Table(str(path))
+    try:
+        for cells in csv.reader(lines, quoting=csv.QUOTE_NONE):
+            if not cells:
+                continue
+            try:
+                sensor, numbers = _parse_row(cells, lines.cut)
+            except ValueError as error:
+                if not lines.cut:
+                    raise EdgeposeError(f"{path}: row {lines.number} {error}") from None
+                return table, (
+                    f"{path}: row {lines.number} is cut off, {table.count} samples before it are good; "
+                    "delete that row or copy the file again"
+                )
+            table.add(sensor, lines.number, numbers, cells.count(""))
+    except csv.Error as error:
+        raise EdgeposeError(f"{path}: row {lines.number}: {error}") from None
+    return table, None
+
+
+def _parse_row(cells: list[str], cut: bool) -> tuple[str, list[float]]:
+    """Sensor and numbers (time first, NaN where empty) of a row; cut says that the row has no line end.
+
+    Raises:
+        ValueError: what is wrong with the row.
+    """
+    if len(cells) != _WIDTH:
+        raise ValueError(f"has {len(cells)} columns and not {_WIDTH}")
+    time_s, sensor, *rest = cells
+    sensor = sensor.strip('"')  # some programs quote text; a quoted line break cannot be meant here
+    if sensor not in PLACEMENTS:
+        raise ValueError(f"names an unknown sensor {_short(sensor)}; the names are {', '.join(PLACEMENTS)}")
+    if cut and (rest[-1] or rest[-2]):
+        # Digits may be missing, which nobody can see.
+        raise ValueError("has no line end")
+    try:
+        return sensor, [float(time_s), *[float(cell) if cell else nan for cell in rest]]
+    except ValueError as error:
+        raise ValueError(f"holds something that is no number ({_short(str(error))})") from None
+
+
+def _short(text: str) -> str:
+    return repr(text.strip() if len(text) < 80 else text[:77] + "...")
+
+
+# --- NPZ ----------------------------------------------------------------------------------------------------
+
+
+def write_npz(path: Path | str, recording: Recording) -> None:
+    """Write a recording as NPZ, quantities as float32.
+
+    Times are one array `t` where all sensors share them, else `<placement>_t`. `sparse` names the arrays in
+    which a row of NaN means not measured.
+    """
+    arrays: dict[str, NDArray[Any]] = {}
+    times = [data.time_s for data in recording.sensors.values()]
+    shared = all(np.array_equal(times[0], other) for other in times[1:])
+    if shared:
+        arrays["t"] = times[0]
+    for placement, data in recording.sensors.items():
+        if not shared:
+            arrays[f"{placement}_t"] = data.time_s
+        for name, values in zip(QUANTITIES, data[1:], strict=True):
+            if values is not None:
+                arrays[f"{placement}_{name}"] = values.astype(np.float32)
+    arrays["sparse"] = np.array([key for key, values in arrays.items() if np.isnan(values).any()], dtype=str)
+    arrays["metadata"] = np.array([f"{key}: {value}" for key, value in recording.metadata.items()], dtype=str)
+    # A file and not a name, to which numpy might add .npz.
+    with Path(path).open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def _read_npz(path: Path) -> Recording:
+    try:
+        arrays = _load_arrays(path)
+    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, RuntimeError, MemoryError) as error:
+        raise EdgeposeError(
+            f"{path}: not a whole NPZ file ({error}); what is left of a cut one cannot be read: copy it again"
+        ) from None
+    sparse = set(_lines_of(path, arrays, "sparse"))
+    metadata = {}
+    for line in _lines_of(path, arrays, "metadata"):
+        key, _, value = line.partition(":")
+        metadata[key.strip()] = value.strip()
+    table = _Table(str(path))
+    for placement in PLACEMENTS:
+        if any(f"{placement}_{name}" in arrays for name in QUANTITIES):
+            _add_arrays(path, table, placement, arrays, sparse)
+    return Recording(table.sensors(), metadata)
+
+
+def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Arrays of an NPZ file that belong to a recording."""
+    with zipfile.ZipFile(path) as archive:
+        # Sizes as declared are the most that zipfile unpacks.
+        size = sum(member.file_size for member in archive.infolist())
+    if size > _MAX_BYTES or size > max(_FREE_BYTES, _MAX_RATIO * path.stat().st_size):
+        raise EdgeposeError(f"{path}: unpacks to {size >> 20} MB, which is no recording")
+    result = {}
+    with np.load(path, allow_pickle=False) as archive:
+        for key in archive.files:
+            placement, _, name = key.rpartition("_")
+            is_sensor = name in QUANTITIES or (name == "t" and placement)
+            if is_sensor and placement not in PLACEMENTS:
+                raise EdgeposeError(
+                    f"{path}: {_short(key)} is of an unknown sensor; the names are {', '.join(PLACEMENTS)}"
+                )
+            if is_sensor or key in ("t", "sparse", "metadata"):
+                result[key] = archive[key]
+    return result
+
+
+def _lines_of(path: Path, arrays: Mapping[str, NDArray[Any]], key: str) -> list[str]:
+    lines = arrays.get(key, np.array([], dtype=str))
+    if lines.ndim != 1 or lines.dtype.kind != "U":
+        raise EdgeposeError(f"{path}: {key!r} is not an array of strings")
+    return [str(line) for line in lines]
+
+
+def _add_arrays(
+    path: Path, table: _Table, placement: str, arrays: Mapping[str, NDArray[Any]], sparse: set[str]
+) -> None:
+    key = f"{placement}_t" if f"{placement}_t" in arrays else "t"
+    if key not in arrays:
+        raise EdgeposeError(
+            f"{path}: has no times of {placement}; they are in an array 't' or '{placement}_t'"
+        )
+    columns = [_numbers(path, arrays, key, (arrays[key].size,))[:, None]]
+    n = len(columns[0])
+    empty = np.zeros(n, dtype=int)
+    for name, size in QUANTITIES.items():
+        key = f"{placement}_{name}"
+        if key not in arrays:
+            columns.append(np.full((n, size), nan))
+            empty += size
+            continue
+        columns.append(_numbers(path, arrays, key, (n, size)))
+        if key in sparse:
+            empty += np.isnan(columns[-1]).sum(axis=1)
+    table.add_block(placement, np.arange(n), np.hstack(columns), empty)
+
+
+def _numbers(path: Path, arrays: Mapping[str, NDArray[Any]], key: str, shape: tuple[int, ...]) -> Array:
+    array = arrays[key]
+    if array.dtype.kind not in "fiu" or array.shape != shape:
+        raise EdgeposeError(f"{path}: {key!r} is {array.dtype} {array.shape} and not numbers {shape}")
+    return array.astype(np.float64)
+
+
+# --- checks -------------------------------------------------------------------------------------------------
+
+
+class _Table:
+    """Rows of numbers (time, then the quantities) by sensor, checked a block at a time.
+
+    Attributes:
+        count: rows so far.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._rows: dict[str, list[list[float]]] = {}
+        self._marks: dict[str, list[tuple[int, int]]] = {}  # number and empty cells of each of these rows
+        self._blocks: dict[str, list[Array]] = {}
+        self._checked = 0
+        self.count = 0
+
+    def add(self, sensor: str, number: int, row: list[float], empty: int) -> None:
+        """Take one row: its number in the file, 14 numbers, how many of them are empty (NaN)."""
+        rows = self._rows.setdefault(sensor, [])
+        rows.append(row)
+        self._marks.setdefault(sensor, []).append((number, empty))
+        self.count += 1
+        if len(rows) == _CHUNK:
+            self._close(sensor)
+
+    def add_block(self, sensor: str, numbers: NDArray[np.int_], rows: Array, empty: NDArray[np.int_]) -> None:
+        """Take rows (n, 14) with their numbers (n,) and counts of empty cells (n,).
+
+        Raises:
+            EdgeposeError: there is something in them that no sensor measures.
+        """
+        if not len(rows):
+            return
+        blocks = self._blocks.setdefault(sensor, [])
+        before = blocks[-1][-1, 0] if blocks else -inf
+
+        def check(bad: Any, problem: str) -> None:
+            if bad.any():
+                raise EdgeposeError(f"{self._name}: row {numbers[np.argmax(bad)]}: {sensor} {problem}")
+
+        check(~(np.abs(rows[:, 0]) < _MAX_TIME_S), "has no time")
+        check(np.diff(rows[:, 0], prepend=before) < 0, "goes back in time; sort the rows by time_s")
+        values = rows[:, 1:]
+        check(
+            (np.abs(values) < _MAX_VALUE).sum(axis=1) + empty != values.shape[1],
+            "has a number that is NaN or absurd",
+        )
+        start = 0
+        for name, size in QUANTITIES.items():
+            there = ~np.isnan(values[:, start : start + size])
+            check(there.any(axis=1) & ~there.all(axis=1), f"has only a part of {name}")
+            start += size
+        norm = np.linalg.norm(values[:, :4], axis=1)
+        check(np.abs(norm - 1.0) > 0.1, "has a quaternion that is not of unit length")
+        values[:, :4] /= norm[:, None]
+        blocks.append(rows)
+        self._checked += len(rows)
+        if self._checked > MAX_SAMPLES:
+            raise EdgeposeError(f"{self._name}: more than {MAX_SAMPLES} samples; split the recording")
+
+    def sensors(self) -> dict[str, SensorData]:
+        """All data by sensor."""
+        for sensor in self._rows:
+            self._close(sensor)
+        result = {}
+        for sensor, blocks in self._blocks.items():
+            rows = np.concatenate(blocks)
+            quantities: list[Array | None] = []
+            start = 1
+            for size in QUANTITIES.values():
+                part = rows[:, start : start + size]
+                quantities.append(None if np.isnan(part).all() else part)
+                start += size
+            result[sensor] = SensorData(rows[:, 0], *quantities)
+        return result
+
+    def _close(self, sensor: str) -> None:
+        rows, marks = self._rows[sensor], np.array(self._marks[sensor]).reshape(-1, 2)
+        if rows:
+            self.add_block(sensor, marks[:, 0], np.array(rows), marks[:, 1])
+        self._rows[sensor], self._marks[sensor] = [], []

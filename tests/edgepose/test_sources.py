@@ -1,0 +1,292 @@
+import contextlib
+import os
+import pty
+import threading
+import time
+import tty
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import serial
+
+from edgepose.errors import EdgeposeError
+from edgepose.placements import PLACEMENTS
+from edgepose.recording import csv_header, csv_row, read_recording, samples, write_csv
+from edgepose.sources import open_source
+from edgepose.sources.serial_port import SerialSource
+from edgepose.sync import FrameClock
+from firmware_protocols.native import Info, Packet, encode, encode_info
+
+REAL = Path(__file__).parents[1] / "data" / "imu" / "six-sites-3s.npz"
+
+
+@pytest.fixture
+def port():
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    yield master, os.ttyname(slave)
+    for fd in (master, slave):
+        with contextlib.suppress(OSError):  # a test unplugged it
+            os.close(fd)
+
+
+def packets(n, start_us=0, ids=range(6), period_us=10_000):
+    return [
+        Packet(
+            s,
+            i & 0xFFFF,
+            (start_us + period_us * i) % (1 << 32),
+            (0.6, 0.0, 0.8, 0.0),
+            (0.0, 0.0, 9.81),
+            (0.1, 0.0, 0.0),
+        )
+        for i in range(n)
+        for s in ids
+    ]
+
+
+class Device(threading.Thread):
+    """Writes chunks at 100 Hz to the other end of a port, until told to stop."""
+
+    def __init__(self, master, chunks):
+        super().__init__(daemon=True)
+        self.master, self.chunks = master, chunks
+        self.stop = threading.Event()
+
+    def run(self):
+        for chunk in self.chunks:
+            if self.stop.wait(0.01):
+                return
+            os.write(self.master, chunk)
+
+    def __enter__(self):
+        self.start()
+        return self
+
+    def __exit__(self, *_):
+        self.stop.set()
+        self.join()
+
+
+def chunks(n, **kwargs):
+    rows = packets(n, **kwargs)
+    width = len(rows) // n
+    return [b"".join(map(encode, rows[i : i + width])) for i in range(0, len(rows), width)]
+
+
+# --- serial -------------------------------------------------------------------------------------------------
+
+
+def test_live_packets_become_samples_and_frames(port):
+    master, name = port
+    got, frames = [], []
+    with open_source(port=name) as source, Device(master, chunks(200, start_us=(1 << 32) - 500_000)):
+        clock = FrameClock()
+        for now_s, batch in source:
+            assert abs(now_s - time.time()) < 1.0
+            got += batch
+            clock.push(batch, now_s)
+            frames += clock.frames(now_s)
+            if len(got) > 600:
+                break
+    assert {s.sensor for s in got} == set(range(6))
+    assert got[0].quat == pytest.approx((0.6, 0.0, 0.8, 0.0), abs=1e-4)
+    assert got[0].acc == (0.0, 0.0, 9.81)
+    assert got[0].gyr == pytest.approx((0.1, 0.0, 0.0))
+    times = [s.time_s for s in got if s.sensor == 2]
+    assert all(b > a for a, b in pairwise(times))
+    assert [f.index for f in frames] == list(range(len(frames)))
+    assert len(frames) > 20
+    # Bytes that came before the first look may be gone, in the middle of a packet.
+    assert source.counters.packets == len(got)
+    assert source.counters.bad <= 1
+    assert source.counters.lost == 0
+
+
+def test_silent_port_still_gives_batches(port):
+    with open_source(port=port[1]) as source:
+        batches = iter(source)
+        times = [next(batches) for _ in range(5)]
+    assert all(batch == [] for _, batch in times)
+    assert all(b[0] > a[0] for a, b in pairwise(times))
+
+
+def test_unknown_ids_are_counted_and_told_once(port, caplog):
+    master, name = port
+    with open_source(port=name) as source, Device(master, chunks(200, ids=(0, 9))):
+        for _ in source:
+            if source.counters.unknown > 20:
+                break
+    assert source.counters.packets > 10
+    assert [r.getMessage() for r in caplog.records] == [
+        f"{name}: packets of sensor id 9 are left out; ids are 0 to 5"
+    ]
+
+
+def drain(name, monkeypatch, seconds=0.3):
+    """The error in which a port ends, with the time-outs made short."""
+    monkeypatch.setattr("edgepose.sources.serial_port.SILENCE_S", seconds)
+    monkeypatch.setattr("edgepose.sources.serial_port.NOISE_S", seconds)
+    got = []
+    with open_source(port=name, baud=9600) as source, pytest.raises(EdgeposeError) as info:
+        got.extend(sample for _, batch in source for sample in batch)
+    assert str(info.value).startswith(f"{name}: ")
+    assert "\n" not in str(info.value)
+    return str(info.value), got
+
+
+def test_silence(port, monkeypatch):
+    message, _ = drain(port[1], monkeypatch)
+    assert "nothing came" in message
+
+
+def test_noise(port, monkeypatch):
+    noise = np.random.default_rng(0).integers(0, 256, 40_000, dtype=np.uint8).tobytes()
+    with Device(port[0], [noise[i : i + 200] for i in range(0, len(noise), 200)]):
+        message, got = drain(port[1], monkeypatch)
+    assert got == []
+    assert "bytes" in message
+    assert "--baud (now 9600)" in message
+    assert "--protocol" in message
+
+
+def test_only_unknown_ids(port, monkeypatch):
+    with Device(port[0], chunks(200, ids=(7, 9))):
+        message, _ = drain(port[1], monkeypatch)
+    assert "only of sensor ids 7, 9" in message
+
+
+def test_frame_with_z_down_is_refused(port, monkeypatch):
+    with Device(port[0], [encode_info(Info(3, "x", frame="NED"))] * 100):
+        message, _ = drain(port[1], monkeypatch)
+    assert "NED" in message
+
+
+def test_unplugged_port(port, monkeypatch):
+    master, name = port
+    with Device(master, chunks(30)) as device:
+        threading.Thread(
+            target=lambda: (device.join(), time.sleep(0.2), os.close(master)), daemon=True
+        ).start()
+        message, got = drain(name, monkeypatch, 5.0)
+    assert f"disappeared after {len(got)} packets" in message
+    assert len(got) > 100
+
+
+def test_unknown_port():
+    with pytest.raises(EdgeposeError, match=r"/dev/nowhere: no such port; ports here: "):
+        open_source(port="/dev/nowhere").__enter__()
+
+
+def test_busy_port(port):
+    with open_source(port=port[1]), pytest.raises(EdgeposeError, match="in use"):
+        open_source(port=port[1]).__enter__()
+    # Closing gives it free.
+    with open_source(port=port[1]):
+        pass
+
+
+def test_port_without_permission(monkeypatch):
+    def refuse(*_, **__):
+        raise serial.SerialException(13, "could not open port")
+
+    monkeypatch.setattr(serial, "Serial", refuse)
+    with pytest.raises(EdgeposeError, match="dialout"):
+        open_source(port="/dev/ttyX").__enter__()
+
+
+def test_not_a_port(tmp_path):
+    (tmp_path / "file").write_text("x")
+    for path, baud in ((tmp_path / "file", 115200), ("/dev/null", 115200)):
+        with pytest.raises(EdgeposeError, match="cannot open it as a serial port"):
+            open_source(port=str(path), baud=baud).__enter__()
+
+
+def test_impossible_speed(port):
+    with pytest.raises(EdgeposeError, match="cannot open"):
+        SerialSource(port[1], -1).__enter__()
+
+
+# --- files --------------------------------------------------------------------------------------------------
+
+
+def everything(**options):
+    with open_source(**options) as source:
+        batches = list(source)
+    return source, batches, [s for _, batch in batches for s in batch]
+
+
+@pytest.mark.parametrize("kind", ["npz", "csv"])
+def test_recording(tmp_path, kind):
+    path = REAL
+    if kind == "csv":
+        path = tmp_path / "a.csv"
+        write_csv(path, read_recording(REAL))
+    source, batches, got = everything(file=path)
+    assert len(got) == source.counters.packets == 1800
+    assert source.damage is None
+    for now_s, batch in batches:
+        assert now_s == max(s.time_s for s in batch)
+    assert all(a[0] < b[0] for a, b in pairwise(batches))
+
+
+def test_cut_recording_gives_what_is_good(tmp_path):
+    rows = list(samples(read_recording(REAL)))[:60]
+    (tmp_path / "a.csv").write_text((csv_header({}) + "".join(map(csv_row, rows)))[:-20])
+    source, _, got = everything(file=tmp_path / "a.csv")
+    assert len(got) == 59
+    assert "cut off" in source.damage
+
+
+def test_capture_with_wrap_noise_and_loss(tmp_path):
+    rows = packets(100, start_us=(1 << 32) - 300_000)
+    del rows[60]
+    data = b"\x01\x02\x03" + b"".join(map(encode, rows[:300])) + os.urandom(50).replace(b"\0", b"\1") + b"\0"
+    (tmp_path / "a.bin").write_bytes(data + b"".join(map(encode, rows[300:]))[:-5])
+    source, _, got = everything(file=tmp_path / "a.bin")
+    assert len(got) == source.counters.packets >= 597
+    assert source.counters.lost >= 1
+    assert source.counters.bad >= 1
+    first = [s.time_s for s in got if s.sensor == 1]
+    assert first[-1] - first[0] == pytest.approx(0.99, abs=1e-3)
+    clock = FrameClock()
+    clock.push(got, 0.0)
+    assert 58 <= len(clock.flush()) <= 60
+
+
+def test_capture_without_packets(tmp_path):
+    (tmp_path / "a.raw").write_bytes(os.urandom(5000))
+    with pytest.raises(EdgeposeError, match="5000 bytes"):
+        everything(file=tmp_path / "a.raw")
+    (tmp_path / "b.raw").write_bytes(b"")
+    with pytest.raises(EdgeposeError, match="0 bytes"):
+        everything(file=tmp_path / "b.raw")
+
+
+@pytest.mark.parametrize("name", ["none.bin", "none.csv"])
+def test_missing_file(tmp_path, name):
+    with pytest.raises(EdgeposeError, match="No such file"):
+        everything(file=tmp_path / name)
+
+
+def test_realtime_takes_its_time(tmp_path):
+    (tmp_path / "a.bin").write_bytes(b"".join(map(encode, packets(30))))
+    start = time.monotonic()
+    _, batches, got = everything(file=tmp_path / "a.bin", realtime=True)
+    assert time.monotonic() - start >= 0.27
+    assert len(got) == 180
+    assert all(s.time_s <= now_s for now_s, batch in batches for s in batch)
+    assert len(batches) >= 28
+
+
+def test_options():
+    for options in ({}, {"port": "a", "file": "b.csv"}):
+        with pytest.raises(EdgeposeError, match="--port or --file"):
+            open_source(**options)
+    with pytest.raises(EdgeposeError, match="unknown protocol"):
+        open_source(port="a", protocol="x")
+    with pytest.raises(EdgeposeError, match="unknown kind"):
+        open_source(file="a.txt")
+    assert len(PLACEMENTS) == 6
