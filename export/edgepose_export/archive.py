@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import warnings
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from edgepose.archive import METADATA_FILE
+from edgepose import __version__
+from edgepose.archive import FORMAT, METADATA_FILE
+from edgepose.placements import PLACEMENTS
+from edgepose.skeleton import JOINTS
 from edgepose_export.networks import BirnnArchive, Ends, PoseDecoder, PoseNetwork, RnnArchive
 
 METHODS = ["window", "start", "stream", "drain"]
@@ -45,3 +48,35 @@ def save(module: torch.jit.ScriptModule, path: Path, metadata: dict[str, object]
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="`torch.jit", category=DeprecationWarning)
         torch.jit.save(module, str(path), _extra_files={METADATA_FILE: json.dumps(metadata, indent=2)})
+
+
+def describe(name: str, network: PoseNetwork, checkpoint: dict[str, Any], past: int, future: int) -> dict[str, Any]:
+    """Metadata of an archive, without measures.
+
+    Args:
+        name: of the model.
+        network: whose weights the archive holds.
+        checkpoint: the training run's state.
+        past: default frames before the present one in a window.
+        future: default frames after it.
+    """
+    shape = network.shape
+    return {
+        "format": FORMAT,
+        "name": name,
+        "kind": shape.kind,
+        "hidden": shape.hidden,
+        "parameters": sum(p.numel() for p in network.parameters()),
+        "placements": list(PLACEMENTS),
+        "rate_hz": 60.0,
+        "past": past,
+        "future": future,
+        "joints": [JOINTS[joint] for joint in shape.joints],
+        "targets": shape.targets,
+        "measured_bones": shape.measured,
+        "precision": "f32",
+        "training": {"steps": checkpoint["step"], **checkpoint["data"], "config": json.loads(checkpoint["config"])},
+        "measures": {},
+        "edgepose": __version__,
+        "torch": torch.__version__,
+    }

@@ -6,7 +6,7 @@ import re
 import zipfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -67,8 +67,8 @@ def read_take(path: Path) -> Take:
     )
 
 
-PARTS = ("train", "validation", "cmu-walk-run", "cmu-02", "bandai-styles")
-"""Parts of the split; the last three are held out and named in every card."""
+HELD_OUT = ("cmu-walk-run", "cmu-02", "bandai-styles")
+"""Parts of the split that no training sees."""
 
 
 def part_of(name: str) -> str:
@@ -78,7 +78,7 @@ def part_of(name: str) -> str:
     out. CMU subject 03 and the style "not-confident" tell training when to stop. Other splits leak: Bandai-Namco's takes of one
     style resemble each other so closely that a nearest-neighbour look-up would win.
     """
-    if match := re.fullmatch(r"(\d\d)_\d\d", name):
+    if match := re.match(r"(\d\d)_\d\d\b", name):
         return {
             "07": "cmu-walk-run",
             "08": "cmu-walk-run",
@@ -116,6 +116,7 @@ class Tape(NamedTuple):
         relative: (N, 24, 3, 3) true global rotations in the root's frame.
         starts: first frame of each take; one more entry holds N.
         names: of the takes.
+        free: whether each take is CMU's, free for all use.
     """
 
     orientation: Tensor
@@ -123,6 +124,7 @@ class Tape(NamedTuple):
     relative: Tensor
     starts: Tensor
     names: list[str]
+    free: list[bool]
 
 
 def tape(takes: list[Take]) -> Tape:
@@ -134,6 +136,7 @@ def tape(takes: list[Take]) -> Tape:
         torch.cat([root_relative_pose(torch.from_numpy(take.pose)) for take in takes]),
         torch.tensor([0, *np.cumsum(lengths)]),
         [take.name for take in takes],
+        [take.license.startswith("CMU") for take in takes],
     )
 
 
@@ -143,3 +146,14 @@ def root_relative_pose(local: Tensor) -> Tensor:
     for joint in range(1, 24):
         result.append(result[PARENTS[joint]] @ local[..., joint, :, :])
     return torch.stack(result, dim=-3)
+
+
+def describe_takes(takes: list[Take]) -> dict[str, Any]:
+    """What an archive's card says of the motion that it was trained on."""
+    licenses = sorted({take.license for take in takes})
+    return {
+        "summary": " and ".join(text.split(",")[0].split(" (")[0] for text in licenses),
+        "licenses": licenses,
+        "takes": len(takes),
+        "hours": sum(len(take.pose) for take in takes) / 60.0 / 3600.0,
+    }

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from edgepose.errors import EdgeposeError
 from edgepose.features import ACCELERATIONS, network_input, rotation_to_6d
+from edgepose.skeleton import PARENTS
 from edgepose_export.archive import Statistics
 from edgepose_export.augmentation import Augmentation, augment
 from edgepose_export.dataset import Tape
@@ -26,7 +27,6 @@ else:
     import tomli as tomllib
 
 CHECKPOINT = "checkpoint.pt"
-CMU_NAME_LENGTH = len("07_01")
 
 
 @dataclass(frozen=True)
@@ -125,8 +125,6 @@ def config_values(config: TrainConfig) -> dict[str, Any]:
 
 def pose_targets(relative: Tensor, shape: NetworkShape) -> Tensor:
     """Numbers (..., pose outputs) that the network shall give, before z-scoring, of root-relative rotations (..., 24, 3, 3)."""
-    from edgepose.skeleton import PARENTS
-
     joints = list(shape.joints)
     if shape.targets == "global-6d":
         return rotation_to_6d(relative[..., joints, :, :]).flatten(-2)
@@ -163,11 +161,11 @@ def window_starts(tape: Tape, window: int, joined: bool) -> tuple[Tensor, Tensor
     """First frames of all windows that a tape holds, those of CMU's takes apart: (others, CMU's)."""
     groups: tuple[list[Tensor], list[Tensor]] = ([], [])
     last = int(tape.starts[-1]) - window
-    for i, name in enumerate(tape.names):
+    for i, free in enumerate(tape.free):
         start, end = int(tape.starts[i]), int(tape.starts[i + 1])
         end = min(end - 1, last) if joined else end - window
         if end >= start:
-            groups[len(name) == CMU_NAME_LENGTH].append(torch.arange(start, end + 1))
+            groups[free].append(torch.arange(start, end + 1))
     empty = torch.zeros(0, dtype=torch.long)
     return torch.cat([empty, *groups[0]]), torch.cat([empty, *groups[1]])
 
@@ -199,12 +197,19 @@ def windows(tape: Tape, starts: Tensor, length: int) -> tuple[Tensor, Tensor, Te
 class Trainer:
     """State of one run: network, averaged weights, optimiser, generator, step."""
 
-    def __init__(
-        self, config: TrainConfig, train: Tape, validation: Tape, statistics: Statistics | None = None
-    ) -> None:
+    def __init__(self, config: TrainConfig, train: Tape, validation: Tape, data: dict[str, Any]) -> None:
+        """Starts a run at step 0.
+
+        Args:
+            config: of the run.
+            train: takes to train on.
+            validation: takes that tell when to stop.
+            data: what the training takes are, for the archive's card: summary, takes, hours, licenses.
+        """
         torch.manual_seed(config.seed)
         self.config, self.train_tape, self.validation_tape = config, train, validation
-        self.statistics = statistics or statistics_of(train, config.network)
+        self.data = data
+        self.statistics = statistics_of(train, config.network)
         self.network = PoseNetwork(config.network)
         self.averaged = PoseNetwork(config.network)
         self.averaged.load_state_dict(self.network.state_dict())
@@ -282,6 +287,7 @@ class Trainer:
             "step": self.step,
             "best": self.best,
             "worse": self.worse,
+            "data": self.data,
         }
 
     def load(self, state: dict[str, Any]) -> None:
@@ -293,6 +299,7 @@ class Trainer:
         self.generator.set_state(state["generator"])
         torch.set_rng_state(state["torch_generator"])
         self.step, self.best, self.worse = state["step"], state["best"], state["worse"]
+        self.data = state["data"]
 
     def start_from(self, state: dict[str, Any]) -> None:
         """Fine-tuning (DIP 3.4.4): takes a checkpoint's averaged weights and statistics, nothing else."""
@@ -321,7 +328,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         state = torch.load(path, weights_only=True)
     except Exception as error:
         raise EdgeposeError(f"{path}: not a checkpoint of edgepose train ({type(error).__name__})") from error
-    if not isinstance(state, dict) or not {"config", "statistics", "averaged", "step"} <= set(state):
+    if not isinstance(state, dict) or not {"config", "statistics", "averaged", "step", "data"} <= set(state):
         raise EdgeposeError(f"{path}: not a checkpoint of edgepose train (entries are missing)")
     return state
 
@@ -350,7 +357,7 @@ def fit(
             save_checkpoint(state, folder / CHECKPOINT)
             if better:
                 save_checkpoint(
-                    {k: state[k] for k in ("config", "statistics", "averaged", "step")}, folder / "best.pt"
+                    {k: state[k] for k in ("config", "statistics", "averaged", "step", "data")}, folder / "best.pt"
                 )
             with (folder / "log.jsonl").open("a") as log:
                 log.write(

@@ -114,29 +114,30 @@ def _motion_files(root: Path) -> list[Path]:
 
 
 def convert(path: Path, job: Job) -> str | None:
-    """Converts one file; what was wrong with it, or None."""
+    """Converts one file, in parts where its source jumps; what was wrong with it, or None."""
     import numpy as np
 
     from edgepose.rotations import rotvec_to_matrix
     from edgepose.skeleton import default_body
-    from edgepose_export.mocap import read_motion, resample
+    from edgepose_export.mocap import pieces, read_motion, resample
     from edgepose_export.synthesis import recording_arrays, virtual_imus, with_hold
 
     try:
-        motion = resample(read_motion(path), job.rate)
-        if len(motion.rotations) < 3:
-            return f"{path}: only {len(motion.rotations)} frames"
-        if job.hold_s:
-            motion = with_hold(motion, job.hold_s)
         mounting = None
         if job.mounting_seed is not None:
-            mounting = rotvec_to_matrix(
-                np.random.default_rng(job.mounting_seed).uniform(-np.pi, np.pi, (6, 3))
-            )
-        imus = virtual_imus(motion, default_body(job.height_m), mounting)
-        target = job.out / path.relative_to(job.root).with_suffix(".npz")
-        target.parent.mkdir(parents=True, exist_ok=True)
-        np.savez(target, **recording_arrays(motion, imus, LICENSES[motion.source]))
+            mounting = rotvec_to_matrix(np.random.default_rng(job.mounting_seed).uniform(-np.pi, np.pi, (6, 3)))
+        takes = pieces(read_motion(path))
+        if not takes:
+            return f"{path}: shorter than a second between jumps"
+        for i, take in enumerate(takes):
+            motion = resample(take, job.rate)
+            if job.hold_s:
+                motion = with_hold(motion, job.hold_s)
+            imus = virtual_imus(motion, default_body(job.height_m), mounting)
+            name = f"{path.stem}.part{i + 1}.npz" if len(takes) > 1 else f"{path.stem}.npz"
+            target = job.out / path.relative_to(job.root).with_name(name)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            np.savez(target, **recording_arrays(motion, imus, LICENSES[motion.source]))
     except EdgeposeError as error:
         return str(error)
     except OSError as error:

@@ -64,7 +64,7 @@ def train(
 
     from edgepose_export import training
     from edgepose_export.cli.progress import labelled
-    from edgepose_export.dataset import part_of, read_takes, tape
+    from edgepose_export.dataset import describe_takes, part_of, read_takes, tape
 
     settings = training.read_config(_config_path(config))
     if steps:
@@ -76,16 +76,13 @@ def train(
         )
     torch.set_num_threads(threads)
     out.mkdir(parents=True, exist_ok=True)
-    parts = [
-        tape(
-            read_takes(data, lambda name, part=part: part_of(name) == part, labelled(f"reading {part} takes"))
-        )
+    takes, validation = (
+        read_takes(data, lambda name, part=part: part_of(name) == part, labelled(f"reading {part} takes"))
         for part in ("train", "validation")
-    ]
-    for part, joined in zip(("train", "validation"), parts, strict=True):
-        hours = len(joined.orientation) / 60 / 3600
-        click.echo(f"{part}: {len(joined.names)} takes, {hours:.2f} h", err=True)
-    trainer = training.Trainer(settings, *parts)
+    )
+    about = describe_takes(takes)
+    click.echo(f"training on {about['takes']} takes, {about['hours']:.2f} h: {about['summary']}", err=True)
+    trainer = training.Trainer(settings, tape(takes), tape(validation), about)
     if resume:
         trainer.load(training.read_checkpoint(checkpoint))
         click.echo(f"going on at step {trainer.step}", err=True)

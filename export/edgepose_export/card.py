@@ -1,0 +1,72 @@
+"""The page beside each archive: what it is, from which data, how good, how to make it again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+_KINDS = {
+    "birnn": "bidirectional LSTM; the pose of a frame is known once its {future} future frames have come ({latency:.0f} ms)",
+    "rnn": "unidirectional LSTM; the pose of a frame is known at once",
+}
+
+
+def card(metadata: dict[str, Any]) -> str:
+    """Markdown of an archive's card, made from its metadata alone."""
+    kind = _KINDS[metadata["kind"]].format(
+        future=metadata["future"], latency=1e3 * metadata["future"] / metadata["rate_hz"]
+    )
+    training = metadata["training"]
+    lines = [
+        f"# {metadata['name']}",
+        "",
+        f"- Network: {kind}; {metadata['hidden']} units a direction, two layers, {metadata['parameters'] / 1e6:.2f} million weights.",
+        f"- Input: calibrated orientations and accelerations of {', '.join(metadata['placements'])} at {metadata['rate_hz']:g} Hz.",
+        f"- Targets: {metadata['targets']}; bones that carry a sensor are {metadata['measured_bones']}.",
+        f"- Trained on: {training['summary']}; {training['takes']} takes, {training['hours']:.2f} h, {training['steps']} steps.",
+        "- Licences of that motion:",
+        *(f"  - {text}" for text in training["licenses"]),
+        "- Weights: for non-commercial use wherever a licence above says NC; edgepose's own code is MIT.",
+        "",
+        "## On motion it has never seen",
+        "",
+        "Mean ± deviation over all frames; synthetic sensors on held-out takes, run through this archive. "
+        "Position errors are on the default body.",
+    ]
+    for part, rows in metadata["measures"].items():
+        lines += ["", f"### {part}", "", *_table(rows)]
+    lines += [
+        "",
+        "The parts: `cmu-walk-run` is CMU subjects 07, 08, 09; `cmu-02` is CMU subject 02 (bends, punches, sword, washing); "
+        "`bandai-styles` is Bandai-Namco's styles exhausted and tired. None of these takes or styles is in the training set.",
+        "",
+        "## Make it again",
+        "",
+        "```",
+        "edgepose synthesize MOCAP --out recordings",
+        f"edgepose train --config {metadata['name']} --data recordings --out runs/{metadata['name']}",
+        f"edgepose export runs/{metadata['name']}/checkpoint.pt --out {metadata['name']}.pt --measure recordings",
+        "```",
+        "",
+        "with MOCAP a folder that holds the BVH files of CMU subjects 01, 02, 03, 05 - 09 (cgspeed's conversion) and both "
+        "Bandai-Namco Research motion datasets.",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+_COLUMNS = {
+    "sip_error_deg": "SIP error, deg",
+    "joint_angle_error_15_deg": "15 joints, deg",
+    "joint_angle_error_10_deg": "10 joints without a sensor, deg",
+    "position_error_cm": "position, cm",
+    "jitter_km_s3": "jitter, km/s^3",
+}
+
+
+def _table(rows: dict[str, dict[str, list[float]]]) -> list[str]:
+    head = ["method", *_COLUMNS.values(), "frames"]
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for name, measures in rows.items():
+        cells = [f"{measures[key][0]:.2f} ± {measures[key][1]:.2f}" for key in _COLUMNS]
+        lines.append("| " + " | ".join([name, *cells, str(int(measures["sip_error_deg"][2]))]) + " |")
+    return lines
