@@ -249,32 +249,29 @@ class FrameClock:
         ready_s = -inf
         for sensor in self._sensors:
             pending = sensor.pending
-            n, x, y, z = 0, 0.0, 0.0, 0.0
+            before = sensor.last
+            inside = []
             while pending and pending[0].time_s <= tick_s:
-                entry = sensor.take()
-                # The first tick has older samples before it.
-                if entry.time_s > start_s:
-                    fx, fy, fz = entry.force
-                    n, x, y, z = n + 1, x + fx, y + fy, z + fz
+                inside.append(sensor.take())
             last = sensor.last
             assert last is not None, "t0 is not before any sensor's first sample"
             age_s = tick_s - last.time_s
-            is_held = age_s > max(_HOLD_PERIODS * sensor.period_s, 1.0 / self._rate)
+            longest_s = max(_HOLD_PERIODS * sensor.period_s, 1.0 / self._rate)
+            is_held = age_s > longest_s
             quat, mean = last.quat, last.force
-            if n:
-                mean = (x / n, y / n, z / n)
             if not is_held:
                 ready_s = max(ready_s, last.arrival_s)
                 # A sample that is further off would not have been waited for.
                 if pending and age_s > 0.0 and pending[0].time_s - tick_s <= sensor.wait_s:
                     following = pending[0]
                     ready_s = max(ready_s, following.arrival_s)
-                    share = age_s / (following.time_s - last.time_s)
                     if self._slerp:
-                        quat = _slerp(quat, following.quat, share)
-                    if not n:
-                        (x0, y0, z0), (x1, y1, z1) = last.force, following.force
-                        mean = (x0 + share * (x1 - x0), y0 + share * (y1 - y0), z0 + share * (z1 - z0))
+                        quat = _slerp(quat, following.quat, age_s / (following.time_s - last.time_s))
+                    inside.append(following)
+                if before is not None and inside and inside[0].time_s - before.time_s <= longest_s:
+                    inside.insert(0, before)
+                if inside:
+                    mean = _mean_force(inside, start_s, tick_s)
             orientation.append(quat)
             force.append(mean)
             held.append(is_held)
@@ -286,6 +283,33 @@ class FrameClock:
             np.array(held),
             ready_s if ready_s > -inf else min(now_s, tick_s),
         )
+
+
+def _mean_force(entries: list[_Entry], start_s: float, end_s: float) -> Vector3:
+    """Mean over the time from start to end of the force that is linear between entries and constant beyond them.
+
+    The mean over time, not over samples: with 5 samples in 3 frames the samples' mean would shake by a fraction of a period.
+    """
+    x = y = z = 0.0
+    t0 = start_s
+    left = entries[0]
+    for right in entries:
+        t1 = min(max(right.time_s, start_s), end_s)
+        if t1 > t0:
+            span = right.time_s - left.time_s
+            # Force in the middle of [t0, t1]; constant before the first entry, where left is right.
+            share = (0.5 * (t0 + t1) - left.time_s) / span if span > 0.0 else 0.0
+            (ax, ay, az), (bx, by, bz) = left.force, right.force
+            weight = t1 - t0
+            x += weight * (ax + share * (bx - ax))
+            y += weight * (ay + share * (by - ay))
+            z += weight * (az + share * (bz - az))
+            t0 = t1
+        left = right
+    weight = end_s - t0  # after the last entry
+    fx, fy, fz = left.force
+    total = end_s - start_s
+    return ((x + weight * fx) / total, (y + weight * fy) / total, (z + weight * fz) / total)
 
 
 def _slerp(p: Quaternion, q: Quaternion, share: float) -> Quaternion:

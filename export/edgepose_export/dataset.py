@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import zipfile
+import zlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,9 +16,12 @@ from torch import Tensor
 
 from edgepose import rotations as rot
 from edgepose.errors import EdgeposeError
-from edgepose.placements import PLACEMENTS
-from edgepose.skeleton import PARENTS
+from edgepose.placements import BONES, PLACEMENTS
+from edgepose.skeleton import PARENTS, forward_kinematics
 from edgepose_export.synthesis import GRAVITY, INERTIAL_FROM_BODY
+
+RATE = 60.0
+"""Frames a second that the networks are made for."""
 
 
 class Take(NamedTuple):
@@ -49,20 +53,34 @@ def read_take(path: Path) -> Take:
             quats = np.stack([data[f"{name}_quat"] for name in PLACEMENTS], axis=1)
             force = np.stack([data[f"{name}_acc"] for name in PLACEMENTS], axis=1)
             poses = data["poses"].reshape(-1, 24, 3)
-            license_note = str(data["license"])
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            rate, license_note = float(data["mocap_framerate"]), str(data["license"])
+        if not len(poses) == len(quats) == len(force):
+            raise ValueError("sensors and poses differ in length")
+    except (OSError, EOFError, ValueError, TypeError, KeyError, zipfile.BadZipFile, zlib.error) as error:
         raise EdgeposeError(
             f"{path}: not a recording with true poses ({error}); make it with edgepose synthesize"
         ) from error
+    if rate != RATE:
+        raise EdgeposeError(
+            f"{path}: has {rate:g} frames a second; networks need edgepose synthesize --rate 60"
+        )
     inertial = rot.quat_to_matrix(quats)
-    body_from_inertial = INERTIAL_FROM_BODY.T
+    orientation = INERTIAL_FROM_BODY.T @ inertial
+    local = rot.rotvec_to_matrix(poses)
+    bones = forward_kinematics(local[0], np.zeros((24, 3)))[0][list(BONES)]
+    if not (rot.angle_between(orientation[0], bones) < 0.01).all():
+        raise EdgeposeError(
+            f"{path}: the sensors are not aligned with the bones; use edgepose synthesize without --mounting"
+        )
     force_inertial = np.einsum("tsij,tsj->tsi", inertial, force.astype(float))
+    # A frame of a run holds the mean over the time since the frame before, see edgepose.sync.
+    force_inertial[1:] = 0.5 * (force_inertial[1:] + force_inertial[:-1])
     acceleration = (force_inertial - [0.0, 0.0, GRAVITY]) @ INERTIAL_FROM_BODY
     return Take(
         path.stem,
-        (body_from_inertial @ inertial).astype(np.float32),
+        orientation.astype(np.float32),
         acceleration.astype(np.float32),
-        rot.rotvec_to_matrix(poses).astype(np.float32),
+        local.astype(np.float32),
         license_note,
     )
 
@@ -74,9 +92,10 @@ HELD_OUT = ("cmu-walk-run", "cmu-02", "bandai-styles")
 def part_of(name: str) -> str:
     """Part that a take belongs to, by its name.
 
-    CMU subjects 07, 08, 09 (walking, running) and 02 (bends, punches, sword) and Bandai-Namco's styles "exhausted" and "tired" are held
-    out. CMU subject 03 and the style "not-confident" tell training when to stop. Other splits leak: Bandai-Namco's takes of one
-    style resemble each other so closely that a nearest-neighbour look-up would win.
+    CMU subjects 07, 08, 09 (walking, running) and 02 (bends, punches, sword) and Bandai-Namco's styles
+    "exhausted" and "tired" are held out. CMU subject 03 and the style "not-confident" tell training when to
+    stop. Other splits leak: Bandai-Namco's takes of one style resemble each other so closely that a
+    nearest-neighbour look-up would win.
     """
     if match := re.match(r"(\d\d)_\d\d\b", name):
         return {
@@ -92,19 +111,40 @@ def part_of(name: str) -> str:
 
 
 def read_takes(
-    folder: Path, wanted: Callable[[str], bool], progress: Callable[[list[Path]], Iterable[Path]] = iter
+    folder: Path, part: str, progress: Callable[[list[Path]], Iterable[Path]] = iter
 ) -> list[Take]:
-    """All takes below a folder whose names are wanted, in the order of their names.
+    """All takes of one part of the split below a folder, in the order of their names; part "all" is every take.
 
     Raises:
         EdgeposeError: none found.
     """
-    paths = sorted((p for p in folder.rglob("*.npz") if wanted(p.stem)), key=lambda p: p.stem)
+    paths = sorted(
+        (p for p in folder.rglob("*.npz") if part in ("all", part_of(p.stem))), key=lambda p: p.stem
+    )
     if not paths:
         raise EdgeposeError(
-            f"{folder}: no recordings of the wanted part; make them with edgepose synthesize --out {folder}"
+            f"{folder}: no {'recordings' if part == 'all' else f'recording of the part {part!r}'}; "
+            f"make them with edgepose synthesize --out {folder}"
         )
     return [read_take(path) for path in progress(paths)]
+
+
+def read_training_takes(
+    folder: Path, progress: Callable[[list[Path]], Iterable[Path]] = iter
+) -> tuple[list[Take], list[Take]]:
+    """Takes to train on and takes that tell when to stop.
+
+    Where no name belongs to the validation part (a user's own recordings), every tenth take goes there.
+
+    Raises:
+        EdgeposeError: fewer than two takes, or none to train on.
+    """
+    takes = read_takes(folder, "train", progress)
+    if any(part_of(path.stem) == "validation" for path in folder.rglob("*.npz")):
+        return takes, read_takes(folder, "validation", progress)
+    if len(takes) < 2:
+        raise EdgeposeError(f"{folder}: one recording is not enough: another must tell when to stop training")
+    return [take for i, take in enumerate(takes) if i % 10], takes[::10]
 
 
 class Tape(NamedTuple):
@@ -142,7 +182,7 @@ def tape(takes: list[Take]) -> Tape:
 
 def root_relative_pose(local: Tensor) -> Tensor:
     """Global rotations (..., 24, 3, 3) in the root's frame of local ones."""
-    result = [torch.eye(3, dtype=local.dtype).expand(local.shape[:-3] + (3, 3))]
+    result = [torch.eye(3, dtype=local.dtype).expand((*local.shape[:-3], 3, 3))]
     for joint in range(1, 24):
         result.append(result[PARENTS[joint]] @ local[..., joint, :, :])
     return torch.stack(result, dim=-3)
@@ -155,5 +195,5 @@ def describe_takes(takes: list[Take]) -> dict[str, Any]:
         "summary": " and ".join(text.split(",")[0].split(" (")[0] for text in licenses),
         "licenses": licenses,
         "takes": len(takes),
-        "hours": sum(len(take.pose) for take in takes) / 60.0 / 3600.0,
+        "hours": sum(len(take.pose) for take in takes) / RATE / 3600.0,
     }

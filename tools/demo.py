@@ -1,0 +1,179 @@
+"""The main job from end to end: six simulated IMUs on a serial port, calibration, poses, and how far they are from the truth.
+
+A motion-capture clip that no shipped model has seen moves a body; six virtual sensors, strapped on at random angles, send native
+packets over a pty in real time. The commands that are run are those a wearer would run.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from edgepose import rotations as rot
+from edgepose.figures import skeleton_strip
+from edgepose.metrics import format_table, summary
+from edgepose.poses import read_poses_csv
+from edgepose.skeleton import default_body
+
+CLIP = Path(__file__).parent / "data" / "09_12.bvh"
+HOLD_S = 6.0
+RATE = 100.0  # of the simulated sensors, Hz
+
+Array = NDArray[np.float64]
+
+
+class Truth(NamedTuple):
+    """True local poses (T, 24, 3, 3) at times (T,), seconds since the clip began to play."""
+
+    time_s: Array
+    pose: Array
+
+    def at(self, time_s: Array) -> Array:
+        """Poses at other times, by slerp."""
+        i = np.clip(np.searchsorted(self.time_s, time_s) - 1, 0, len(self.time_s) - 2)
+        share = (time_s - self.time_s[i]) / (self.time_s[i + 1] - self.time_s[i])
+        quats = rot.matrix_to_quat(self.pose)
+        return rot.quat_to_matrix(rot.slerp(quats[i], quats[i + 1], np.repeat(share[:, None], 24, axis=1)))
+
+
+def edgepose(*words: str) -> list[str]:
+    """A command line of edgepose in this environment."""
+    return [sys.executable, "-m", "edgepose", *words]
+
+
+def show(words: list[str]) -> None:
+    """Prints a command as a user would type it."""
+    click.echo("\n$ " + " ".join(["edgepose", *words[3:]] if words[1:3] == ["-m", "edgepose"] else words), err=True)
+
+
+@contextmanager
+def simulator(recording: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """The simulated sensors, standing still, and the port they send to."""
+    words = [sys.executable, str(Path(__file__).parent / "simulate.py"), str(recording), "--stand"]
+    process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdin and process.stdout
+    try:
+        yield process, said(process, "port")
+    finally:
+        process.stdin.close()
+        process.wait(10)
+
+
+def said(process: subprocess.Popen[str], word: str) -> str:
+    """What the simulator says after a word; waits for it."""
+    assert process.stdout
+    for line in process.stdout:
+        if line.startswith(word + " "):
+            return line.split()[1]
+    raise SystemExit(f"the simulator ended before it said {word!r}")
+
+
+class Listener(threading.Thread):
+    """Receives the datagrams of a run: (Unix time of arrival, pose as sent)."""
+
+    def __init__(self) -> None:
+        """Binds to a free port of this machine."""
+        super().__init__(daemon=True)
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("127.0.0.1", 0))
+        self.port: int = self.socket.getsockname()[1]
+        self.first = threading.Event()
+        self.received: list[tuple[float, dict[str, object]]] = []
+
+    def run(self) -> None:
+        """Receives until the process ends."""
+        while True:
+            data = self.socket.recv(65536)
+            self.received.append((time.time(), json.loads(data)))
+            self.first.set()
+
+
+def follow(process: subprocess.Popen[str], port: str, out: Path) -> tuple[float, float, Listener]:
+    """Calibrates, starts a run, lets the clip play; gives when it began and ended (Unix time) and what came by UDP."""
+    calibration, csv = out / "calibration.json", out / "poses.csv"
+    words = edgepose(
+        "calibrate", "--port", port, "--body-frame", "heading:0", "--hold", "3", "--countdown", "1", "--out", str(calibration)
+    )
+    show(words)
+    subprocess.run(words, check=True)
+    listener = Listener()
+    listener.start()
+    destination = f"127.0.0.1:{listener.port}"
+    words = edgepose("run", "--port", port, "--calibration", str(calibration), "--csv", str(csv), "--udp", destination)
+    show(words)
+    run = subprocess.Popen(words)
+    try:
+        while not listener.first.wait(0.5):
+            if run.poll() is not None:
+                raise SystemExit("edgepose run ended before it gave a pose")
+        assert process.stdin
+        process.stdin.write("go\n")
+        process.stdin.flush()
+        begin, end = float(said(process, "started")), float(said(process, "ended"))
+        time.sleep(0.5)  # the last frames still wait for their future
+    finally:
+        run.send_signal(signal.SIGINT)
+        code = run.wait(20)
+    if code:
+        raise SystemExit(f"edgepose run failed with exit code {code}")
+    return begin, end, listener
+
+
+def report(begin: float, end: float, listener: Listener, truth: Truth, out: Path) -> None:
+    """Prints error, latency and rate over the clip and draws it."""
+    frames, time_s, status, poses = read_poses_csv(out / "poses.csv")
+    click.echo(f"\nposes.csv: {len(frames)} frames at 60 Hz, numbers missing between first and last: {np.sum(np.diff(frames) - 1)}")
+    clip = (time_s >= begin + HOLD_S + 1.0) & (time_s <= end)
+    seconds = time_s[clip] - begin
+    true = truth.at(seconds)
+    offsets = default_body().offsets
+    click.echo(f"clip: {clip.sum()} frames in {seconds[-1] - seconds[0]:.1f} s; status ok in {np.mean([s == 'ok' for s, c in zip(status, clip, strict=True) if c]):.1%}")
+    click.echo("\nError against the clip's true pose:")
+    click.echo(format_table({"birnn, online (20, 5)": summary(poses[clip], true, offsets, 60.0)}))
+    delays = np.array([arrived - float(str(pose["time_s"])) for arrived, pose in listener.received]) * 1e3
+    p50, p99 = np.percentile(delays, [50, 99])
+    click.echo(f"\nFrom a sensor's measurement to its pose arriving by UDP: {p50:.0f} ms median, {p99:.0f} ms p99")
+    click.echo("(83 ms of it are the 5 future frames that the bidirectional network waits for; --model rnn waits for none)")
+    wanted = np.linspace(0, len(seconds) - 1, 10).round().astype(int)
+    picture = out / "skeletons.png"
+    skeleton_strip(
+        picture, poses[clip][wanted], seconds[wanted] - seconds[0], offsets, true[wanted],
+        title="CMU 09_12: poses from six IMUs (above) and the true ones (grey)",
+    )  # fmt: skip
+    click.echo(f"\nwrote {out / 'poses.csv'} and {picture}")
+
+
+@click.command(help=__doc__)
+@click.option("--out", type=click.Path(path_type=Path), default=Path("demo-output"), show_default=True, help="Folder for the results.")
+def main(out: Path) -> None:
+    """The command line."""
+    out.mkdir(parents=True, exist_ok=True)
+    recording = out / CLIP.with_suffix(".npz").name
+    words = edgepose(
+        "synthesize", str(CLIP), "--out", str(out), "--hold", f"{HOLD_S:g}", "--rate", f"{RATE:g}", "--mounting", "7"
+    )
+    show(words)
+    subprocess.run(words, check=True)
+    with np.load(recording) as data:
+        truth = Truth(data["t"], rot.rotvec_to_matrix(data["poses"].reshape(-1, 24, 3)))
+    with simulator(recording) as (process, port):
+        click.echo(f"\nsix simulated IMUs stand still and send {RATE:g} packets a second each to {port}", err=True)
+        results = follow(process, port, out)
+    report(*results, truth, out)
+
+
+if __name__ == "__main__":
+    main()
