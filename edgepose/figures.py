@@ -106,7 +106,9 @@ def skeleton_strip(
 
     centres, width = _columns([figures for figures, _ in rows])
     height = max(_top(f) for figures, _ in rows for f in figures) + 0.12
-    label, head_in = 0.24, 0.42  # metres below the last ground line; inches for title and legend
+    label = 0.24  # metres below the last ground line
+    title_in, legend_in = 0.3 if title else 0.0, 0.36  # inches above the figures
+    head_in = title_in + legend_in
     total = len(rows) * height + label
     # Few figures would make a picture of giants: leave room at their sides instead.
     canvas = max(width, total * WIDTH_IN / (1.8 * len(rows) + 1.2))
@@ -127,10 +129,10 @@ def skeleton_strip(
         y = -(len(rows) - 1) * height - 0.05
         axes.text(centre, y, f"{time:.2f} s", ha="center", va="top", fontsize=8, color=INK)
 
-    top = 1.0 - 0.5 * head_in / (body_in + head_in)
+    inch = 1.0 / (body_in + head_in)  # of the figure's height
     if title:
-        figure.text(0.02, top, title, ha="left", va="center", fontsize=10, color=INK)
-    _legend(figure, top, reference is not None)
+        figure.text(0.02, 1.0 - 0.6 * title_in * inch, title, ha="left", va="center", fontsize=10, color=INK)
+    _legend(figure, 1.0 - (title_in + 0.5 * legend_in) * inch, reference is not None)
     try:
         figure.savefig(path, dpi=DPI)
     except (OSError, ValueError) as error:  # ValueError: an ending that matplotlib does not know.
