@@ -19,6 +19,9 @@ from edgepose.sources.native_stream import NativeStream
 SILENCE_S = 5.0
 """How long a port may say nothing at the start."""
 
+BACKLOG_S = 0.5
+"""Longest time to throw away what has waited, seconds; a port that is never empty is read from then on."""
+
 NOISE_S = 3.0
 """How long bytes may come at the start without one usable packet in them."""
 
@@ -80,8 +83,9 @@ class SerialSource:
         assert self._serial is not None, "the source has not been entered"
         start_s = self._now()
         first_s: float | None = None
-        # What has waited since the port was opened is of unknown age.
-        self._read()
+        # What has waited since the port was opened is of unknown age, and full buffers have lost parts of it.
+        while self._read()[0] and self._waiting() and self._now() - start_s < BACKLOG_S:
+            pass
         while True:
             data, gone = self._read()
             now_s = self._now()
@@ -112,6 +116,12 @@ class SerialSource:
         except OSError:
             return data, True
         return data, False
+
+    def _waiting(self) -> int:
+        try:
+            return int(self._serial.in_waiting) if self._serial else 0
+        except OSError:  # gone; the next read tells
+            return 0
 
     def _host_time(self, sensor: int, t_us: int) -> float:
         return self._clocks[sensor].host_time(t_us, self._arrival_s)
