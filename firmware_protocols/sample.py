@@ -80,4 +80,4 @@ def z_up(quat: Quaternion) -> Quaternion:
     w, x, y, z = quat
     # R_ENU_NED is a half turn about (1, 1, 0) / sqrt(2).
     h = 0.5**0.5
-    return (-h * (x + y), h * (w + z), h * (w - z), h * (x - y))
+    return (-h * (x + y), h * (w + z), h * (w - z), h * (y - x))
