@@ -1,7 +1,8 @@
 """Model archives: find, check and describe them without running anything; load them once they are trusted.
 
-An archive is a TorchScript file, and loading one runs the code in it. So a file is loaded only when its SHA-256 sum is known: from
-`SHA256SUMS` beside the shipped archives, or from the user's own list, or when the user says so for this once.
+An archive is a TorchScript file, and loading one runs the code in it. So a file is loaded only when its
+SHA-256 sum is known: from `SHA256SUMS` beside the shipped archives, or from the user's own list, or when the
+user says so for this once.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import io
 import json
 import os
 import zipfile
+import zlib
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -26,6 +28,7 @@ FORMAT = 1
 MODELS = Path(str(resources.files("edgepose") / "models"))
 
 _METADATA_LIMIT = 1 << 20
+_MOST_FRAMES = 1000
 
 
 class ArchiveInfo(NamedTuple):
@@ -74,11 +77,8 @@ def find(name: str) -> Path:
 
 def _sums(path: Path) -> set[str]:
     try:
-        return {
-            line.split()[0]
-            for line in path.read_text().splitlines()
-            if line.strip() and not line.startswith("#")
-        }
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        return {line.split()[0].lower() for line in lines if line.strip()}
     except FileNotFoundError:
         return set()
     except OSError as error:
@@ -92,12 +92,13 @@ def inspect(path: Path) -> ArchiveInfo:
         EdgeposeError: not an archive of edgepose, damaged, or of a newer format.
     """
     try:
-        sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-        with zipfile.ZipFile(path) as archive:
+        content = path.read_bytes()
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
             entries = [e for e in archive.infolist() if e.filename.endswith(f"/extra/{METADATA_FILE}")]
             if len(entries) != 1 or entries[0].file_size > _METADATA_LIMIT:
                 raise EdgeposeError(
-                    f"{path}: not a model archive of edgepose (it has no {METADATA_FILE}); make one with edgepose export"
+                    f"{path}: not a model archive of edgepose (it has no {METADATA_FILE}); "
+                    "make one with edgepose export"
                 )
             metadata = json.loads(archive.read(entries[0]))
     except (zipfile.BadZipFile, EOFError) as error:
@@ -106,9 +107,11 @@ def inspect(path: Path) -> ArchiveInfo:
         ) from error
     except OSError as error:
         raise EdgeposeError(f"{path}: {error.strerror or error}") from error
-    except ValueError as error:
+    # zipfile gives RuntimeError for passwords, NotImplementedError for odd compression, json RecursionError.
+    except (ValueError, RuntimeError, zlib.error) as error:
         raise EdgeposeError(f"{path}: the archive's metadata cannot be read ({error})") from error
     _check(path, metadata)
+    sha256 = hashlib.sha256(content).hexdigest()
     known = _sums(MODELS / "SHA256SUMS") | _sums(trust_file())
     return ArchiveInfo(path, sha256, sha256 in known, metadata)
 
@@ -118,7 +121,8 @@ def _check(path: Path, metadata: Any) -> None:
         raise EdgeposeError(f"{path}: the archive's metadata is not what edgepose export writes")
     if metadata["format"] > FORMAT:
         raise EdgeposeError(
-            f"{path}: archive format {metadata['format']} is newer than this edgepose reads ({FORMAT}); update edgepose"
+            f"{path}: archive format {metadata['format']} is newer than this edgepose reads ({FORMAT}); "
+            "update edgepose"
         )
     if metadata.get("kind") not in ("birnn", "rnn"):
         raise EdgeposeError(f"{path}: unknown kind of network {metadata.get('kind')!r}")
@@ -126,6 +130,10 @@ def _check(path: Path, metadata: Any) -> None:
         raise EdgeposeError(f"{path}: made for other sensor placements: {metadata.get('placements')}")
     if not isinstance(metadata.get("rate_hz"), (int, float)) or not 1 <= metadata["rate_hz"] <= 1000:
         raise EdgeposeError(f"{path}: the archive's frame rate {metadata.get('rate_hz')!r} is not a rate")
+    for name in ("past", "future"):
+        frames = metadata.get(name)
+        if type(frames) is not int or not 0 <= frames <= _MOST_FRAMES:
+            raise EdgeposeError(f"{path}: the archive's number of {name} frames {frames!r} is not a number")
 
 
 def load(info: ArchiveInfo, trust: bool = False) -> torch.jit.ScriptModule:
@@ -140,8 +148,9 @@ def load(info: ArchiveInfo, trust: bool = False) -> torch.jit.ScriptModule:
     """
     if not (info.trusted or trust):
         raise EdgeposeError(
-            f"{info.path}: loading a model archive runs its code, and this one's SHA-256 sum {info.sha256[:16]}... is not known; "
-            "if you made it or know who did, run with --trust, or once: edgepose models --trust PATH"
+            f"{info.path}: loading a model archive runs its code, and this one's SHA-256 sum "
+            f"{info.sha256[:16]}... is not known; if you made it or know who did, run with --trust, or once: "
+            "edgepose models --trust PATH"
         )
     import torch
 
@@ -172,7 +181,8 @@ def trust(path: Path) -> ArchiveInfo:
         try:
             trust_file().parent.mkdir(parents=True, exist_ok=True)
             with trust_file().open("a") as file:
-                file.write(f"{info.sha256}  {path.name}\n")
+                # The line break in front is for a list that was edited and does not end in one.
+                file.write(f"\n{info.sha256}  {' '.join(path.name.split())}\n")
         except OSError as error:
             raise EdgeposeError(f"{trust_file()}: {error.strerror}") from error
     return info._replace(trusted=True)

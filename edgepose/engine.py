@@ -1,7 +1,7 @@
 """Runs a model archive frame by frame: window, stream or step (DIP 3.4, 5.1.3, 5.1.4).
 
-Every frame that goes in comes out, in order: the first ones seen with the past that there is, the last ones, at `finish`, with the future
-that there is.
+Every frame that goes in comes out, in order: the first ones seen with the past that there is, the last ones,
+at `finish`, with the future that there is.
 """
 
 from __future__ import annotations
@@ -14,9 +14,12 @@ import torch
 from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
+Input = NDArray[np.floating[Any]]
 
 WARM_UP = 5
-"""Frames run through a module before the first real one; TorchScript compiles and specialises during its first calls."""
+"""Frames run through a module before the first real one; TorchScript compiles and specialises during its
+first calls.
+"""
 
 
 class EngineOutput(NamedTuple):
@@ -38,8 +41,10 @@ class EngineOutput(NamedTuple):
 class Engine(Protocol):
     """What `window_engine` and `stream_engine` give."""
 
-    def push(self, tag: Any, orientation: Array, acceleration: Array) -> list[EngineOutput]:
-        """Takes a frame ((6, 3, 3) R_TB, (6, 3) m/s^2 in T without gravity) and gives the poses that are due: none or one."""
+    def push(self, tag: Any, orientation: Input, acceleration: Input) -> list[EngineOutput]:
+        """Takes a frame ((6, 3, 3) R_TB, (6, 3) m/s^2 in T without gravity) and gives the poses that are due:
+        none or one.
+        """
 
     def finish(self) -> list[EngineOutput]:
         """Gives the poses of the frames that still wait for their future."""
@@ -50,9 +55,10 @@ def _output(tag: Any, rotations: torch.Tensor, std: torch.Tensor, filling: bool)
 
 
 class WindowEngine:
-    """For each frame the network runs over the `past` frames before it, itself and `future` frames after it."""
+    """For each frame the network runs over `past` frames before it, itself and `future` frames after it."""
 
     def __init__(self, module: torch.jit.ScriptModule, past: int, future: int) -> None:
+        """Warms the module up; past and future are numbers of frames, 0 or more."""
         self._module, self._past, self._future = module, past, future
         self._tags: deque[Any] = deque()
         self._seen = 0
@@ -63,11 +69,11 @@ class WindowEngine:
             for _ in range(WARM_UP):
                 module.window(torch.eye(3).expand(1, length, 6, 3, 3), torch.zeros(1, length, 6, 3), past)
 
-    def push(self, tag: Any, orientation: Array, acceleration: Array) -> list[EngineOutput]:
+    def push(self, tag: Any, orientation: Input, acceleration: Input) -> list[EngineOutput]:
         """See `Engine.push`."""
-        longest = self._past + self._future
-        self._orientation = torch.cat([self._orientation[:, -longest:], _tensor(orientation)], dim=1)
-        self._acceleration = torch.cat([self._acceleration[:, -longest:], _tensor(acceleration)], dim=1)
+        length = self._past + 1 + self._future
+        self._orientation = torch.cat([self._orientation, _tensor(orientation)], dim=1)[:, -length:]
+        self._acceleration = torch.cat([self._acceleration, _tensor(acceleration)], dim=1)[:, -length:]
         self._tags.append(tag)
         self._seen += 1
         return [self._oldest(self._future)] if self._seen > self._future else []
@@ -89,9 +95,10 @@ class WindowEngine:
 
 
 class StreamEngine:
-    """One step a frame with carried state; a unidirectional network with `future` 0, a bidirectional one with any."""
+    """One step a frame with carried state; `future` is 0 for a unidirectional network."""
 
     def __init__(self, module: torch.jit.ScriptModule, past: int, future: int) -> None:
+        """Warms the module up; the first `past` poses are marked as filling."""
         self._module, self._past = module, past
         self._tags: deque[Any] = deque()
         self._done = 0
@@ -101,7 +108,7 @@ class StreamEngine:
                 state = module.stream(torch.eye(3).expand(1, 6, 3, 3), torch.zeros(1, 6, 3), state)[2]
             self._state = module.start(1, future)
 
-    def push(self, tag: Any, orientation: Array, acceleration: Array) -> list[EngineOutput]:
+    def push(self, tag: Any, orientation: Input, acceleration: Input) -> list[EngineOutput]:
         """See `Engine.push`."""
         self._tags.append(tag)
         with torch.inference_mode():
@@ -123,5 +130,5 @@ class StreamEngine:
         return outputs
 
 
-def _tensor(array: Array) -> torch.Tensor:
+def _tensor(array: Input) -> torch.Tensor:
     return torch.from_numpy(np.asarray(array, np.float32))[None, None]

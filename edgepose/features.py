@@ -1,7 +1,8 @@
-"""What a network is given and how its answer becomes a pose, in torch: one implementation for training and inside the archives.
+"""What a network is given and how its answer becomes a pose, in torch: one implementation for training and
+inside the archives.
 
-All functions are scriptable and take any leading dimensions. Frames and names: T is the body frame, R_TB a bone's orientation in it,
-"root" the pelvis sensor.
+All functions are scriptable and take any leading dimensions. Frames and names: T is the body frame, R_TB a
+bone's orientation in it, "root" the pelvis sensor.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ def root_relative(orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Te
 
 
 def network_input(orientation: Tensor, acceleration: Tensor) -> Tensor:
-    """The vector x_t (..., 60) of DIP 4.3: five row-major matrices, then five accelerations; not yet z-scored.
+    """The vector x_t (..., 60) of DIP 4.3: five row-major matrices, then five accelerations; not yet
+    z-scored.
 
     Shapes and frames of the arguments are those of `root_relative`.
     """
@@ -46,7 +48,9 @@ def network_input(orientation: Tensor, acceleration: Tensor) -> Tensor:
 
 
 def rotation_from_6d(x: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) whose first two columns are the orthonormalised halves of x (..., 6) (Zhou et al. 2019)."""
+    """Rotation matrices (..., 3, 3) whose first two columns are the orthonormalised halves of x (..., 6)
+    (Zhou et al. 2019).
+    """
     first = torch.nn.functional.normalize(x[..., :3], dim=-1)
     second = x[..., 3:]
     second = second - (first * second).sum(-1, keepdim=True) * first

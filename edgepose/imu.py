@@ -16,10 +16,12 @@ class ImuSample(NamedTuple):
 
     Attributes:
         sensor: index into `edgepose.placements.PLACEMENTS`.
-        time_s: time of the measurement on the source's clock, seconds. Live sources map device clocks to Unix time; files keep
-            their own times.
-        quat: unit quaternion w, x, y, z, sensor frame to inertial frame I (Z up); None where the device measures no orientation.
-        acc: specific force in the sensor frame, m/s^2 (a level sensor at rest reads +9.81 on its up axis); None if absent.
+        time_s: time of the measurement on the source's clock, seconds. Live sources map device clocks to Unix
+            time; files keep their own times.
+        quat: unit quaternion w, x, y, z, sensor frame to inertial frame I (Z up); None where the device
+            measures no orientation.
+        acc: specific force in the sensor frame, m/s^2 (a level sensor at rest reads +9.81 on its up axis);
+            None if absent.
         gyr: angular rate in the sensor frame, rad/s; None if absent.
         mag: magnetic field in the sensor frame, uT; None if absent.
     """
@@ -38,13 +40,15 @@ class ImuFrame(NamedTuple):
     Attributes:
         index: frame number from 0, counting every tick of the clock.
         time_s: time of the tick on the source's clock, seconds.
-        orientation: (6, 4) unit quaternions w, x, y, z, sensor to inertial (R_IS), in the order of PLACEMENTS.
+        orientation: (6, 4) unit quaternions w, x, y, z, sensor to inertial (R_IS), in the order of
+            PLACEMENTS.
         force: (6, 3) specific force averaged over the frame, inertial frame, m/s^2: (0, 0, 9.81) at rest.
         held: (6,) bool, True where a sensor had nothing new and its last values are repeated.
-        ready_s: time on the source's clock at which the frame's last packet had arrived (for latency), seconds.
+        ready_s: time on the source's clock at which the frame's last packet had arrived (for latency),
+            seconds.
     """
 
-    index: int
+    index: int  # type: ignore[assignment]  # hides tuple.index, which nobody wants here
     time_s: float
     orientation: NDArray[np.float64]
     force: NDArray[np.float64]

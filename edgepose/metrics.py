@@ -34,6 +34,16 @@ LABELS = {
 }
 """The keys of `per_frame` and `summary` and how a person reads them."""
 
+HEADINGS = {
+    "sip_error_deg": "SIP, deg",
+    "joint_angle_error_15_deg": "15 joints, deg",
+    "joint_angle_error_10_deg": "10 joints, deg",
+    "position_error_cm": "position, cm",
+    "jitter_km_s3": "jitter, km/s^3",
+    "jitter_reference_km_s3": "reference jitter",
+}
+"""The same, short enough for the head of a column."""
+
 
 class Measure(NamedTuple):
     """Mean and standard deviation of a measure over a number of frames; NaN where there are none."""
@@ -128,23 +138,29 @@ def summary(predicted: ArrayLike, true: ArrayLike, offsets: ArrayLike, rate: flo
 
 
 def format_table(summaries: Mapping[str, Mapping[str, Measure]]) -> str:
-    """A table to print: a line a measure, a column a summary, in each cell "mean ± deviation (frames)"."""
-    keys = [key for key in LABELS if any(key in column for column in summaries.values())]
-    table = [["measure", *(LABELS[key] for key in keys)]]
-    for name, column in summaries.items():
-        table.append([name, *(_cell(column[key]) if key in column else "-" for key in keys)])
-    widths = [max(map(len, column)) for column in table]
+    """A table to print: a line a method, a column a measure, in each cell "mean ± deviation".
+
+    Numbers of frames, those of the errors, stand in a column of their own where methods differ in them,
+    otherwise in the last line. Jitter has three frames fewer a sequence.
+
+    Args:
+        summaries: for each method what `summary` gives.
+    """
+    keys = [key for key in LABELS if any(key in row for row in summaries.values())]
+    frames = {name: max((m.frames for m in row.values()), default=0) for name, row in summaries.items()}
+    same = len(set(frames.values())) == 1
+    table = [["method", *(HEADINGS[key] for key in keys), *([] if same else ["frames"])]]
+    for name, row in summaries.items():
+        cells = [f"{row[key].mean:.2f} ± {row[key].std:.2f}" if key in row else "-" for key in keys]
+        table.append([name, *cells, *([] if same else [str(frames[name])])])
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     lines = []
-    for row in zip(*table, strict=True):
-        cells = [row[0].ljust(widths[0])] + [
-            cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True)
-        ]
-        lines.append("  ".join(cells).rstrip())
+    for method, *cells in table:
+        padded = [cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True)]
+        lines.append("  ".join([method.ljust(widths[0]), *padded]).rstrip())
+    over = f" over {frames.popitem()[1]} frames" if same else ""
+    lines.append(f"mean ± deviation{over}; 15 joints: all predicted, 10 joints: those without a sensor")
     return "\n".join(lines)
-
-
-def _cell(m: Measure) -> str:
-    return f"{m.mean:.2f} ± {m.std:.2f} ({m.frames})"
 
 
 def _same_shape(predicted: ArrayLike, true: ArrayLike) -> tuple[Array, Array]:

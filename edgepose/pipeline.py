@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,6 +18,9 @@ from edgepose.pose import PoseFrame
 from edgepose.sinks import Sink
 from edgepose.sync import FrameClock
 
+LATENCIES = 216_000
+"""Latencies that are kept: those of the last hour at 60 Hz. A run may last for weeks."""
+
 
 @dataclass
 class RunSummary:
@@ -28,7 +32,8 @@ class RunSummary:
         held: of these, poses in which a sensor's last values were repeated.
         held_by_sensor: frames in which each sensor was held, in the order of PLACEMENTS.
         seconds: wall time from the first samples to the end.
-        latencies_s: for each frame that gave a pose, seconds from the arrival of its newest packet here to the pose's being sent.
+        latencies_s: for the newest frames that gave a pose, seconds from the arrival of their newest packet
+            here to the pose's being sent.
         error: what ended the run early, if anything did.
     """
 
@@ -37,7 +42,7 @@ class RunSummary:
     held: int = 0
     held_by_sensor: list[int] = field(default_factory=lambda: [0] * len(PLACEMENTS))
     seconds: float = 0.0
-    latencies_s: list[float] = field(default_factory=list)
+    latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=LATENCIES))
     error: EdgeposeError | None = None
 
 
@@ -60,10 +65,12 @@ def run(
     engine: Engine,
     sinks: list[Sink],
     on_pose: Callable[[RunSummary], None] = lambda summary: None,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> RunSummary:
-    """Runs a source to its end, or until Ctrl-C, and writes every pose to every sink.
+    """Runs a source to its end, or until `stopped`, and writes every pose to every sink.
 
-    What the source gave before an error or Ctrl-C comes out; an error is kept in the summary for the caller to report.
+    What the source gave before an error or the stop comes out. After an error of a sink nothing is written any
+    more. An error is kept in the summary for the caller to report.
 
     Args:
         source: batches (time on the source's clock, samples that came).
@@ -72,6 +79,8 @@ def run(
         engine: makes poses.
         sinks: written in order.
         on_pose: called after each pose was written.
+        stopped: asked after each batch whether to end the run. An interrupt in the middle of a frame would lose
+            that frame; this does not.
     """
     summary = RunSummary()
     started = arrived = time.perf_counter()
@@ -93,22 +102,25 @@ def run(
             summary.latencies_s.append(time.perf_counter() - arrived)
             on_pose(summary)
 
-    def push(frames: list[ImuFrame]) -> None:
-        for frame in frames:
-            write(engine.push(frame, *apply(calibration, frame.orientation, frame.force)))
-
-    try:
+    def frames() -> Iterator[ImuFrame]:
+        """All frames; an error of the source or the clock ends the samples, not the frames made of them."""
+        nonlocal arrived
         try:
             for now_s, samples in source:
                 arrived = time.perf_counter()
                 if samples:
                     clock.push(samples, now_s)
-                push(clock.frames(now_s))
-        except KeyboardInterrupt:
-            pass
+                yield from clock.frames(now_s)
+                if stopped():
+                    break
         except EdgeposeError as error:
             summary.error = error
-        push(clock.flush())
+        yield from clock.flush()
+
+    try:
+        for frame in frames():
+            orientation, force = apply(calibration, frame.orientation, frame.force)
+            write(engine.push(frame, orientation.astype(np.float32), force.astype(np.float32)))
         write(engine.finish())
     except EdgeposeError as error:
         summary.error = summary.error or error

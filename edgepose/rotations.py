@@ -1,6 +1,7 @@
 """All rotation arithmetic, on numpy arrays with any leading dimensions.
 
-Quaternions are w, x, y, z. `R_AB` maps vectors from frame B to frame A: `v_A = R_AB @ v_B`. Angles are radians.
+Quaternions are w, x, y, z. `R_AB` maps vectors from frame B to frame A: `v_A = R_AB @ v_B`. Angles are
+radians.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ def _unit(v: Array) -> Array:
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
-# --- quaternions -----------------------------------------------------------------------------------------------------------
+# --- quaternions --------------------------------------------------------------------------------------------
 
 
 def quat_multiply(p: ArrayLike, q: ArrayLike) -> Array:
@@ -47,14 +48,16 @@ def quat_rotate(q: ArrayLike, v: ArrayLike) -> Array:
 
 
 def quat_continuous(q: ArrayLike) -> Array:
-    """The same rotations (T, ..., 4) with signs chosen so that neighbours in time lie on one side of the sphere."""
+    """The same rotations (T, ..., 4), signs chosen so that neighbours in time are near each other."""
     q = np.asarray(q, float)
     flips = np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=-1, keepdims=True) < 0, -1.0, 1.0), axis=0)
     return np.concatenate([q[:1], q[1:] * flips])
 
 
 def slerp(q0: ArrayLike, q1: ArrayLike, t: ArrayLike) -> Array:
-    """Spherical interpolation from q0 (..., 4) at t = 0 to q1 at t = 1 along the shorter arc; t broadcasts over (...)."""
+    """Spherical interpolation from q0 (..., 4) at t = 0 to q1 at t = 1 along the shorter arc; t broadcasts
+    over (...).
+    """
     q0 = np.asarray(q0, float)
     return quat_multiply(
         q0,
@@ -65,14 +68,14 @@ def slerp(q0: ArrayLike, q1: ArrayLike, t: ArrayLike) -> Array:
 
 
 def mean_rotation(quats: ArrayLike) -> Array:
-    """Mean unit quaternion (4,) of (N, 4): largest eigenvector of the sum of outer products (Markley et al. 2007)."""
+    """Mean unit quaternion (4,) of (N, 4): eigenvector of the sum of outer products (Markley 2007)."""
     q = np.asarray(quats, float)
     mean: Array = np.linalg.eigh(q.T @ q)[1][:, -1]
     return mean if mean[0] >= 0 else -mean
 
 
 def heading(q: ArrayLike) -> Array:
-    """Angle (...) of the part of unit quaternions (..., 4) that turns about the vertical axis Z (swing-twist split)."""
+    """Angle (...) of the part of unit quaternions (..., 4) that turns about Z, up (swing-twist split)."""
     q = np.asarray(q, float)
     return 2.0 * np.arctan2(q[..., 3], q[..., 0])
 
@@ -84,7 +87,7 @@ def about_z(angle: ArrayLike) -> Array:
     return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)
 
 
-# --- conversions -----------------------------------------------------------------------------------------------------------
+# --- conversions --------------------------------------------------------------------------------------------
 
 
 def quat_to_matrix(q: ArrayLike) -> Array:
@@ -99,7 +102,7 @@ def quat_to_matrix(q: ArrayLike) -> Array:
 
 
 def matrix_to_quat(r: ArrayLike) -> Array:
-    """Unit quaternions (..., 4), w >= 0, of rotation matrices (..., 3, 3); stable for every angle (Shepperd 1978)."""
+    """Unit quaternions (..., 4), w >= 0, of rotations (..., 3, 3); stable everywhere (Shepperd 1978)."""
     r = np.asarray(r, float)
     m = {(i, j): r[..., i, j] for i in range(3) for j in range(3)}
     trace = m[0, 0] + m[1, 1] + m[2, 2]
@@ -153,7 +156,9 @@ def about_axis(axis: str, angle: ArrayLike) -> Array:
 
 
 def euler_to_matrix(angles: ArrayLike, order: str) -> Array:
-    """Rotation matrices (..., 3, 3) of angles (..., len(order)) multiplied in the written order: "zyx" is Rz Ry Rx."""
+    """Rotation matrices (..., 3, 3) of angles (..., len(order)) multiplied in the written order: "zyx" is Rz
+    Ry Rx.
+    """
     angles = np.asarray(angles, float)
     result = about_axis(order[0], angles[..., 0])
     for i, axis in enumerate(order[1:], start=1):
@@ -161,7 +166,7 @@ def euler_to_matrix(angles: ArrayLike, order: str) -> Array:
     return result
 
 
-# --- matrices --------------------------------------------------------------------------------------------------------------
+# --- matrices -----------------------------------------------------------------------------------------------
 
 
 def transpose(r: Array) -> Array:
@@ -171,13 +176,14 @@ def transpose(r: Array) -> Array:
 
 def angle_between(a: ArrayLike, b: ArrayLike) -> Array:
     """Geodesic distance (...) between rotation matrices (..., 3, 3), from 0 to pi."""
-    # The chord ||A - B||_F = 2 sqrt(2) sin(angle / 2) keeps its precision at small angles, where arccos of the trace does not.
+    # The chord ||A - B||_F = 2 sqrt(2) sin(angle / 2) keeps its precision at small angles, where arccos of
+    # the trace does not.
     chord = np.linalg.norm(np.asarray(a, float) - np.asarray(b, float), axis=(-2, -1))
     return 2.0 * np.arcsin(np.clip(chord / np.sqrt(8.0), 0.0, 1.0))
 
 
 def nearest_rotation(m: ArrayLike) -> Array:
-    """Rotation matrices (..., 3, 3) nearest to any matrices in the Frobenius norm (SVD, determinant kept at +1)."""
+    """Rotation matrices (..., 3, 3), determinant +1, nearest to any matrices in the Frobenius norm (SVD)."""
     u, _, vt = np.linalg.svd(np.asarray(m, float))
     u[..., :, -1] *= np.sign(np.linalg.det(u @ vt))[..., None]
     return u @ vt

@@ -56,7 +56,9 @@ def _terminate(number: int, frame: FrameType | None) -> NoReturn:
 
 
 def main() -> NoReturn:
-    """Entry point: errors become one line on stderr. Exit codes: 0 done, 1 the job failed, 2 wrong use, 130 interrupted."""
+    """Entry point: errors become one line on stderr. Exit codes: 0 done, 1 the job failed, 2 wrong use, 130
+    interrupted.
+    """
     signal.signal(signal.SIGTERM, _terminate)  # ends a run as Ctrl-C does: files complete, counts printed
     debug = "--debug" in sys.argv[1:]
     try:

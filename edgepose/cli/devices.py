@@ -27,7 +27,8 @@ def devices() -> None:
         )
     if not ports:
         click.echo(
-            "  none found; plug the hub in, or check that its driver is loaded and you may read it (group dialout)"
+            "  none found; plug the hub in, or check that its driver is loaded and you may read it "
+            "(group dialout)"
         )
 
     # No CAN backend is configured here; importing python-can costs more than the rest of this command.

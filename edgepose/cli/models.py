@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import click
@@ -56,7 +57,8 @@ def _show(info: archive.ArchiveInfo) -> None:
         click.echo(card.read_text(encoding="utf-8").rstrip())
     else:
         for key, value in info.metadata.items():
-            click.echo(f"{key}: {value}")
+            # JSON, so that a text from a stranger's file cannot steer the terminal.
+            click.echo(f"{json.dumps(key)[1:-1]}: {json.dumps(value)}")
     click.echo(
         f"\nfile: {Path(info.path)}\nsha256: {info.sha256}\ntrusted: {'yes' if info.trusted else 'no'}"
     )

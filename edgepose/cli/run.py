@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import FrameType, TracebackType
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -42,8 +45,8 @@ if TYPE_CHECKING:
     type=click.Choice(["window", "stream"]),
     default="window",
     show_default=True,
-    help="How a bidirectional model runs: anew over a window for each frame, or with its forward state carried on (cheaper). "
-    "A unidirectional one always carries its state.",
+    help="How a bidirectional model runs: anew over a window for each frame, or with its forward state "
+    "carried on (cheaper). A unidirectional one always carries its state.",
 )
 @click.option(
     "--past",
@@ -53,7 +56,8 @@ if TYPE_CHECKING:
 @click.option(
     "--future",
     type=click.IntRange(0, 120),
-    help="Frames after the present one that a bidirectional model waits for; each adds 1/60 s of latency  [default: the model's]",
+    help="Frames after the present one that a bidirectional model waits for; each adds 1/60 s of latency  "
+    "[default: the model's]",
 )
 @click.option("--csv", "csv_path", metavar="FILE", help="Write poses as CSV; - is standard output.")
 @click.option(
@@ -95,6 +99,9 @@ def run(
     check_source(port, path)
     if csv_path is None and udp is None:
         raise click.UsageError("give at least one output: --csv FILE or --udp HOST:PORT")
+    for flag, given in (("--file", path), ("--calibration", calibration_path)):
+        if given is not None and _is_same_file(csv_path, given):
+            raise click.UsageError(f"--csv would overwrite {given}, which is {flag}; name another file")
 
     from edgepose import archive
     from edgepose.calibration import load_calibration
@@ -103,7 +110,7 @@ def run(
     from edgepose.sinks.udp import UdpSink, parse_destination
     from edgepose.sources import open_source
 
-    destination = parse_destination(udp) if udp else None
+    destination = None if udp is None else parse_destination(udp)
     calibration = load_calibration(calibration_path)
     info = archive.inspect(archive.find(model))
     kind, rate = info.metadata["kind"], float(info.metadata["rate_hz"])
@@ -122,16 +129,23 @@ def run(
         from edgepose.sync import FrameClock
 
         engine = (StreamEngine if kind == "rnn" or online == "stream" else WindowEngine)(module, past, future)
+        stop = stack.enter_context(_Stop())
         sinks: list[Sink] = []
-        if csv_path:
+        if csv_path is not None:
             sinks.append(stack.enter_context(CsvSink(csv_path, rotations, std)))
         if destination:
             sinks.append(stack.enter_context(UdpSink(*destination)))
         clock = FrameClock(rate)
-        _say(
-            f"running {model} ({kind}, {'stream' if isinstance(engine, StreamEngine) else 'window'}); Ctrl-C ends the run"
+        way = "stream" if isinstance(engine, StreamEngine) else "window"
+        _say(f"running {model} ({kind}, {way}); Ctrl-C ends the run")
+        summary = run_pipeline(
+            source, clock, calibration, engine, sinks, _progress(), stopped=lambda: stop.asked
         )
-        summary = run_pipeline(source, clock, calibration, engine, sinks, _progress())
+        for sink in sinks:
+            try:
+                sink.close()
+            except EdgeposeError as error:
+                summary.error = summary.error or error
     _report(summary, source, clock.dropped, rate, future, live=port is not None or realtime)
     if summary.error:
         raise summary.error
@@ -139,26 +153,57 @@ def run(
         raise EdgeposeError(source.damage)
 
 
+class _Stop:
+    """Whether Ctrl-C or SIGTERM has come. A second one interrupts at once, as outside of this."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> _Stop:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._before[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._restore()
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.asked = True
+        self._restore()
+
+    def _restore(self) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+
+def _is_same_file(output: str | None, given: Path) -> bool:
+    try:
+        return output not in (None, "-") and given.samefile(str(output))
+    except OSError:  # there is no such file yet
+        return False
+
+
 def _say(text: str) -> None:
     click.echo(text, err=True)
 
 
-def _progress(every_s: float = 1.0):  # type: ignore[no-untyped-def]
-    """A callback that keeps one line on a terminal up to date; elsewhere it is silent."""
-    if not sys.stderr.isatty():
-        return lambda summary: None
-    shown = [time.monotonic(), 0]
+def _progress() -> Callable[[RunSummary], None]:
+    """A callback that keeps one line on a terminal up to date; elsewhere it writes a line now and then."""
+    terminal = sys.stderr.isatty()
+    every_s = 1.0 if terminal else 10.0
+    shown_s, poses = time.monotonic(), 0
 
     def show(summary: RunSummary) -> None:
-        now = time.monotonic()
-        if now - shown[0] >= every_s:
-            rate = (summary.poses - shown[1]) / (now - shown[0])
-            shown[:] = [now, summary.poses]
-            click.echo(
-                f"\r{summary.poses} poses, {rate:.0f} a second, {summary.held} with a held sensor  ",
-                nl=False,
-                err=True,
-            )
+        nonlocal shown_s, poses
+        now_s = time.monotonic()
+        if now_s - shown_s >= every_s:
+            rate = (summary.poses - poses) / (now_s - shown_s)
+            shown_s, poses = now_s, summary.poses
+            text = f"{poses} poses, {rate:.0f} a second, {summary.held} with a held sensor"
+            click.echo(f"\r{text}  " if terminal else text, nl=not terminal, err=True)
 
     return show
 
@@ -171,11 +216,13 @@ def _report(summary: RunSummary, source: Source, dropped: int, rate: float, futu
         _say("")
     speed = summary.poses / summary.seconds if summary.seconds else 0.0
     _say(
-        f"poses    {summary.poses} in {summary.seconds:.1f} s, {speed:.1f} a second; {summary.filling} while the window was filling"
+        f"poses    {summary.poses} in {summary.seconds:.1f} s, {speed:.1f} a second; "
+        f"{summary.filling} while the window was filling"
     )
     counts = source.counters
     _say(
-        f"packets  {counts.packets} good, {counts.lost} lost, {counts.bad} bad; {dropped} samples too late or twice"
+        f"packets  {counts.packets} good, {counts.lost} lost, {counts.bad} bad; "
+        f"{dropped} samples too late or twice"
     )
     if summary.held:
         worst = sorted(zip(summary.held_by_sensor, PLACEMENTS, strict=True), reverse=True)
@@ -184,5 +231,6 @@ def _report(summary: RunSummary, source: Source, dropped: int, rate: float, futu
         p50, p99, most = np.percentile(np.array(summary.latencies_s) * 1e3, [50, 99, 100])
         ahead = f" plus {future} frames of look-ahead, {future / rate * 1e3:.0f} ms" if future else ""
         _say(
-            f"latency  {p50:.1f} ms median, {p99:.1f} ms p99, {most:.1f} ms max from last packet to pose sent{ahead}"
+            f"latency  {p50:.1f} ms median, {p99:.1f} ms p99, {most:.1f} ms max "
+            f"from last packet to pose sent{ahead}"
         )

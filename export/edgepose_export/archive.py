@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,15 +13,19 @@ from torch import Tensor, nn
 
 from edgepose import __version__
 from edgepose.archive import FORMAT, METADATA_FILE
+from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 from edgepose.skeleton import JOINTS
+from edgepose_export.dataset import RATE
 from edgepose_export.networks import BirnnArchive, Ends, PoseDecoder, PoseNetwork, RnnArchive
 
 METHODS = ["window", "start", "stream", "drain"]
 
 
 class Statistics(NamedTuple):
-    """Means and standard deviations over the training set: inputs (60,), accelerations being its last 15, and pose targets."""
+    """Means and standard deviations over the training set: inputs (60,), accelerations being its last 15, and
+    pose targets.
+    """
 
     input_mean: Tensor
     input_std: Tensor
@@ -44,13 +49,38 @@ def script(network: PoseNetwork, statistics: Statistics) -> torch.jit.ScriptModu
 
 
 def save(module: torch.jit.ScriptModule, path: Path, metadata: dict[str, object]) -> None:
-    """Writes an archive with its metadata as a JSON extra file."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="`torch.jit", category=DeprecationWarning)
-        torch.jit.save(module, str(path), _extra_files={METADATA_FILE: json.dumps(metadata, indent=2)})
+    """Writes an archive with its metadata as a JSON extra file.
+
+    Raises:
+        EdgeposeError: it cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="`torch.jit", category=DeprecationWarning)
+            torch.jit.save(module, str(path), _extra_files={METADATA_FILE: json.dumps(metadata, indent=2)})
+    except (OSError, RuntimeError) as error:
+        reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
+        raise EdgeposeError(f"{path}: cannot be written: {reason}") from error
 
 
-def describe(name: str, network: PoseNetwork, checkpoint: dict[str, Any], past: int, future: int) -> dict[str, Any]:
+def revision() -> str | None:
+    """The commit of the source tree that this code runs from; None when it was installed as a package."""
+    root = Path(__file__).parents[2]
+    if not (root / ".git").exists():
+        return None
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return done.stdout.strip()
+
+
+def describe(
+    name: str, network: PoseNetwork, checkpoint: dict[str, Any], past: int, future: int
+) -> dict[str, Any]:
     """Metadata of an archive, without measures.
 
     Args:
@@ -68,15 +98,20 @@ def describe(name: str, network: PoseNetwork, checkpoint: dict[str, Any], past: 
         "hidden": shape.hidden,
         "parameters": sum(p.numel() for p in network.parameters()),
         "placements": list(PLACEMENTS),
-        "rate_hz": 60.0,
+        "rate_hz": RATE,
         "past": past,
         "future": future,
         "joints": [JOINTS[joint] for joint in shape.joints],
         "targets": shape.targets,
         "measured_bones": shape.measured,
         "precision": "f32",
-        "training": {"steps": checkpoint["step"], **checkpoint["data"], "config": json.loads(checkpoint["config"])},
+        "training": {
+            "steps": checkpoint["step"],
+            **checkpoint["data"],
+            "config": json.loads(checkpoint["config"]),
+        },
         "measures": {},
         "edgepose": __version__,
+        "revision": revision(),
         "torch": torch.__version__,
     }

@@ -29,8 +29,8 @@ class Augmentation(NamedTuple):
 
     Attributes:
         mirror: share of sequences whose left and right are exchanged.
-        misalignment_deg: deviation of each sensor's error against its bone, a rotation vector's each component (a calibration pose that
-            was not quite the pose).
+        misalignment_deg: deviation of each sensor's error against its bone, a rotation vector's each
+            component (a calibration pose that was not quite the pose).
         heading_deg: deviation of each sensor's heading against the pelvis sensor.
         acceleration_noise: deviation of white noise on each frame's accelerations, m/s^2.
         acceleration_scale: deviation of each sensor's scale error.
@@ -44,7 +44,9 @@ class Augmentation(NamedTuple):
 
 
 def mirror(orientation: Tensor, acceleration: Tensor, relative: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Left and right exchanged by a reflection in the plane X = 0 of T; shapes (..., 6, 3, 3), (..., 6, 3), (..., 24, 3, 3)."""
+    """Left and right exchanged by a reflection in the plane X = 0 of T; shapes (..., 6, 3, 3), (..., 6, 3),
+    (..., 24, 3, 3).
+    """
     flip = torch.tensor([-1.0, 1.0, 1.0])
     signs = flip[:, None] * flip
     return (
@@ -65,7 +67,9 @@ def small_rotations(vectors: Tensor) -> Tensor:
 def augment(
     batch: tuple[Tensor, Tensor, Tensor], how: Augmentation, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Disturbed copies of sequences (B, T, 6, 3, 3), (B, T, 6, 3) and, mirrored only, their true poses (B, T, 24, 3, 3)."""
+    """Disturbed copies of sequences (B, T, 6, 3, 3), (B, T, 6, 3) and, mirrored only, their true poses (B, T,
+    24, 3, 3).
+    """
     orientation, acceleration, relative = batch
     size = len(orientation)
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from edgepose import rotations as rot
 from edgepose.placements import BONES, ROOT
-from edgepose.skeleton import JOINTS, PARENTS, UNOBSERVED, local_from_global
+from edgepose.skeleton import JOINTS, PARENTS, UNOBSERVED, forward_kinematics, local_from_global
 from edgepose_export.dataset import Take
 
 Array = NDArray[np.float64]
@@ -21,8 +21,8 @@ _BETWEEN = {
     13: (0, 15, 3 / 5), 14: (0, 15, 3 / 5),
     16: (9, 18, 1 / 2), 17: (9, 19, 1 / 2),
 }  # fmt: skip
-"""Thighs halfway between pelvis and shank, trunk and neck in equal steps from pelvis to head, collars with the chest, upper arms halfway
-between chest and forearm."""
+"""Thighs halfway between pelvis and shank, trunk and neck in equal steps from pelvis to head, collars with
+the chest, upper arms halfway between chest and forearm."""
 
 
 def _mean(matrices: Array) -> Array:
@@ -38,7 +38,7 @@ def _measured(take: Take) -> Array:
 
 
 def _local(poses: Array) -> Array:
-    """Local rotations of global ones in which feet, toes, wrists and hands still have to take their parents' rotation."""
+    """Local rotations of global ones; feet, toes, wrists and hands first take their parents' rotation."""
     for joint, parent in enumerate(PARENTS):
         if JOINTS[joint].endswith(("ankle", "foot", "wrist", "hand")):
             poses[:, joint] = poses[:, parent]
@@ -66,7 +66,7 @@ class Baselines(NamedTuple):
 
     Attributes:
         mean_pose: (24, 3, 3) mean local rotations.
-        offsets: (24, 3, 3) mean rotation from each interpolated joint's guess to its truth, in the guess's frame.
+        offsets: (24, 3, 3) mean rotation from each interpolated joint's guess to its truth, in its frame.
     """
 
     mean_pose: Array
@@ -77,15 +77,13 @@ def learn(takes: list[Take], every: int = 10) -> Baselines:
     """Means over every tenth frame of the training takes."""
     locals_, offsets = [], []
     for take in takes:
-        part = take._replace(orientation=take.orientation[::every], acceleration=take.acceleration[::every], pose=take.pose[::every])
+        part = take._replace(orientation=take.orientation[::every], pose=take.pose[::every])
         locals_.append(part.pose.astype(float))
-        offsets.append(rot.transpose(_globals(interpolated(part))) @ _globals(part.pose.astype(float)))
+        offsets.append(rot.transpose(_globals(interpolated(part))) @ _globals(locals_[-1]))
     return Baselines(_mean(np.concatenate(locals_)), _mean(np.concatenate(offsets)))
 
 
 def _globals(local: Array) -> Array:
-    from edgepose.skeleton import forward_kinematics
-
     return forward_kinematics(local, np.zeros((24, 3)))[0]
 
 

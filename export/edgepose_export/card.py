@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 _KINDS = {
-    "birnn": "bidirectional LSTM; the pose of a frame is known once its {future} future frames have come ({latency:.0f} ms)",
+    "birnn": "bidirectional LSTM; the pose of a frame is known once its {future} future frames have come "
+    "({latency:.0f} ms)",
     "rnn": "unidirectional LSTM; the pose of a frame is known at once",
 }
 
@@ -19,36 +20,48 @@ def card(metadata: dict[str, Any]) -> str:
     lines = [
         f"# {metadata['name']}",
         "",
-        f"- Network: {kind}; {metadata['hidden']} units a direction, two layers, {metadata['parameters'] / 1e6:.2f} million weights.",
-        f"- Input: calibrated orientations and accelerations of {', '.join(metadata['placements'])} at {metadata['rate_hz']:g} Hz.",
+        f"- Network: {kind}; {metadata['hidden']} units a direction, two layers, "
+        f"{metadata['parameters'] / 1e6:.2f} million weights.",
+        f"- Input: calibrated orientations and accelerations of {', '.join(metadata['placements'])} "
+        f"at {metadata['rate_hz']:g} Hz.",
         f"- Targets: {metadata['targets']}; bones that carry a sensor are {metadata['measured_bones']}.",
-        f"- Trained on: {training['summary']}; {training['takes']} takes, {training['hours']:.2f} h, {training['steps']} steps.",
+        f"- Trained on: {training['summary']}; {training['takes']} takes, {training['hours']:.2f} h, "
+        f"{training['steps']} steps.",
         "- Licences of that motion:",
         *(f"  - {text}" for text in training["licenses"]),
         "- Weights: for non-commercial use wherever a licence above says NC; edgepose's own code is MIT.",
+        f"- Exported by edgepose {metadata['edgepose']}, revision {metadata['revision'] or 'unknown'}.",
         "",
-        "## On motion it has never seen",
-        "",
-        "Mean ± deviation over all frames; synthetic sensors on held-out takes, run through this archive. "
-        "Position errors are on the default body.",
     ]
+    if metadata["measures"]:
+        lines += [
+            "## On motion it has never seen",
+            "",
+            "Mean ± deviation over all frames; synthetic sensors on held-out takes, run through this "
+            "archive. Position errors are on the default body.",
+            "",
+        ]
     for part, rows in metadata["measures"].items():
-        lines += ["", f"### {part}", "", *_table(rows)]
+        lines += [f"### {part}", "", *_table(rows), ""]
+    if metadata["measures"]:
+        lines += [
+            "The parts: `cmu-walk-run` is CMU subjects 07, 08, 09; `cmu-02` is CMU subject 02 (bends, "
+            "punches, sword, washing); `bandai-styles` is Bandai-Namco's styles exhausted and tired. None of "
+            "these takes or styles is in the training set.",
+            "",
+        ]
     lines += [
-        "",
-        "The parts: `cmu-walk-run` is CMU subjects 07, 08, 09; `cmu-02` is CMU subject 02 (bends, punches, sword, washing); "
-        "`bandai-styles` is Bandai-Namco's styles exhausted and tired. None of these takes or styles is in the training set.",
-        "",
         "## Make it again",
         "",
         "```",
         "edgepose synthesize MOCAP --out recordings",
         f"edgepose train --config {metadata['name']} --data recordings --out runs/{metadata['name']}",
-        f"edgepose export runs/{metadata['name']}/checkpoint.pt --out {metadata['name']}.pt --measure recordings",
+        f"edgepose export runs/{metadata['name']}/checkpoint.pt --out {metadata['name']}.pt "
+        "--measure recordings",
         "```",
         "",
-        "with MOCAP a folder that holds the BVH files of CMU subjects 01, 02, 03, 05 - 09 (cgspeed's conversion) and both "
-        "Bandai-Namco Research motion datasets.",
+        "with MOCAP a folder that holds the BVH files of CMU subjects 01, 02, 03, 05 - 09 (cgspeed's "
+        "conversion) and both Bandai-Namco Research motion datasets.",
         "",
     ]
     return "\n".join(lines)

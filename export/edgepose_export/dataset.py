@@ -113,7 +113,7 @@ def part_of(name: str) -> str:
 def read_takes(
     folder: Path, part: str, progress: Callable[[list[Path]], Iterable[Path]] = iter
 ) -> list[Take]:
-    """All takes of one part of the split below a folder, in the order of their names; part "all" is every take.
+    """All takes of one part of the split below a folder, by name; the part "all" is every take.
 
     Raises:
         EdgeposeError: none found.

@@ -13,22 +13,22 @@ from numpy.typing import NDArray
 from edgepose.metrics import Measure, measure, per_frame
 from edgepose.skeleton import default_body
 from edgepose_export import baselines
-from edgepose_export.dataset import HELD_OUT, Take, part_of, read_takes
+from edgepose_export.dataset import HELD_OUT, RATE, Take, read_takes
 
 Array = NDArray[np.float64]
 
-RATE = 60.0
 BATCH = 512
 
 
 class Mode(NamedTuple):
-    """How an archive is run: "offline" (the whole take), "window" or "stream", with past and future frames."""
+    """How an archive is run: "offline" (the whole take), "window" or "stream"; past and future frames."""
 
     name: str
     past: int = 0
     future: int = 0
 
     def __str__(self) -> str:
+        """For a person."""
         if self.name == "offline":
             return "offline, whole take"
         if self.name == "window":
@@ -47,7 +47,9 @@ def run_archive(module: torch.jit.ScriptModule, take: Take, mode: Mode) -> Array
         return _window(module, orientation, acceleration, mode)
 
 
-def _stream(module: torch.jit.ScriptModule, orientation: torch.Tensor, acceleration: torch.Tensor, future: int) -> Array:
+def _stream(
+    module: torch.jit.ScriptModule, orientation: torch.Tensor, acceleration: torch.Tensor, future: int
+) -> Array:
     state = module.start(1, future)
     parts = []
     for o, a in zip(orientation, acceleration, strict=True):
@@ -57,8 +59,10 @@ def _stream(module: torch.jit.ScriptModule, orientation: torch.Tensor, accelerat
     return torch.cat(parts).double().numpy()
 
 
-def _window(module: torch.jit.ScriptModule, orientation: torch.Tensor, acceleration: torch.Tensor, mode: Mode) -> Array:
-    """Many windows of equal length at once; the function of a frame's window is the one that a run computes."""
+def _window(
+    module: torch.jit.ScriptModule, orientation: torch.Tensor, acceleration: torch.Tensor, mode: Mode
+) -> Array:
+    """Many windows of equal length at once; each is the window that a run computes for that frame."""
     frames, result = len(orientation), torch.empty(len(orientation), 24, 3, 3)
     length = mode.past + 1 + mode.future
     for first in range(0, frames - length + 1, BATCH):
@@ -75,9 +79,7 @@ Table = dict[str, dict[str, Measure]]
 """Row name to measures."""
 
 
-def evaluate(
-    takes: Iterable[Take], methods: dict[str, Callable[[Take], Array]]
-) -> Table:
+def evaluate(takes: Iterable[Take], methods: dict[str, Callable[[Take], Array]]) -> Table:
     """Measures of several methods over all frames of some takes, on the default body."""
     offsets = default_body().offsets
     values: dict[str, dict[str, list[Array]]] = {}
@@ -86,7 +88,9 @@ def evaluate(
             errors = per_frame(method(take), take.pose.astype(float), offsets, RATE)
             for key, column in errors.items():
                 values.setdefault(name, {}).setdefault(key, []).append(column)
-    return {name: {key: measure(np.concatenate(v)) for key, v in rows.items()} for name, rows in values.items()}
+    return {
+        name: {key: measure(np.concatenate(v)) for key, v in rows.items()} for name, rows in values.items()
+    }
 
 
 def baseline_methods(learnt: baselines.Baselines) -> dict[str, Callable[[Take], Array]]:
@@ -121,7 +125,7 @@ def held_out_tables(
     parts: Iterable[str] = HELD_OUT,
     progress: Callable[[list[Take]], Iterable[Take]] = iter,
 ) -> dict[str, Table]:
-    """Tables of an archive, and of the baselines learnt from the training takes, on parts of a folder of recordings.
+    """Tables of an archive, and of baselines learnt from the training takes, on parts of a folder.
 
     A part is one of HELD_OUT, or "all" for every take there is.
     """
@@ -129,8 +133,5 @@ def held_out_tables(
         str(mode): lambda take, mode=mode: run_archive(module, take, mode) for mode in modes
     }
     if with_baselines:
-        methods |= baseline_methods(baselines.learn(read_takes(data, lambda name: part_of(name) == "train")))
-    return {
-        part: evaluate(progress(read_takes(data, lambda name, part=part: part in ("all", part_of(name)))), methods)
-        for part in parts
-    }
+        methods |= baseline_methods(baselines.learn(read_takes(data, "train")))
+    return {part: evaluate(progress(read_takes(data, part)), methods) for part in parts}

@@ -1,8 +1,9 @@
 """The networks of DIP 3.4 in two forms: one that trains fast, one that runs as a TorchScript archive.
 
-Both hold the same weights. `PoseNetwork` uses `torch.nn.LSTM`, which is quickest over long batched sequences. `RnnArchive` and
-`BirnnArchive` write the cells out, one matrix product over input and state, which is several times quicker for one frame at a
-time, and carry everything between calibration and pose: root normalisation, statistics, network, projection to rotations.
+Both hold the same weights. `PoseNetwork` uses `torch.nn.LSTM`, which is quickest over long batched sequences.
+`RnnArchive` and `BirnnArchive` write the cells out, one matrix product over input and state, which is several
+times quicker for one frame at a time, and carry everything between calibration and pose: root normalisation,
+statistics, network, projection to rotations.
 """
 
 from __future__ import annotations
@@ -24,7 +25,10 @@ from edgepose.placements import BONES, ROOT
 from edgepose.skeleton import PARENTS, PREDICTED, UNOBSERVED
 
 SIGMA_FLOOR = 0.02
-"""Smallest standard deviation a network may claim, in normalised units: without it, joints that never move take all gradient."""
+"""Smallest standard deviation a network may claim, in normalised units.
+
+Without it, joints that never move take all gradient.
+"""
 
 
 class NetworkShape(NamedTuple):
@@ -33,10 +37,10 @@ class NetworkShape(NamedTuple):
     Attributes:
         kind: "birnn" or "rnn".
         hidden: units of the dense layer and of each LSTM direction; 512 in the paper.
-        targets: "local-matrix" (the paper: 9 numbers of each local rotation) or "global-6d" (6 numbers of each rotation in the root's
-            frame).
-        measured: "predicted" (the paper: all 15 joints come from the network) or "passed" (bones that carry a sensor take its
-            orientation; the network predicts the other 10). "passed" needs "global-6d".
+        targets: "local-matrix" (the paper: 9 numbers of each local rotation) or "global-6d" (6 numbers of
+            each rotation in the root's frame).
+        measured: "predicted" (the paper: all 15 joints come from the network) or "passed" (bones that carry a
+            sensor take its orientation; the network predicts the other 10). "passed" needs "global-6d".
     """
 
     kind: str = "birnn"
@@ -61,9 +65,10 @@ class NetworkShape(NamedTuple):
 
 
 class PoseNetwork(nn.Module):
-    """Dense layer with ReLU, two LSTM layers, a head for means and one for standard deviations (DIP figure 12)."""
+    """Dense layer with ReLU, two LSTM layers, heads for means and standard deviations (DIP figure 12)."""
 
     def __init__(self, shape: NetworkShape) -> None:
+        """Random weights for a shape."""
         super().__init__()
         self.shape = shape
         both = shape.kind == "birnn"
@@ -76,7 +81,7 @@ class PoseNetwork(nn.Module):
         self.deviation = nn.Linear(width, outputs)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Means and standard deviations (B, T, outputs) of z-scored inputs (B, T, 60), in normalised units."""
+        """Normalised means and standard deviations (B, T, outputs) of z-scored inputs (B, T, 60)."""
         x = torch.relu(self.dense(x))
         x, _ = self.lstm1(x)
         x, _ = self.lstm2(x)
@@ -87,6 +92,7 @@ class PoseDecoder(nn.Module):
     """Network outputs to SMPL's 24 local rotations; differentiable, scriptable."""
 
     def __init__(self, shape: NetworkShape, target_mean: Tensor, target_std: Tensor) -> None:
+        """Decoder of a network's outputs, whose pose part was normalised by these statistics."""
         super().__init__()
         self.local = shape.targets == "local-matrix"
         self.passed = shape.measured == "passed"
@@ -97,7 +103,8 @@ class PoseDecoder(nn.Module):
         self.register_buffer("source", torch.tensor(_sources(shape)))
         self.register_buffer("parents", torch.tensor(PARENTS[1:]))
         self.register_buffer("std_source", torch.tensor(_std_sources(shape)))
-        # A small rotation by d turns a matrix's entries by a vector of norm sqrt(2) d, its first two columns by sqrt(4/3) d on average.
+        # A small rotation by d moves a matrix's entries by sqrt(2) d, those of its first two columns by
+        # sqrt(4/3) d on average.
         self.spread = 2.0 if self.local else 4.0 / 3.0
 
     def forward(self, orientation: Tensor, mean: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
@@ -109,7 +116,8 @@ class PoseDecoder(nn.Module):
             deviation: the same shape, standard deviations.
 
         Returns:
-            (..., 24, 3, 3) local rotations, joint 0 the pelvis sensor's orientation; (..., 24) standard deviations, radians.
+            (..., 24, 3, 3) local rotations, joint 0 the pelvis sensor's orientation; (..., 24) standard
+            deviations, radians.
         """
         size = self.joints * self.numbers
         y = mean[..., :size] * self.target_std + self.target_mean
@@ -118,7 +126,7 @@ class PoseDecoder(nn.Module):
         std = torch.cat([torch.zeros_like(std[..., :1]), std], dim=-1).index_select(-1, self.std_source)
         y = y.unflatten(-1, (self.joints, self.numbers))
         root = orientation[..., -1, :, :]
-        identity = torch.eye(3, dtype=y.dtype).expand(y.shape[:-2] + (1, 3, 3))
+        identity = torch.eye(3, dtype=y.dtype).expand_as(root).unsqueeze(-3)
         if self.local:
             rotations = nearest_rotation(y.unflatten(-1, (3, 3)))
             local = torch.cat([identity, rotations], dim=-3).index_select(-3, self.source)
@@ -152,6 +160,7 @@ class LstmCell(nn.Module):
     """One LSTM direction as one Linear over input and state."""
 
     def __init__(self, lstm: nn.LSTM, suffix: str) -> None:
+        """Copies one direction's weights; `suffix` is torch's: "" forwards, "_reverse" backwards."""
         super().__init__()
         weights = [getattr(lstm, f"weight_{part}_l0{suffix}").detach() for part in ("ih", "hh")]
         biases = [getattr(lstm, f"bias_{part}_l0{suffix}").detach() for part in ("ih", "hh")]
@@ -177,7 +186,7 @@ class LstmCell(nn.Module):
 
     @torch.jit.export
     def run_back(self, x: Tensor) -> Tensor:
-        """Outputs (B, T, hidden) over x (B, T, inputs) from the last frame to the first, from a zero state."""
+        """Outputs (B, T, hidden) over x (B, T, inputs) from last frame to first, from a zero state."""
         zero = x.new_zeros(x.shape[0], self.size)
         return self.run(x.flip(1), zero, zero)[0].flip(1)
 
@@ -194,6 +203,7 @@ class Ends(nn.Module):
     def __init__(
         self, network: PoseNetwork, input_mean: Tensor, input_std: Tensor, decoder: PoseDecoder
     ) -> None:
+        """Takes the network's dense layers and the statistics of its inputs (60,)."""
         super().__init__()
         self.register_buffer("input_mean", input_mean)
         self.register_buffer("input_std", input_std)
@@ -217,6 +227,7 @@ class RnnArchive(nn.Module):
     """Unidirectional network: one step a frame, no look-ahead. Methods and shapes as in `BirnnArchive`."""
 
     def __init__(self, network: PoseNetwork, ends: Ends) -> None:
+        """Takes a trained network's weights."""
         super().__init__()
         self.ends = ends
         self.cell1 = LstmCell(network.lstm1, "")
@@ -261,11 +272,13 @@ class RnnArchive(nn.Module):
 class BirnnArchive(nn.Module):
     """Bidirectional network: whole sequence, exact window, or stream with carried forward states.
 
-    Everywhere `orientation` is (B, [T,] 6, 3, 3), calibrated bone orientations R_TB, and `acceleration` (B, [T,] 6, 3), m/s^2 in T
-    without gravity; B counts wearers. Poses are (B, [T,] 24, 3, 3) local rotations with (B, [T,] 24) standard deviations in radians.
+    Everywhere `orientation` is (B, [T,] 6, 3, 3), calibrated bone orientations R_TB, and `acceleration`
+    (B, [T,] 6, 3), m/s^2 in T without gravity; B counts wearers. Poses are (B, [T,] 24, 3, 3) local rotations
+    with (B, [T,] 24) standard deviations in radians.
     """
 
     def __init__(self, network: PoseNetwork, ends: Ends) -> None:
+        """Takes a trained network's weights."""
         super().__init__()
         self.ends = ends
         self.forward1, self.backward1 = LstmCell(network.lstm1, ""), LstmCell(network.lstm1, "_reverse")
@@ -294,8 +307,8 @@ class BirnnArchive(nn.Module):
     def start(self, batch: int, future: int) -> list[Tensor]:
         """State before the first frame of a stream in which each pose sees `future` later frames.
 
-        The state is [h1, c1, h2, c2, waiting inputs, waiting layer-1 outputs, waiting orientations, a tensor whose length is
-        `future`]; frames wait until their future has come.
+        The state is [h1, c1, h2, c2, waiting inputs, waiting layer-1 outputs, waiting orientations, a tensor
+        whose length is `future`]; frames wait until their future has come.
         """
         size = self.forward1.size
         zero = torch.zeros(batch, size)
@@ -304,9 +317,10 @@ class BirnnArchive(nn.Module):
 
     @torch.jit.export
     def oldest(self, state: list[Tensor]) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Pose of the oldest waiting frame, seen with all that wait behind it, and the state without that frame.
+        """Pose of the oldest waiting frame, seen with all that wait behind it, and the state without it.
 
-        Forward states are carried; backward passes start anew at the newest frame (latency-controlled bidirectional LSTM).
+        Forward states are carried; backward passes start anew at the newest frame (latency-controlled
+        bidirectional LSTM).
         """
         x = torch.cat([state[5], self.backward1.run_back(state[4])], dim=-1)
         h2, c2 = self.forward2(x[:, 0], state[2], state[3])
@@ -319,7 +333,10 @@ class BirnnArchive(nn.Module):
     def stream(
         self, orientation: Tensor, acceleration: Tensor, state: list[Tensor]
     ) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """One frame on: the pose of the frame `future` frames ago, (B, 1, 24, 3, 3), or (B, 0, 24, 3, 3) while too few have come."""
+        """One frame on: the pose of the frame `future` frames ago, (B, 1, 24, 3, 3).
+
+        Or none, (B, 0, 24, 3, 3), while too few frames have come.
+        """
         x = self.ends(orientation, acceleration)
         h1, c1 = self.forward1(x, state[0], state[1])
         state = [

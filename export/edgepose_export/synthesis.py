@@ -17,14 +17,16 @@ Array = NDArray[np.float64]
 GRAVITY = 9.81
 
 INERTIAL_FROM_BODY = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""R_IT of synthetic recordings: a wearer who faces +Z of T faces +X of I, so `heading:0` is their body frame."""
+"""R_IT of synthetic recordings: a wearer who faces +Z of T faces +X of I, so `heading:0` is their body
+frame.
+"""
 
 BLEND_S = 1.0
 """Seconds in which a held pose turns into the first pose of the take."""
 
 
 def straight_pose() -> Array:
-    """Global rotations (24, 3, 3) of the straight pose (N-pose): arms hang, everything else as in the zero pose."""
+    """Global rotations (24, 3, 3) of the straight pose (N-pose): the zero pose with hanging arms."""
     pose = np.tile(np.eye(3), (24, 1, 1))
     pose[[16, 18, 20, 22]] = rot.about_axis("z", -np.pi / 2)
     pose[[17, 19, 21, 23]] = rot.about_axis("z", np.pi / 2)
@@ -32,25 +34,22 @@ def straight_pose() -> Array:
 
 
 def with_hold(motion: Motion, seconds: float) -> Motion:
-    """The take with the wearer standing straight for some seconds before it, facing as its first frame faces.
+    """The take with the wearer standing straight for some seconds before it.
 
-    The pelvis stays where the first frame has it; the last `BLEND_S` seconds are added to get from one pose to the other.
+    The take is turned so that it begins facing +Z of T, which is what `heading:0` calibrates. The pelvis
+    stays where the first frame has it; another `BLEND_S` seconds lead from the straight pose to that frame's.
     """
-    first = motion.rotations[0]
-    forward = first[0, :, 2]
-    pose = rot.about_axis("y", np.arctan2(forward[0], forward[2])) @ straight_pose()
-    steps = round(BLEND_S * motion.rate)
+    forward = motion.rotations[0, 0, :, 2]
+    turn = rot.about_axis("y", -np.arctan2(forward[0], forward[2]))
+    rotations, translation = turn @ motion.rotations, motion.translation @ turn.T
     # A smooth start and end (smoothstep), so that the virtual accelerometers see no jolt.
-    t = np.linspace(0.0, 1.0, steps, endpoint=False)
-    t = t * t * (3.0 - 2.0 * t)
-    way = rot.quat_to_matrix(
-        rot.slerp(rot.matrix_to_quat(pose)[None], rot.matrix_to_quat(first)[None], t[:, None])
-    )
-    hold = np.broadcast_to(pose, (round(seconds * motion.rate), 24, 3, 3))
-    still = np.broadcast_to(motion.translation[0], (len(hold) + steps, 3))
+    t = np.linspace(0.0, 1.0, round(BLEND_S * motion.rate), endpoint=False)[:, None]
+    first, last = rot.matrix_to_quat(straight_pose()), rot.matrix_to_quat(rotations[0])
+    way = rot.quat_to_matrix(rot.slerp(first, last, t * t * (3.0 - 2.0 * t)))
+    hold = np.broadcast_to(straight_pose(), (round(seconds * motion.rate), 24, 3, 3))
+    still = np.broadcast_to(translation[0], (len(hold) + len(way), 3))
     return motion._replace(
-        rotations=np.concatenate([hold, way, motion.rotations]),
-        translation=np.concatenate([still, motion.translation]),
+        rotations=np.concatenate([hold, way, rotations]), translation=np.concatenate([still, translation])
     )
 
 
@@ -71,7 +70,8 @@ class VirtualImus(NamedTuple):
 def virtual_imus(motion: Motion, body: Body, mounting: Array | None = None) -> VirtualImus:
     """Sensors at the body's six skin points.
 
-    Accelerations are central differences over neighbouring frames, DIP eq. 3 with n = 1; the first and last frame repeat theirs.
+    Accelerations are central differences over neighbouring frames, DIP eq. 3 with n = 1; the first and last
+    frame repeat theirs.
 
     Args:
         motion: at the rate that is wanted of the sensors.
@@ -100,7 +100,9 @@ def virtual_imus(motion: Motion, body: Body, mounting: Array | None = None) -> V
 
 
 def recording_arrays(motion: Motion, imus: VirtualImus, license_note: str) -> dict[str, NDArray]:
-    """Keys of an npz that is an IMU recording and an AMASS-like motion file at once: sensors, and the pose they were made from."""
+    """Keys of an npz that is an IMU recording and an AMASS-like motion file at once: sensors, and the pose
+    they were made from.
+    """
     arrays: dict[str, NDArray] = {"t": np.arange(len(motion.rotations)) / motion.rate}
     for i, name in enumerate(PLACEMENTS):
         arrays[f"{name}_quat"] = imus.orientation[:, i].astype(np.float32)

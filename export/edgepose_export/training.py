@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields
@@ -36,12 +37,13 @@ class TrainConfig:
     Attributes:
         network: the network's shape.
         augmentation: disturbances of the batches.
-        beta: weight of the beta-likelihood (Seitzer et al. 2022); 0 is the paper's Gaussian likelihood, which lets entries that never move
-            take all gradient.
+        beta: weight of the beta-likelihood (Seitzer et al. 2022); 0 is the paper's Gaussian likelihood, which
+            lets entries that never move take all gradient.
         steps: optimiser steps.
         sequences: sequences a step.
         window: frames a sequence.
-        joined: sequences may run over the ends of takes: a network that is never reset learns to recover from a jump.
+        joined: sequences may run over the ends of takes: a network that is never reset learns to recover from
+            a jump.
         free_share: share of the sequences taken from CMU's takes.
         input_dropout: share of the inputs set to zero (DIP: 0.2).
         learning_rate: of Adam.
@@ -75,41 +77,78 @@ def read_config(path: Path) -> TrainConfig:
     """A TOML file with TrainConfig's fields, `[network]` and `[augmentation]` tables.
 
     Raises:
-        EdgeposeError: not TOML, an unknown field or a wrong type.
+        EdgeposeError: no file, not TOML, an unknown field, or a value of a wrong type or out of its range.
     """
     try:
-        values = tomllib.loads(path.read_text())
-        return config_from(values)
-    except (OSError, tomllib.TOMLDecodeError, TypeError, ValueError) as error:
+        return config_from(tomllib.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise EdgeposeError(f"{path}: {error.strerror}") from error
+    except ValueError as error:
         raise EdgeposeError(f"{path}: {error}") from error
 
 
 def config_from(values: dict[str, Any]) -> TrainConfig:
-    """TrainConfig of plain values; the inverse of `dataclasses.asdict` with the tables as dicts."""
+    """TrainConfig of plain values; the inverse of `config_values`.
+
+    Raises:
+        ValueError: an unknown field, or a value of a wrong type or out of its range; names the field.
+    """
     values = dict(values)
     tables: dict[str, Any] = {"network": NetworkShape, "augmentation": Augmentation}
     for name, kind in tables.items():
-        table = dict(values.pop(name, {}))
-        unknown = set(table) - set(kind._fields)
-        if unknown:
-            raise ValueError(f"unknown field {sorted(unknown)[0]!r} in [{name}]")
-        values[name] = kind(**table)
-    unknown = set(values) - {f.name for f in fields(TrainConfig)}
-    if unknown:
-        raise ValueError(f"unknown field {sorted(unknown)[0]!r}")
-    config = TrainConfig(**values)
-    _check_choice("kind", config.network.kind, ("birnn", "rnn"))
-    _check_choice("targets", config.network.targets, ("local-matrix", "global-6d"))
-    _check_choice("measured", config.network.measured, ("predicted", "passed"))
-    _check_choice("schedule", config.schedule, ("exponential", "cosine"))
+        table = values.pop(name, {})
+        if not isinstance(table, dict):
+            raise ValueError(f"{name} is {table!r}; it takes a table [{name}]")
+        values[name] = kind(**_checked(table, kind()._asdict(), f" in [{name}]"))
+    defaults = {f.name: getattr(TrainConfig, f.name) for f in fields(TrainConfig) if f.name not in tables}
+    config = TrainConfig(
+        **_checked({k: v for k, v in values.items() if k not in tables}, defaults),
+        **{name: values[name] for name in tables},
+    )
     if config.network.measured == "passed" and config.network.targets != "global-6d":
         raise ValueError('measured = "passed" needs targets = "global-6d"')
     return config
 
 
-def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"{name} is {value!r}; it takes {' or '.join(map(repr, choices))}")
+_CHOICES = {
+    "kind": ("birnn", "rnn"),
+    "targets": ("local-matrix", "global-6d"),
+    "measured": ("predicted", "passed"),
+    "schedule": ("exponential", "cosine"),
+}
+
+_RANGES: dict[str, tuple[float, float]] = {
+    "hidden": (1, 8192),
+    "steps": (1, 10**9),
+    "sequences": (1, 10**6),
+    "window": (1, 10**6),
+    "validate_every": (1, 10**9),
+    "seed": (0, 2**62),
+    "learning_rate": (1e-12, 10.0),
+    "averaging": (0.0, 1.0),
+    "input_dropout": (0.0, 0.99),
+    "free_share": (0.0, 1.0),
+    "mirror": (0.0, 1.0),
+}
+"""Least and greatest value of numbers; those of other fields are 0 and 1000."""
+
+
+def _checked(values: dict[str, Any], defaults: dict[str, Any], where: str = "") -> dict[str, Any]:
+    """The same values, if each has its default's type (or is whole) and is in its range."""
+    for name, value in values.items():
+        if name not in defaults:
+            raise ValueError(f"unknown field {name!r}{where}")
+        kind = type(defaults[name])
+        if type(value) is not kind and not (kind is float and type(value) is int):
+            words = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+            raise ValueError(f"{name} is {value!r}; it takes {words[kind]}")
+        if kind is str and value not in _CHOICES[name]:
+            raise ValueError(f"{name} is {value!r}; it takes {' or '.join(map(repr, _CHOICES[name]))}")
+        if kind in (int, float):
+            low, high = _RANGES.get(name, (0, 1000))
+            if not low <= value <= high:
+                raise ValueError(f"{name} is {value!r}; it takes {low:g} to {high:g}")
+    return values
 
 
 def config_values(config: TrainConfig) -> dict[str, Any]:
@@ -120,11 +159,13 @@ def config_values(config: TrainConfig) -> dict[str, Any]:
     }
 
 
-# --- targets and loss ------------------------------------------------------------------------------------------------------
+# --- targets and loss ---------------------------------------------------------------------------------------
 
 
 def pose_targets(relative: Tensor, shape: NetworkShape) -> Tensor:
-    """Numbers (..., pose outputs) that the network shall give, before z-scoring, of root-relative rotations (..., 24, 3, 3)."""
+    """Numbers (..., pose outputs) that the network shall give, before z-scoring, of root-relative rotations
+    (..., 24, 3, 3).
+    """
     joints = list(shape.joints)
     if shape.targets == "global-6d":
         return rotation_to_6d(relative[..., joints, :, :]).flatten(-2)
@@ -135,8 +176,8 @@ def pose_targets(relative: Tensor, shape: NetworkShape) -> Tensor:
 def statistics_of(tape: Tape, shape: NetworkShape) -> Statistics:
     """Means and deviations over a training tape (DIP 4.4).
 
-    Local matrices are z-scored entry by entry as in the paper. Global rotations get one deviation for all entries, so that a degree
-    weighs the same at every joint.
+    Local matrices are z-scored entry by entry as in the paper. Global rotations get one deviation for all
+    entries, so that a degree weighs the same at every joint.
     """
     inputs = network_input(tape.orientation, tape.acceleration)
     targets = pose_targets(tape.relative, shape)
@@ -147,14 +188,16 @@ def statistics_of(tape: Tape, shape: NetworkShape) -> Statistics:
 
 
 def likelihood_loss(mean: Tensor, deviation: Tensor, target: Tensor, beta: float) -> Tensor:
-    """Negative Gaussian log-likelihood (DIP eq. 4 and 5), each term weighted by deviation^(2 beta) without gradient; a scalar."""
+    """Negative Gaussian log-likelihood (DIP eq. 4 and 5), each term weighted by deviation^(2 beta) without
+    gradient; a scalar.
+    """
     loss = torch.log(deviation) + 0.5 * ((target - mean) / deviation).square()
     if beta:
         loss = loss * deviation.detach() ** (2.0 * beta)
     return loss.mean()
 
 
-# --- batches ---------------------------------------------------------------------------------------------------------------
+# --- batches ------------------------------------------------------------------------------------------------
 
 
 def window_starts(tape: Tape, window: int, joined: bool) -> tuple[Tensor, Tensor]:
@@ -191,7 +234,7 @@ def windows(tape: Tape, starts: Tensor, length: int) -> tuple[Tensor, Tensor, Te
     return tape.orientation[index], tape.acceleration[index], tape.relative[index]
 
 
-# --- the run ---------------------------------------------------------------------------------------------------------------
+# --- the run ------------------------------------------------------------------------------------------------
 
 
 class Trainer:
@@ -216,8 +259,12 @@ class Trainer:
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate)
         self.generator = torch.Generator().manual_seed(config.seed + 1)
         self.starts = window_starts(train, config.window, config.joined)
-        if len(self.starts[0]) + len(self.starts[1]) == 0:
-            raise EdgeposeError(f"no training take is as long as the window of {config.window} frames")
+        for part, starts in (
+            ("training", self.starts),
+            ("validation", window_starts(validation, config.window, False)),
+        ):
+            if not any(map(len, starts)):
+                raise EdgeposeError(f"no {part} take is as long as the window of {config.window} frames")
         self.step = 0
         self.best = math.inf
         self.worse = 0
@@ -291,7 +338,14 @@ class Trainer:
         }
 
     def load(self, state: dict[str, Any]) -> None:
-        """Goes on where a checkpoint stopped."""
+        """Goes on where a checkpoint stopped.
+
+        Raises:
+            EdgeposeError: the checkpoint is of another network, or holds weights only.
+        """
+        if "optimiser" not in state:
+            raise EdgeposeError("the checkpoint holds weights only; begin a new run from it with --init")
+        self._check_shape(state)
         self.statistics = Statistics(**state["statistics"])
         self.network.load_state_dict(state["network"])
         self.averaged.load_state_dict(state["averaged"])
@@ -302,20 +356,47 @@ class Trainer:
         self.data = state["data"]
 
     def start_from(self, state: dict[str, Any]) -> None:
-        """Fine-tuning (DIP 3.4.4): takes a checkpoint's averaged weights and statistics, nothing else."""
-        shape = config_from(json.loads(state["config"])).network
-        if shape != self.config.network:
-            raise EdgeposeError(f"the checkpoint holds {shape}, the config asks for {self.config.network}")
+        """Fine-tuning (DIP 3.4.4): takes a checkpoint's averaged weights and statistics.
+
+        What it was trained on, and under which licences, is noted together with this run's takes.
+
+        Raises:
+            EdgeposeError: the checkpoint is of another network.
+        """
+        self._check_shape(state)
         self.statistics = Statistics(**state["statistics"])
         self.network.load_state_dict(state["averaged"])
         self.averaged.load_state_dict(state["averaged"])
+        before = state["data"]
+        self.data = {
+            "summary": f"{before['summary']}, then {self.data['summary']}",
+            "licenses": sorted({*before["licenses"], *self.data["licenses"]}),
+            "takes": before["takes"] + self.data["takes"],
+            "hours": before["hours"] + self.data["hours"],
+        }
+
+    def _check_shape(self, state: dict[str, Any]) -> None:
+        shape = config_from(json.loads(state["config"])).network
+        if shape != self.config.network:
+            raise EdgeposeError(f"the checkpoint holds {shape}, the config asks for {self.config.network}")
 
 
 def save_checkpoint(state: dict[str, Any], path: Path) -> None:
-    """Writes a checkpoint so that a crash leaves the old one or the new one, never half of one."""
+    """Writes a checkpoint so that a crash leaves the old one or the new one, never half of one.
+
+    Raises:
+        EdgeposeError: it cannot be written (disk full).
+    """
     partial = path.with_suffix(".partial")
-    torch.save(state, partial)
-    partial.replace(path)
+    try:
+        with partial.open("wb") as file:
+            torch.save(state, file)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise EdgeposeError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
@@ -326,11 +407,24 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     """
     try:
         state = torch.load(path, weights_only=True)
+    except OSError as error:
+        raise EdgeposeError(f"{path}: {error.strerror or error}") from error
     except Exception as error:
         raise EdgeposeError(f"{path}: not a checkpoint of edgepose train ({type(error).__name__})") from error
-    if not isinstance(state, dict) or not {"config", "statistics", "averaged", "step", "data"} <= set(state):
+    if not isinstance(state, dict) or not set(_WEIGHTS_ONLY) <= set(state):
         raise EdgeposeError(f"{path}: not a checkpoint of edgepose train (entries are missing)")
+    try:
+        network = PoseNetwork(config_from(json.loads(state["config"])).network)
+        network.load_state_dict(state["averaged"])
+        Statistics(**state["statistics"])
+    except (TypeError, ValueError, RuntimeError, AttributeError) as error:
+        reason = str(error).splitlines()[0]
+        raise EdgeposeError(f"{path}: not a checkpoint that this edgepose reads ({reason})") from error
     return state
+
+
+_WEIGHTS_ONLY = ("config", "statistics", "averaged", "step", "data")
+"""Entries of `best.pt`: what `export` and fine-tuning need."""
 
 
 def fit(
@@ -339,26 +433,32 @@ def fit(
     on_step: Callable[[int, float], None],
     on_validation: Callable[[int, float, float], None],
 ) -> None:
-    """Trains to the config's end, writing `checkpoint.pt` and, at the best validation loss, `best.pt` and a line of `log.jsonl`."""
+    """Trains to the config's end, writing `checkpoint.pt` and, at the best validation loss, `best.pt` and a
+    line of `log.jsonl`.
+    """
     config, total, count = trainer.config, 0.0, 0
     while trainer.step < config.steps:
         loss = trainer.train_step()
         if not math.isfinite(loss):
             raise EdgeposeError(
-                f"the loss is {loss} at step {trainer.step}; go on from the last checkpoint with a lower learning rate"
+                f"the loss is {loss} at step {trainer.step}; "
+                "go on from the last checkpoint with a lower learning rate"
             )
         total, count = total + loss, count + 1
         on_step(trainer.step, loss)
         if trainer.step % config.validate_every == 0 or trainer.step == config.steps:
             validation = trainer.validate()
+            if not math.isfinite(validation):
+                raise EdgeposeError(
+                    f"the validation loss is {validation} at step {trainer.step}; "
+                    "go on from the last checkpoint with a lower learning rate"
+                )
             better = validation < trainer.best
             trainer.best, trainer.worse = (validation, 0) if better else (trainer.best, trainer.worse + 1)
             state = trainer.state()
             save_checkpoint(state, folder / CHECKPOINT)
             if better:
-                save_checkpoint(
-                    {k: state[k] for k in ("config", "statistics", "averaged", "step", "data")}, folder / "best.pt"
-                )
+                save_checkpoint({k: state[k] for k in _WEIGHTS_ONLY}, folder / "best.pt")
             with (folder / "log.jsonl").open("a") as log:
                 log.write(
                     json.dumps({"step": trainer.step, "train": total / count, "validation": validation})

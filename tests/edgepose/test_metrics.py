@@ -88,12 +88,25 @@ def test_summary_and_table():
     assert result["sip_error_deg"] == pytest.approx((values.mean(), values.std(), 6))
     assert result["jitter_km_s3"].frames == 3
     table = metrics.format_table({"BiRNN": result, "SIP": metrics.summary(true, true, OFFSETS, 60.0)})
-    lines = table.splitlines()
-    assert lines[0].split() == ["measure", "BiRNN", "SIP"]
-    assert len(lines) == 1 + len(result)
-    assert len({len(line) for line in lines}) == 1
-    assert f"{values.mean():.2f} ± {values.std():.2f} (6)" in lines[1]
-    assert lines[1].endswith("0.00 ± 0.00 (6)")
+    head, birnn, sip, note = table.splitlines()
+    assert head.split("  ")[0] == "method"
+    assert all(heading in head and len(heading) <= 16 for heading in metrics.HEADINGS.values())
+    assert len({len(line) for line in (head, birnn, sip)}) == 1
+    assert len(head) <= 110
+    assert birnn.split("  ")[1].strip() == f"{values.mean():.2f} ± {values.std():.2f}"
+    assert sip.split()[:4] == ["SIP", "0.00", "±", "0.00"]
+    assert note.startswith("mean ± deviation over 6 frames; ")
+
+
+def test_table_of_unlike_methods():
+    long, short = metrics.summary(random_poses(6, 7), random_poses(6, 8), OFFSETS, 60.0), {}
+    short["sip_error_deg"] = metrics.measure([1.0, 3.0])
+    head, first, second, note = metrics.format_table({"a method": long, "b": short}).splitlines()
+    assert head.split()[-1] == "frames"
+    assert first.split()[-1] == "6"
+    assert second.split() == ["b", "2.00", "±", "1.00", "-", "-", "-", "-", "-", "2"]
+    assert note.startswith("mean ± deviation; ")
+    assert list(metrics.HEADINGS) == list(metrics.LABELS)
 
 
 def test_too_short_for_jitter():

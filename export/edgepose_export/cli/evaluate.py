@@ -10,8 +10,12 @@ MODES = click.Choice(["window", "stream", "offline"])
 
 
 @click.command()
-@click.option("--model", "name", default="birnn", show_default=True, help="Shipped model or an archive's path.")
-@click.option("--trust", is_flag=True, help="Load --model although its sum is not known: you vouch for the code in it.")
+@click.option(
+    "--model", "name", default="birnn", show_default=True, help="Shipped model or an archive's path."
+)
+@click.option(
+    "--trust", is_flag=True, help="Load --model although its sum is not known: you vouch for the code in it."
+)
 @click.option(
     "--data",
     required=True,
@@ -23,18 +27,22 @@ MODES = click.Choice(["window", "stream", "offline"])
     "parts",
     multiple=True,
     type=click.Choice(["cmu-walk-run", "cmu-02", "bandai-styles", "all"]),
-    help="Held-out part of the split, or all takes below --data; may be repeated  [default: the three held-out parts]",
+    help="Held-out part of the split, or all takes below --data; may be repeated  "
+    "[default: the three held-out parts]",
 )
 @click.option(
     "--online",
     "modes",
     multiple=True,
     type=MODES,
-    help="How the model runs: as `run` runs it, or over whole takes; may be repeated  [default: all that apply]",
+    help="How the model runs: as `run` runs it, or over whole takes; may be repeated  "
+    "[default: all that apply]",
 )
 @click.option("--past", type=click.IntRange(0, 600), help="Past frames of a window  [default: the model's]")
 @click.option("--future", type=click.IntRange(0, 120), help="Future frames  [default: the model's]")
-@click.option("--baselines", is_flag=True, help="Add trivial baselines, learnt from the training takes below --data.")
+@click.option(
+    "--baselines", is_flag=True, help="Add trivial baselines, learnt from the training takes below --data."
+)
 def evaluate(
     name: str,
     trust: bool,

@@ -12,23 +12,42 @@ import click
 @click.command()
 @click.argument("checkpoint", type=click.Path(path_type=Path))
 @click.option(
-    "--out", required=True, type=click.Path(path_type=Path, dir_okay=False), help="Archive to write; its card goes beside it as .md."
+    "--out",
+    required=True,
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Archive to write, a .pt file; its card goes beside it as .md.",
 )
-@click.option("--past", type=click.IntRange(0, 600), default=20, show_default=True, help="Past frames of a bidirectional model's window.")
-@click.option("--future", type=click.IntRange(0, 120), default=5, show_default=True, help="Future frames a bidirectional model waits for.")
+@click.option(
+    "--past",
+    type=click.IntRange(0, 600),
+    default=20,
+    show_default=True,
+    help="Past frames of a bidirectional model's window.",
+)
+@click.option(
+    "--future",
+    type=click.IntRange(0, 120),
+    default=5,
+    show_default=True,
+    help="Future frames a bidirectional model waits for.",
+)
 @click.option(
     "--measure",
     "data",
     type=click.Path(path_type=Path, exists=True, file_okay=False),
-    help="Folder that `edgepose synthesize` wrote: measure the archive on its held-out takes and put the figures into the card.",
+    help="Folder that `edgepose synthesize` wrote: measure the archive on its held-out takes and put the "
+    "figures into the card.",
 )
 def export(checkpoint: Path, out: Path, past: int, future: int, data: Path | None) -> None:
-    """Turn a checkpoint of `edgepose train` into a TorchScript archive for `edgepose run --model FILE --trust`.
+    """Turn a checkpoint of `edgepose train` into a TorchScript archive for `edgepose run --model FILE
+    --trust`.
 
     \b
     Example:
       edgepose export runs/birnn/checkpoint.pt --out my-birnn.pt --measure recordings/
     """
+    if out.suffix != ".pt":
+        raise click.UsageError("--out is the name of a .pt file")
     from edgepose_export import archive, training
     from edgepose_export.card import card
     from edgepose_export.networks import PoseNetwork
@@ -52,4 +71,7 @@ def _measure(module: Any, metadata: dict[str, Any], data: Path) -> dict[str, Any
     from edgepose_export.evaluation import held_out_tables, modes_of
 
     tables = held_out_tables(module, modes_of(metadata), data, with_baselines=True)
-    return {part: {row: {key: list(m) for key, m in columns.items()} for row, columns in table.items()} for part, table in tables.items()}
+    return {
+        part: {row: {key: list(m) for key, m in columns.items()} for row, columns in table.items()}
+        for part, table in tables.items()
+    }

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
@@ -76,7 +79,8 @@ def synthesize(
 ) -> None:
     """Make IMU recordings with true poses from motion capture (.bvh, .amc, AMASS .npz; folders are searched).
 
-    Training reads them with the default flags. A recording with --hold can be calibrated and run like a real one.
+    Training reads them with the default flags. A recording with --hold can be calibrated and run like a real
+    one.
 
     \b
     Examples:
@@ -92,11 +96,17 @@ def synthesize(
         (path, Job(out, root if root.is_dir() else root.parent, rate, height, hold, mounting_seed))
         for root, path in files
     ]
+    _check_targets(tasks)
     failed = []
-    with ProcessPoolExecutor(jobs) as pool:
-        futures = [pool.submit(convert, *task) for task in tasks]
-        for future, (_, path) in progress(list(zip(futures, files, strict=True)), "synthesizing"):
-            problem = future.result()
+    with ExitStack() as stack:
+        if jobs == 1:
+            results = [partial(convert, *task) for task in tasks]
+        else:
+            # Not forked: a copy of a process with threads may hang.
+            pool = stack.enter_context(ProcessPoolExecutor(jobs, mp_context=get_context("spawn")))
+            results = [pool.submit(convert, *task).result for task in tasks]
+        for result, (_, path) in progress(list(zip(results, files, strict=True)), "synthesizing"):
+            problem = result()
             if problem:
                 failed.append(path)
                 click.echo(f"left out: {problem}", err=True)
@@ -105,6 +115,16 @@ def synthesize(
         raise EdgeposeError(
             f"{len(failed)} of {len(files)} files could not be converted; they are named above"
         )
+
+
+def _check_targets(tasks: list[tuple[Path, Job]]) -> None:
+    """Raises EdgeposeError if two files would become one recording, such as a take's .amc and .bvh."""
+    seen: dict[Path, Path] = {}
+    for path, job in tasks:
+        target = job.out / path.relative_to(job.root).with_suffix(".npz")
+        if target in seen:
+            raise EdgeposeError(f"{seen[target]} and {path} would both become {target}; give one of them")
+        seen[target] = path
 
 
 def _motion_files(root: Path) -> list[Path]:
@@ -125,7 +145,9 @@ def convert(path: Path, job: Job) -> str | None:
     try:
         mounting = None
         if job.mounting_seed is not None:
-            mounting = rotvec_to_matrix(np.random.default_rng(job.mounting_seed).uniform(-np.pi, np.pi, (6, 3)))
+            mounting = rotvec_to_matrix(
+                np.random.default_rng(job.mounting_seed).uniform(-np.pi, np.pi, (6, 3))
+            )
         takes = pieces(read_motion(path))
         if not takes:
             return f"{path}: shorter than a second between jumps"

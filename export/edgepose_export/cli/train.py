@@ -64,7 +64,7 @@ def train(
 
     from edgepose_export import training
     from edgepose_export.cli.progress import labelled
-    from edgepose_export.dataset import describe_takes, part_of, read_takes, tape
+    from edgepose_export.dataset import describe_takes, read_training_takes, tape
 
     settings = training.read_config(_config_path(config))
     if steps:
@@ -76,10 +76,7 @@ def train(
         )
     torch.set_num_threads(threads)
     out.mkdir(parents=True, exist_ok=True)
-    takes, validation = (
-        read_takes(data, lambda name, part=part: part_of(name) == part, labelled(f"reading {part} takes"))
-        for part in ("train", "validation")
-    )
+    takes, validation = read_training_takes(data, labelled("reading takes"))
     about = describe_takes(takes)
     click.echo(f"training on {about['takes']} takes, {about['hours']:.2f} h: {about['summary']}", err=True)
     trainer = training.Trainer(settings, tape(takes), tape(validation), about)
@@ -102,8 +99,8 @@ def _fit(trainer, out: Path) -> None:  # type: ignore[no-untyped-def]
         speed = (step - first) * config.sequences * config.window / spent
         left = (config.steps - step) * spent / (step - first) / 60
         click.echo(
-            f"{'' if not sys.stderr.isatty() else chr(13)}step {step} of {config.steps}: loss {loss:.4f}, validation {validation:.4f}, "
-            f"{speed / 1e3:.1f} k frames/s, {left:.0f} min left",
+            f"{chr(13) if sys.stderr.isatty() else ''}step {step} of {config.steps}: loss {loss:.4f}, "
+            f"validation {validation:.4f}, {speed / 1e3:.1f} k frames/s, {left:.0f} min left",
             err=True,
         )
 

@@ -1,0 +1,96 @@
+"""Small networks and made-up sensor data that several test files need."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from edgepose_export.archive import Statistics, describe, save, script
+from edgepose_export.networks import NetworkShape, PoseNetwork
+
+SHAPES = [
+    NetworkShape(kind, 8, targets, measured)
+    for kind in ("birnn", "rnn")
+    for targets, measured in (
+        ("local-matrix", "predicted"),
+        ("global-6d", "predicted"),
+        ("global-6d", "passed"),
+    )
+]
+DATA = {"summary": "Made-up motion", "licenses": ["Made-up motion, public domain"], "takes": 3, "hours": 0.5}
+
+
+def tiny_network(shape):
+    """A network whose recurrent weights are large enough for past and future to matter, and statistics."""
+    torch.manual_seed(5)
+    network = PoseNetwork(shape).eval()
+    with torch.no_grad():
+        for weights in network.parameters():
+            weights.mul_(2.0)
+    generator = torch.Generator().manual_seed(6)
+
+    def numbers(size):
+        return torch.rand(size, generator=generator)
+
+    mean = numbers(shape.pose_outputs) * 0.2
+    if shape.targets == "local-matrix":
+        mean = mean + torch.eye(3).flatten().repeat(len(shape.joints))
+    else:
+        mean = mean + torch.tensor([1.0, 0, 0, 0, 1, 0]).repeat(len(shape.joints))
+    return network, Statistics(
+        numbers(60) * 0.1, 0.5 + numbers(60), mean, 0.1 + 0.3 * numbers(shape.pose_outputs)
+    )
+
+
+@cache
+def tiny_module(shape):
+    return script(*tiny_network(shape))
+
+
+@pytest.fixture(scope="session")
+def tiny():
+    """The scripted module of a shape with 8 units; always the same weights."""
+    return tiny_module
+
+
+@pytest.fixture(scope="session", params=SHAPES, ids=lambda s: f"{s.kind}-{s.targets}-{s.measured}")
+def shape(request):
+    return request.param
+
+
+@pytest.fixture(scope="session")
+def parts():
+    """Network and statistics of a shape."""
+    return tiny_network
+
+
+@pytest.fixture(scope="session")
+def write_archive():
+    """Writes an archive of a shape, gives its path; keywords replace entries of its metadata."""
+
+    def write(path, shape=SHAPES[2], **changes):
+        checkpoint = {"step": 7, "data": DATA, "config": '{"steps": 7}'}
+        about = describe(path.stem, tiny_network(shape)[0], checkpoint, 4, 2)
+        if shape.kind == "rnn":
+            about |= {"past": 0, "future": 0}
+        save(tiny_module(shape), path, about | changes)
+        return path
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def wearers():
+    """Makes sensors (wearers, frames, 6, ...) that turn steadily: orientations and accelerations, float32."""
+
+    def make(count, frames, seed=1):
+        rng = np.random.default_rng(seed)
+        start = Rotation.random(count * 6, random_state=rng).as_matrix().reshape(count, 1, 6, 3, 3)
+        steps = rng.normal(scale=0.2, size=(count, frames, 6, 3)).cumsum(axis=1)
+        turns = Rotation.from_rotvec(steps.reshape(-1, 3)).as_matrix().reshape(count, frames, 6, 3, 3)
+        acceleration = rng.normal(scale=3.0, size=(count, frames, 6, 3))
+        return torch.tensor(start @ turns).float(), torch.tensor(acceleration).float()
+
+    return make

@@ -1,0 +1,100 @@
+import numpy as np
+import pytest
+import torch
+
+from edgepose.engine import EngineOutput, StreamEngine, WindowEngine
+from edgepose_export.networks import NetworkShape
+
+BIRNN = NetworkShape("birnn", 8, "global-6d", "passed")
+RNN = BIRNN._replace(kind="rnn")
+
+
+def run(engine, orientation, acceleration):
+    """All outputs, and how many came after each frame; tags are the frames' numbers."""
+    outputs, counts = [], []
+    for t, (o, a) in enumerate(zip(orientation, acceleration, strict=True)):
+        # Calibration gives float64.
+        out = engine.push(t, o.numpy().astype(float), a.numpy().astype(float))
+        counts.append(len(out))
+        outputs += out
+    last = engine.finish()
+    return outputs + last, counts, len(last)
+
+
+def check_frames(result, frames, future, past):
+    outputs, counts, last = result
+    assert [output.tag for output in outputs] == list(range(frames))
+    assert counts == [int(t >= future) for t in range(frames)]
+    assert last == min(future, frames)
+    assert [output.filling for output in outputs] == [t < past for t in range(frames)]
+    for output in outputs:
+        assert isinstance(output, EngineOutput)
+        assert output.rotations.shape == (24, 3, 3)
+        assert output.std.shape == (24,)
+        assert output.rotations.dtype == output.std.dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    ("past", "future", "frames"),
+    [(4, 2, 12), (0, 0, 6), (3, 0, 6), (0, 3, 6), (20, 5, 12), (2, 9, 6), (4, 2, 1), (1, 1, 0), (5, 6, 12)],
+)
+def test_window(tiny, wearers, past, future, frames):
+    module = tiny(BIRNN)
+    orientation, acceleration = (x[0] for x in wearers(1, max(frames, 1)))
+    orientation, acceleration = orientation[:frames], acceleration[:frames]
+    result = run(WindowEngine(module, past, future), orientation, acceleration)
+    check_frames(result, frames, future, past)
+    for t, output in enumerate(result[0]):
+        window = slice(max(0, t - past), t + future + 1)
+        with torch.no_grad():
+            rotations, std = module(orientation[None, window], acceleration[None, window])
+        index = t - window.start
+        np.testing.assert_allclose(output.rotations, rotations[0, index], atol=2e-5)
+        np.testing.assert_allclose(output.std, std[0, index], atol=2e-5)
+
+
+@pytest.mark.parametrize("window", [(0, 0), (3, 2)])
+def test_window_keeps_no_more_frames_than_it_needs(tiny, wearers, window):
+    engine = WindowEngine(tiny(BIRNN), *window)
+    run(engine, *(x[0] for x in wearers(1, 20)))
+    assert engine._orientation.shape[1] == engine._acceleration.shape[1] == sum(window) + 1
+
+
+@pytest.mark.parametrize(("future", "frames"), [(2, 12), (0, 12), (9, 6), (3, 3), (2, 1), (1, 0)])
+def test_stream(tiny, wearers, future, frames):
+    module = tiny(BIRNN)
+    orientation, acceleration = (x[0, :frames] for x in wearers(1, 12))
+    result = run(StreamEngine(module, 4, future), orientation, acceleration)
+    check_frames(result, frames, future, 4)
+    with torch.no_grad():
+        state, poses = module.start(1, future), []
+        for o, a in zip(orientation, acceleration, strict=True):
+            rotations, _, state = module.stream(o[None], a[None], state)
+            poses += rotations[0]
+        poses += module.drain(state)[0][0]
+    for output, pose in zip(result[0], poses, strict=True):
+        np.testing.assert_allclose(output.rotations, pose, atol=2e-5)
+
+
+def test_one_directional_stream_is_the_whole_sequence(tiny, wearers):
+    orientation, acceleration = wearers(1, 12)
+    result = run(StreamEngine(tiny(RNN), 0, 0), orientation[0], acceleration[0])
+    check_frames(result, 12, 0, 0)
+    with torch.no_grad():
+        rotations, std = tiny(RNN)(orientation, acceleration)
+    np.testing.assert_allclose([output.rotations for output in result[0]], rotations[0], atol=2e-5)
+    np.testing.assert_allclose([output.std for output in result[0]], std[0], atol=2e-5)
+
+
+@pytest.mark.parametrize("engine", [WindowEngine, StreamEngine])
+def test_warming_up_leaves_no_trace(tiny, wearers, engine):
+    orientation, acceleration = (x[0] for x in wearers(1, 5))
+    first, second = (run(engine(tiny(BIRNN), 3, 2), orientation, acceleration)[0] for _ in range(2))
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_allclose(a.rotations, b.rotations, atol=1e-6)
+    # Outputs stay as they were given while the engine goes on.
+    running = engine(tiny(BIRNN), 0, 0)
+    kept = running.push(0, orientation[0].numpy(), acceleration[0].numpy())[0]
+    copy = kept.rotations.copy()
+    running.push(1, orientation[1].numpy(), acceleration[1].numpy())
+    np.testing.assert_array_equal(kept.rotations, copy)
