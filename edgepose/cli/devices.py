@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import click
 
 
@@ -34,6 +36,8 @@ def devices() -> None:
     # No CAN backend is configured here; importing python-can costs more than the rest of this command.
     import can
 
+    # It tells of every vendor's library that is not installed.
+    logging.getLogger("can").setLevel(logging.CRITICAL)
     click.echo("CAN interfaces (python-can):")
     channels = can.detect_available_configs(
         interfaces=["socketcan", "pcan", "vector", "kvaser", "ixxat", "usb2can"]
