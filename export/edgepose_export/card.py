@@ -54,14 +54,16 @@ def card(metadata: dict[str, Any]) -> str:
         "## Make it again",
         "",
         "```",
-        "edgepose synthesize MOCAP --out recordings",
+        "edgepose synthesize MOCAP --out recordings --jobs 2",
+        "edgepose synthesize MOCAP/*_normal_*.bvh --hold 3 --out recordings/standing",
         f"edgepose train --config {metadata['name']} --data recordings --out runs/{metadata['name']}",
         f"edgepose export runs/{metadata['name']}/checkpoint.pt --out {metadata['name']}.pt "
         "--measure recordings",
         "```",
         "",
-        "with MOCAP a folder that holds the BVH files of CMU subjects 01, 02, 03, 05 - 09 (cgspeed's "
-        "conversion) and both Bandai-Namco Research motion datasets.",
+        "MOCAP is a folder with the motion named above. For the shipped models: the BVH files of CMU subjects "
+        "01, 02, 03, 05 - 09 and some further takes (cgspeed's conversion), and both Bandai-Namco Research "
+        "motion datasets. The whole config is in the archive's metadata.",
         "",
     ]
     return "\n".join(lines)
