@@ -69,8 +69,8 @@ def run(
 ) -> RunSummary:
     """Runs a source to its end, or until `stopped`, and writes every pose to every sink.
 
-    What the source gave before an error or the stop comes out. After an error of a sink nothing is written any
-    more. An error is kept in the summary for the caller to report.
+    What the source gave before an error or the stop comes out. After an error of a sink nothing more is
+    written. An error is kept in the summary for the caller to report.
 
     Args:
         source: batches (time on the source's clock, samples that came).
@@ -79,8 +79,7 @@ def run(
         engine: makes poses.
         sinks: written in order.
         on_pose: called after each pose was written.
-        stopped: asked after each batch whether to end the run. An interrupt in the middle of a frame would lose
-            that frame; this does not.
+        stopped: asked after each batch whether to end the run. An interrupt would lose the frame under way.
     """
     summary = RunSummary()
     started = arrived = time.perf_counter()

@@ -1,9 +1,11 @@
 """Plays an IMU recording as six devices on a serial port (a pty), in real time, as native packets.
 
-    python tools/simulate.py recording.npz           # prints the port, plays at once, then stands at the last sample
-    python tools/simulate.py recording.npz --stand   # stands at the first sample until a line comes on standard input
+\b
+    python tools/simulate.py recording.npz           # plays at once, then stands at the last sample
+    python tools/simulate.py recording.npz --stand   # stands at the first sample until a line comes on stdin
 
-Prints `port NAME`, `started UNIX_TIME` and `ended UNIX_TIME`; ends when standard input closes, or at Ctrl-C.
+Prints `port NAME`, `started UNIX_TIME` and `ended UNIX_TIME`. Ends when standard input closes, though not
+in the middle of the recording, or at Ctrl-C.
 """
 
 from __future__ import annotations
@@ -32,15 +34,32 @@ TICK_S = 0.001
 def packet_maker(recording: Recording, sensor: int) -> Callable[[int, int, int], bytes]:
     """A function of (row, sequence number, device time in us) that gives a sensor's packet on the wire."""
     data = recording.sensors[PLACEMENTS[sensor]]
-    if data.quat is None or data.acc is None or data.gyr is None:
-        raise EdgeposeError(f"{PLACEMENTS[sensor]}: the recording lacks orientation, acceleration or angular rate")
-    columns: list[list[tuple[float, ...]]] = [list(map(tuple, rows.tolist())) for rows in (data.quat, data.acc, data.gyr)]
+    if data.quat is None or data.acc is None:
+        raise EdgeposeError(f"{PLACEMENTS[sensor]}: the recording lacks orientation or acceleration")
+    columns = [
+        [None] * len(data.time_s) if rows is None else [v if v[0] == v[0] else None for v in rows.tolist()]
+        for rows in (data.quat, data.acc, data.gyr)
+    ]
 
     def make(row: int, seq: int, t_us: int) -> bytes:
         quat, acc, gyr = (column[row] for column in columns)
-        return encode(Packet(sensor, seq & 0xFFFF, t_us & 0xFFFFFFFF, quat, acc, gyr))  # type: ignore[arg-type]
+        return encode(Packet(sensor, seq & 0xFFFF, t_us & 0xFFFFFFFF, quat, acc, gyr))
 
     return make
+
+
+def common_times(recording: Recording) -> NDArray[np.float64]:
+    """Times that all six sensors share."""
+    times = recording.sensors[PLACEMENTS[0]].time_s
+    for name, data in recording.sensors.items():
+        if not np.array_equal(data.time_s, times):
+            raise EdgeposeError(
+                f"{name}: its times differ from those of {PLACEMENTS[0]}; the simulator plays sensors that "
+                "sample at the same instants"
+            )
+    if len(times) < 2 or not (np.diff(times) > 0).all():
+        raise EdgeposeError("the recording needs two instants or more, each later than the one before")
+    return times
 
 
 def line_came() -> bool | None:
@@ -52,7 +71,7 @@ def line_came() -> bool | None:
 
 def play(recording: Recording, stand: bool) -> None:
     """Sends samples until standard input closes."""
-    times: NDArray[np.float64] = recording.sensors[PLACEMENTS[0]].time_s
+    times = common_times(recording)
     makers = [packet_maker(recording, sensor) for sensor in range(len(PLACEMENTS))]
     period = float(np.median(np.diff(times)))
     rows = len(times)
