@@ -10,6 +10,9 @@ from scipy.spatial.transform import Rotation
 from edgepose_export.archive import Statistics, describe, save, script
 from edgepose_export.networks import NetworkShape, PoseNetwork
 
+# The tests' networks are tiny: a second thread would only wait.
+torch.set_num_threads(1)
+
 SHAPES = [
     NetworkShape(kind, 8, targets, measured)
     for kind in ("birnn", "rnn")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -388,9 +389,11 @@ def save_checkpoint(state: dict[str, Any], path: Path) -> None:
         EdgeposeError: it cannot be written (disk full).
     """
     partial = path.with_suffix(".partial")
+    content = io.BytesIO()
+    torch.save(state, content)
     try:
         with partial.open("wb") as file:
-            torch.save(state, file)
+            file.write(content.getbuffer())
             file.flush()
             os.fsync(file.fileno())
         partial.replace(path)

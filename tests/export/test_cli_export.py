@@ -1,0 +1,293 @@
+import json
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+
+from edgepose import archive
+from edgepose.cli import cli
+from edgepose.errors import EdgeposeError
+from edgepose.placements import PLACEMENTS
+from edgepose.recording import read_recording
+from edgepose_export.training import read_checkpoint
+
+DATA = Path(__file__).parents[1] / "data" / "mocap"
+WALK = DATA / "dataset-2_walk_normal_001.bvh"
+CONFIG = """
+steps = 6
+sequences = 2
+window = 20
+validate_every = 3
+averaging = 0.5
+[network]
+kind = "birnn"
+hidden = 8
+targets = "global-6d"
+measured = "passed"
+"""
+# One real take under names of every part of the split.
+NAMES = ("01_01", "03_01", "07_01", "02_01", "dataset-2_walk_tired_001")
+
+
+@pytest.fixture(autouse=True)
+def own_settings(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+
+
+def edgepose(*arguments):
+    """Output of a command that has to succeed."""
+    result = CliRunner().invoke(cli, [str(a) for a in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result
+
+
+def fails(*arguments):
+    """The one line with which a command ends, as `edgepose` prints it."""
+    with pytest.raises(EdgeposeError) as caught:
+        CliRunner().invoke(cli, [str(a) for a in arguments], catch_exceptions=False)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """The whole chain, once: recordings, a run of a few steps, an archive with its card."""
+    folder = tmp_path_factory.mktemp("chain")
+    (folder / "mocap").mkdir()
+    for name in NAMES:
+        shutil.copy(WALK, folder / "mocap" / f"{name}.bvh")
+    (folder / "tiny.toml").write_text(CONFIG)
+    recordings, run = folder / "recordings", folder / "run"
+    said = [edgepose("synthesize", folder / "mocap", "--out", recordings).output]
+    train = ("train", "--config", folder / "tiny.toml", "--data", recordings, "--threads", 1)
+    said.append(edgepose(*train, "--out", run).output)
+    said.append(
+        edgepose(
+            "export", run / "best.pt", "--out", folder / "new" / "tiny.pt", "--measure", recordings
+        ).output
+    )
+    return folder, said, train
+
+
+def test_synthesize(made):
+    folder, said, _ = made
+    assert "5 of 5 recordings written" in said[0]
+    assert sorted(p.stem for p in (folder / "recordings").iterdir()) == sorted(NAMES)
+    recording = read_recording(folder / "recordings" / "07_01.npz")
+    assert all(len(data.time_s) == 119 for data in recording.sensors.values())
+
+
+def test_train(made):
+    folder, said, _ = made
+    assert "training on 1 takes" in said[1]
+    assert "step 3 of 6: loss" in said[1]
+    assert "step 6 of 6: loss" in said[1]
+    state = read_checkpoint(folder / "run" / "checkpoint.pt")
+    assert state["step"] == 6
+    assert state["data"]["takes"] == 1
+    assert "CC BY-NC" in state["data"]["licenses"][0]
+
+
+def test_metadata(made):
+    folder, said, _ = made
+    path = folder / "new" / "tiny.pt"
+    assert f"wrote {path}" in said[2]
+    about = archive.inspect(path).metadata
+    assert about["format"] == archive.FORMAT
+    assert (about["name"], about["kind"], about["hidden"]) == ("tiny", "birnn", 8)
+    assert about["parameters"] == sum(
+        x.numel() for x in read_checkpoint(folder / "run" / "best.pt")["averaged"].values()
+    )
+    assert about["placements"] == list(PLACEMENTS)
+    assert (about["rate_hz"], about["past"], about["future"]) == (60.0, 20, 5)
+    assert len(about["joints"]) == 10
+    assert (about["targets"], about["measured_bones"]) == ("global-6d", "passed")
+    training = about["training"]
+    assert training["config"]["network"]["hidden"] == 8
+    assert training["summary"] == "Bandai-Namco Research Motiondataset"
+    assert "CC BY-NC" in training["licenses"][0]
+    assert (training["takes"], training["steps"]) == (1, read_checkpoint(folder / "run" / "best.pt")["step"])
+    assert training["hours"] == pytest.approx(119 / 60 / 3600)
+    assert about["torch"] == torch.__version__
+    assert about["revision"] is None or len(about["revision"]) == 40
+    assert set(about["measures"]) == {"cmu-walk-run", "cmu-02", "bandai-styles"}
+    for rows in about["measures"].values():
+        assert len(rows) == 6
+        for measures in rows.values():
+            mean, deviation, frames = measures["sip_error_deg"]
+            assert mean > 0
+            assert deviation > 0
+            assert frames == 119
+    # JSON as other languages read it: no NaN.
+    with zipfile.ZipFile(path) as file:
+        text = file.read("tiny/extra/edgepose.json").decode()
+    json.loads(text, parse_constant=lambda name: pytest.fail(name))
+
+
+def test_card(made):
+    folder, _, _ = made
+    card = (folder / "new" / "tiny.md").read_text(encoding="utf-8")
+    about = archive.inspect(folder / "new" / "tiny.pt").metadata
+    for text in (
+        "# tiny",
+        "bidirectional LSTM",
+        "5 future frames have come (83 ms)",
+        "8 units",
+        "at 60 Hz",
+        ", ".join(PLACEMENTS),
+        "CC BY-NC 4.0",
+        "non-commercial",
+        "### cmu-walk-run",
+        "### bandai-styles",
+        "mean pose",
+        "online, window (20, 5)",
+        "edgepose synthesize",
+        "edgepose train",
+        "edgepose export",
+    ):
+        assert text in card
+    mean, deviation, frames = about["measures"]["cmu-02"]["offline, whole take"]["sip_error_deg"]
+    row = next(line for line in card.split("### cmu-02")[1].splitlines() if "offline" in line)
+    assert row.startswith(f"| offline, whole take | {mean:.2f} ± {deviation:.2f} |")
+    assert row.endswith(f"| {frames} |")
+
+
+def test_models_and_evaluate(made):
+    folder, _, _ = made
+    path = folder / "new" / "tiny.pt"
+    data = ("--data", folder / "recordings")
+    assert "trusted: no" in edgepose("models", path).output
+    assert "is not known" in fails("evaluate", "--model", path, *data)
+    edgepose("models", "--trust", path)
+    said = edgepose("evaluate", "--model", path, *data, "--part", "cmu-02", "--baselines").stdout
+    part, head, *rows, note = said.strip().splitlines()
+    assert part == "cmu-02"
+    assert head.startswith("method")
+    assert "119 frames" in note
+    assert [row.split("  ")[0] for row in rows] == [
+        "online, window (20, 5)",
+        "online, stream (5 future)",
+        "offline, whole take",
+        "mean pose",
+        "measured bones, others interpolated",
+        "measured bones, others interpolated + mean offsets",
+    ]
+    # The archive's own figures come back.
+    mean, deviation, _ = archive.inspect(path).metadata["measures"]["cmu-02"]["offline, whole take"][
+        "sip_error_deg"
+    ]
+    assert f"{mean:.2f} ± {deviation:.2f}" in rows[2]
+    said = edgepose(
+        "evaluate", "--model", path, *data, "--part", "all", "--online", "window", "--past", 3
+    ).stdout
+    assert "online, window (3, 5)" in said
+    assert "595 frames" in said
+    assert "stream" not in said
+
+
+def test_training_goes_on_and_fine_tunes(made, tmp_path):
+    folder, _, train = made
+    run = tmp_path / "run"
+    shutil.copytree(folder / "run", run)
+    assert "go on with --resume" in fails(*train, "--out", run)
+    said = edgepose(*train, "--out", run, "--resume", "--steps", 9).output
+    assert "going on at step 6" in said
+    assert read_checkpoint(run / "checkpoint.pt")["step"] == 9
+    tuned = tmp_path / "tuned"
+    edgepose(*train, "--out", tuned, "--init", folder / "run" / "best.pt")
+    assert ", then " in read_checkpoint(tuned / "checkpoint.pt")["data"]["summary"]
+    both = CliRunner().invoke(cli, [*map(str, train), "--out", str(run), "--resume", "--init", "x"])
+    assert both.exit_code == 2
+    assert "no such" in fails(*train, "--out", tmp_path / "none", "--resume").lower()
+
+
+def test_own_recordings_are_enough_to_fine_tune(made, tmp_path):
+    """Files that no part of the split claims: some of them tell when to stop."""
+    folder, _, _ = made
+    (tmp_path / "mine").mkdir()
+    for name in ("morning", "evening"):
+        shutil.copy(folder / "recordings" / "01_01.npz", tmp_path / "mine" / f"{name}.npz")
+    edgepose(
+        "train", "--config", folder / "tiny.toml", "--data", tmp_path / "mine", "--out", tmp_path / "tuned",
+        "--init", folder / "run" / "best.pt", "--steps", 2, "--threads", 1,
+    )  # fmt: skip
+    assert read_checkpoint(tmp_path / "tuned" / "checkpoint.pt")["step"] == 2
+
+
+def test_unidirectional(made, tmp_path):
+    folder, _, _ = made
+    config = tmp_path / "rnn.toml"
+    config.write_text(CONFIG.replace('"birnn"', '"rnn"').replace("steps = 6", "steps = 1"))
+    data = folder / "recordings"
+    edgepose("train", "--config", config, "--data", data, "--out", tmp_path / "run", "--threads", 1)
+    path = tmp_path / "rnn.pt"
+    edgepose("export", tmp_path / "run" / "checkpoint.pt", "--out", path)
+    about = archive.inspect(path).metadata
+    assert (about["kind"], about["past"], about["future"], about["measures"]) == ("rnn", 0, 0, {})
+    card = path.with_suffix(".md").read_text(encoding="utf-8")
+    assert "unidirectional" in card
+    assert "never seen" not in card
+    said = edgepose("evaluate", "--model", path, "--trust", "--data", data, "--part", "cmu-02").stdout
+    assert "online, step by step" in said
+    wrong = CliRunner().invoke(
+        cli, ["evaluate", "--model", str(path), "--trust", "--data", str(data), "--future", "2"]
+    )
+    assert wrong.exit_code == 2
+    assert "unidirectional" in wrong.output
+
+
+def test_synthesize_options(tmp_path):
+    out = tmp_path / "out"
+    edgepose(
+        "synthesize", WALK, "--out", out, "--rate", 100, "--hold", 2, "--mounting", 1, "--height", 1.9,
+        "--jobs", 2,
+    )  # fmt: skip
+    recording = read_recording(out / f"{WALK.stem}.npz")
+    times = recording.sensors["head"].time_s
+    np.testing.assert_allclose(np.diff(times), 0.01)
+    assert times[-1] > 2 + 1 + 1.9
+    still = recording.sensors["left_forearm"].acc[:190]
+    np.testing.assert_allclose(still, np.broadcast_to(still[0], still.shape), atol=1e-5)
+    assert np.linalg.norm(still[0]) == pytest.approx(9.81, abs=1e-4)
+
+
+def test_synthesize_faults(tmp_path):
+    folder = tmp_path / "mocap"
+    folder.mkdir()
+    assert "no motion files" in fails("synthesize", folder, "--out", tmp_path / "out")
+    shutil.copy(WALK, folder / "good.bvh")
+    (folder / "bad.bvh").write_text("HIERARCHY\n")
+    result = CliRunner().invoke(cli, ["synthesize", str(folder), "--out", str(tmp_path / "out")])
+    assert "left out:" in result.output
+    assert "bad.bvh" in result.output
+    assert "1 of 2 files could not be converted" in str(result.exception)
+    assert (tmp_path / "out" / "good.npz").exists()
+    shutil.copy(WALK, folder / "good.amc")
+    assert "would both become" in fails("synthesize", folder, "--out", tmp_path / "out")
+
+
+def test_export_faults(made, tmp_path):
+    folder, _, _ = made
+    best = folder / "run" / "best.pt"
+    assert "No such file" in fails("export", tmp_path / "none.pt", "--out", tmp_path / "x.pt")
+    assert CliRunner().invoke(cli, ["export", str(best), "--out", str(tmp_path / "x.md")]).exit_code == 2
+    (tmp_path / "file").write_text("")
+    assert "cannot be written" in fails("export", best, "--out", tmp_path / "file" / "x.pt")
+
+
+def test_errors_are_one_line(made, tmp_path):
+    _, _, train = made
+    (tmp_path / "bad.toml").write_text("steps = 'many'\n")
+    arguments = [*map(str, train), "--out", str(tmp_path / "run"), "--config", str(tmp_path / "bad.toml")]
+    done = subprocess.run(
+        [sys.executable, "-m", "edgepose", *arguments], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert done.stderr == f"edgepose: {tmp_path / 'bad.toml'}: steps is 'many'; it takes a whole number\n"
+    assert not (tmp_path / "run").exists()

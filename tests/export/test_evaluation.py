@@ -1,0 +1,206 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from edgepose import metrics
+from edgepose.engine import StreamEngine, WindowEngine
+from edgepose.errors import EdgeposeError
+from edgepose.placements import BONES
+from edgepose.skeleton import PREDICTED, UNOBSERVED, default_body, forward_kinematics
+from edgepose_export import baselines, evaluation
+from edgepose_export.dataset import HELD_OUT, Take, describe_takes, part_of, read_take
+from edgepose_export.evaluation import Mode, run_archive
+from edgepose_export.mocap import read_motion, resample
+from edgepose_export.networks import NetworkShape
+from edgepose_export.synthesis import recording_arrays, virtual_imus
+
+WALK = Path(__file__).parents[1] / "data" / "mocap" / "dataset-2_walk_normal_001.bvh"
+BIRNN = NetworkShape("birnn", 8, "global-6d", "passed")
+RNN = BIRNN._replace(kind="rnn")
+
+
+def made_up(wearers, frames, seed=1):
+    orientation, acceleration = (x[0].numpy() for x in wearers(1, frames, seed))
+    pose = Rotation.random(frames * 24, random_state=seed).as_matrix().reshape(frames, 24, 3, 3)
+    return Take("made up", orientation, acceleration, pose.astype(np.float32), "free")
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory):
+    path = tmp_path_factory.mktemp("evaluation") / "walk.npz"
+    motion = resample(read_motion(WALK))
+    np.savez(path, **recording_arrays(motion, virtual_imus(motion, default_body()), "free"))
+    return read_take(path)
+
+
+def run(engine, take):
+    outputs = [engine.push(*row) for row in zip(range(10**6), take.orientation, take.acceleration)]  # noqa: B905
+    return np.array([one.rotations for some in [*outputs, engine.finish()] for one in some])
+
+
+@pytest.mark.parametrize(
+    ("past", "future", "frames"),
+    [(4, 2, 40), (0, 0, 5), (20, 5, 12), (3, 9, 8), (9, 3, 8), (2, 1, evaluation.BATCH + 9), (4, 2, 1)],
+)
+def test_window_is_what_a_run_computes(tiny, wearers, past, future, frames):
+    module, take = tiny(BIRNN), made_up(wearers, frames)
+    expected = run(WindowEngine(module, past, future), take)
+    got = run_archive(module, take, Mode("window", past, future))
+    assert got.shape == (frames, 24, 3, 3)
+    np.testing.assert_allclose(got, expected, atol=3e-5)
+
+
+@pytest.mark.parametrize(("shape", "future", "frames"), [(BIRNN, 3, 30), (BIRNN, 9, 4), (RNN, 0, 30)])
+def test_stream_is_what_a_run_computes(tiny, wearers, shape, future, frames):
+    module, take = tiny(shape), made_up(wearers, frames)
+    expected = run(StreamEngine(module, 0, future), take)
+    np.testing.assert_allclose(run_archive(module, take, Mode("stream", 0, future)), expected, atol=3e-5)
+
+
+def test_offline_is_the_whole_take(tiny, walk):
+    module = tiny(BIRNN)
+    with torch.no_grad():
+        expected = module(torch.tensor(walk.orientation)[None], torch.tensor(walk.acceleration)[None])[0][0]
+    np.testing.assert_allclose(run_archive(module, walk, Mode("offline")), expected, atol=1e-6)
+
+
+def test_modes():
+    about = {"kind": "birnn", "past": 20, "future": 5}
+    names = [str(mode) for mode in evaluation.modes_of(about)]
+    assert names == ["online, window (20, 5)", "online, stream (5 future)", "offline, whole take"]
+    names = [str(mode) for mode in evaluation.modes_of({"kind": "rnn", "past": 0, "future": 0})]
+    assert names == ["online, step by step", "offline, whole take"]
+
+
+def test_measures_are_over_all_frames_of_all_takes(wearers):
+    takes = [made_up(wearers, frames, seed) for frames, seed in ((20, 1), (9, 2))]
+    guess = made_up(wearers, 20, 3).pose.astype(float)
+    table = evaluation.evaluate(takes, {"a guess": lambda take: guess[: len(take.pose)]})
+    offsets = default_body().offsets
+    parts = [metrics.per_frame(guess[: len(t.pose)], t.pose.astype(float), offsets, 60.0) for t in takes]
+    assert set(table) == {"a guess"}
+    for key in metrics.LABELS:
+        assert table["a guess"][key] == metrics.measure(np.concatenate([part[key] for part in parts]))
+    assert table["a guess"]["sip_error_deg"].frames == 29
+
+
+# --- baselines ----------------------------------------------------------------------------------------------
+
+
+def errors(poses, take):
+    return metrics.joint_angle_error(poses, take.pose.astype(float), PREDICTED).max()
+
+
+def moving(wearers, frames=50):
+    """A take whose poses a test still has to fill in."""
+    rng = np.random.default_rng(3)
+    vectors = np.cumsum(rng.normal(scale=0.03, size=(frames, 6, 3)), axis=0)
+    orientation = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(frames, 6, 3, 3)
+    return made_up(wearers, frames)._replace(orientation=orientation)
+
+
+def test_mean_pose_is_right_for_who_never_moves(wearers):
+    take = moving(wearers)
+    pose = np.tile(take.pose[:1], (50, 1, 1, 1)).astype(float)
+    pose[:, 0] = take.orientation[:, 5]
+    take = take._replace(pose=pose)
+    got = baselines.poses(take, baselines.learn([take]))["mean pose"]
+    assert errors(got, take) < 1e-3
+    np.testing.assert_allclose(got[:, 0], take.orientation[:, 5])
+
+
+def test_interpolation_is_right_for_who_moves_so(wearers):
+    take = moving(wearers)
+    take = take._replace(pose=baselines.interpolated(take))
+    learnt = baselines.learn([take])
+    got = baselines.poses(take, learnt)
+    assert errors(got["measured bones, others interpolated"], take) < 1e-5
+    assert errors(got["measured bones, others interpolated + mean offsets"], take) < 1e-3
+    np.testing.assert_allclose(learnt.offsets, np.tile(np.eye(3), (24, 1, 1)), atol=1e-6)
+
+
+def test_interpolation_with_offsets_is_right_for_who_is_off_so(wearers):
+    take = moving(wearers)
+    offsets = np.tile(np.eye(3), (24, 1, 1))
+    turns = np.random.default_rng(1).normal(scale=0.3, size=(10, 3))
+    offsets[list(UNOBSERVED)] = Rotation.from_rotvec(turns).as_matrix()
+    take = take._replace(pose=baselines.interpolated(take, offsets))
+    got = baselines.poses(take, baselines.learn([take]))
+    assert errors(got["measured bones, others interpolated + mean offsets"], take) < 1e-3
+    assert errors(got["measured bones, others interpolated"], take) > 5
+
+
+def test_interpolated_bones_lie_between_their_sensors(walk):
+    world, _ = forward_kinematics(baselines.interpolated(walk), np.zeros((24, 3)))
+    np.testing.assert_allclose(world[:, list(BONES)], walk.orientation, atol=1e-5)
+    half = Rotation.from_matrix(world[:, 0]).inv() * Rotation.from_matrix(world[:, 1])
+    whole = Rotation.from_matrix(world[:, 0]).inv() * Rotation.from_matrix(world[:, 4])
+    np.testing.assert_allclose(half.as_rotvec() * 2, whole.as_rotvec(), atol=1e-5)
+    for joint, parent in ((7, 4), (10, 4), (8, 5), (20, 18), (22, 18), (23, 19)):
+        np.testing.assert_allclose(world[:, joint], world[:, parent], atol=1e-6)
+
+
+# --- the split ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "part"),
+    [
+        ("01_01", "train"),
+        ("05_20.part2", "train"),
+        ("06_15", "train"),
+        ("directing_traffic_1.part6", "train"),
+        ("02_03", "cmu-02"),
+        ("02_03.part1", "cmu-02"),
+        ("03_01", "validation"),
+        ("07_12", "cmu-walk-run"),
+        ("08_01", "cmu-walk-run"),
+        ("09_12", "cmu-walk-run"),
+        ("09_12.part2", "cmu-walk-run"),
+        ("107_12", "train"),
+        ("dataset-1_walk_tired_001", "bandai-styles"),
+        ("dataset-2_run_exhausted_010.part1", "bandai-styles"),
+        ("dataset-1_bow_not-confident_001", "validation"),
+        ("dataset-1_bow_active_001", "train"),
+        ("dataset-2_walk_normal_001", "train"),
+        ("my walk", "train"),
+    ],
+)
+def test_part_of_the_split(name, part):
+    assert part_of(name) == part
+    assert part in (*HELD_OUT, "train", "validation")
+
+
+def test_tables_of_a_folder(tmp_path, tiny, walk):
+    motion = resample(read_motion(WALK))
+    arrays = recording_arrays(motion, virtual_imus(motion, default_body()), "free")
+    for name in ("01_01", "07_01", "02_01"):
+        (tmp_path / name[:2]).mkdir()
+        np.savez(tmp_path / name[:2] / f"{name}.npz", **arrays)
+    tables = evaluation.held_out_tables(tiny(RNN), [Mode("offline")], tmp_path, True, ("cmu-02", "all"))
+    assert list(tables) == ["cmu-02", "all"]
+    for table, frames in zip(tables.values(), (119, 357), strict=True):
+        assert len(table) == 4
+        for row in table.values():
+            assert set(row) == set(metrics.LABELS)
+            assert row["sip_error_deg"].frames == frames
+            assert np.isfinite([value.mean for value in row.values()]).all()
+    with pytest.raises(EdgeposeError, match="no recording of the part 'bandai-styles'"):
+        evaluation.held_out_tables(tiny(RNN), [Mode("offline")], tmp_path, False)
+
+
+def test_description_of_takes(walk):
+    licenses = (
+        "CMU Graphics Lab Motion Capture Database (mocap.cs.cmu.edu), free for all use",
+        "Bandai-Namco Research Motiondataset, CC BY-NC 4.0",
+    )
+    about = describe_takes([walk._replace(license=text) for text in (*licenses, licenses[0])])
+    assert about["summary"] == (
+        "Bandai-Namco Research Motiondataset and CMU Graphics Lab Motion Capture Database"
+    )
+    assert about["licenses"] == sorted(licenses)
+    assert about["takes"] == 3
+    assert about["hours"] == pytest.approx(3 * 119 / 60 / 3600)

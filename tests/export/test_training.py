@@ -1,0 +1,461 @@
+import json
+import pickle
+import resource
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from edgepose.errors import EdgeposeError
+from edgepose.skeleton import PARENTS, PREDICTED, default_body
+from edgepose_export import training
+from edgepose_export.archive import Statistics
+from edgepose_export.augmentation import Augmentation
+from edgepose_export.cli.synthesize import LICENSES
+from edgepose_export.dataset import read_take, read_training_takes, tape
+from edgepose_export.mocap import read_motion, resample
+from edgepose_export.networks import NetworkShape, PoseDecoder
+from edgepose_export.synthesis import recording_arrays, virtual_imus
+from edgepose_export.training import TrainConfig, Trainer, config_from, read_checkpoint, save_checkpoint
+
+DATA = Path(__file__).parents[1] / "data" / "mocap"
+CONFIGS = Path(training.__file__).parent / "configs"
+SMALL = TrainConfig(
+    network=NetworkShape("rnn", 8, "global-6d", "passed"),
+    augmentation=Augmentation(0.5, 4.0, 3.0, 0.1, 0.02),
+    beta=0.5,
+    steps=12,
+    sequences=4,
+    window=20,
+    free_share=0.25,
+    input_dropout=0.1,
+    averaging=0.9,
+    validate_every=4,
+)
+ABOUT = {"summary": "walks", "licenses": ["free"], "takes": 3, "hours": 0.001}
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Recordings on disk: two of Bandai-Namco, one of CMU."""
+    folder = tmp_path_factory.mktemp("recordings")
+    sources = {
+        "dataset-2_walk_normal_001": "dataset-2_walk_normal_001.bvh",
+        "dataset-2_raise-up-right-hand_normal_001": "dataset-2_raise-up-right-hand_normal_001.bvh",
+        "01_01": "07_01.bvh",
+    }
+    for name, source in sources.items():
+        motion = resample(read_motion(DATA / source))
+        arrays = recording_arrays(motion, virtual_imus(motion, default_body()), LICENSES[motion.source])
+        np.savez(folder / f"{name}.npz", **arrays)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def takes(files):
+    return [read_take(path) for path in sorted(files.glob("*.npz"))]
+
+
+def trainer(takes, config=SMALL):
+    return Trainer(config, tape(takes), tape(takes[-1:]), dict(ABOUT))
+
+
+def fit(one, folder):
+    losses, validations = [], []
+    training.fit(one, folder, lambda step, loss: losses.append(loss), lambda *line: validations.append(line))
+    return losses, validations
+
+
+def same(a, b):
+    """Two nested states hold the same bits."""
+    if isinstance(a, torch.Tensor):
+        return torch.equal(a, b)
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, list | tuple):
+        return len(a) == len(b) and all(map(same, a, b))
+    return a == b
+
+
+# --- loss and targets ---------------------------------------------------------------------------------------
+
+
+def test_targets_are_what_the_decoder_turns_into_the_pose(shape, takes):
+    together = tape(takes)
+    statistics = training.statistics_of(together, shape)
+    targets = training.pose_targets(together.relative, shape)
+    mean = (targets - statistics.target_mean) / statistics.target_std
+    pose, _ = PoseDecoder(shape, *statistics[2:])(together.orientation, mean, torch.ones_like(mean))
+    truth = torch.cat([torch.from_numpy(take.pose) for take in takes])
+    chosen = [0, *PREDICTED]
+    torch.testing.assert_close(pose[:, chosen], truth[:, chosen], rtol=0, atol=2e-4)
+
+
+def test_tape(takes):
+    together = tape(takes)
+    assert together.names == [take.name for take in takes]
+    for i, take in enumerate(takes):
+        part = slice(int(together.starts[i]), int(together.starts[i + 1]))
+        assert torch.equal(together.orientation[part], torch.from_numpy(take.orientation))
+        assert torch.equal(together.acceleration[part], torch.from_numpy(take.acceleration))
+        # Global rotations as seen from the pelvis: those of the bones with sensors are known.
+        seen = together.orientation[part, -1:].mT @ together.orientation[part]
+        torch.testing.assert_close(together.relative[part][:, [18, 19, 4, 5, 15, 0]], seen, rtol=0, atol=1e-4)
+        for joint in (1, 16):
+            local = together.relative[part, PARENTS[joint]].mT @ together.relative[part, joint]
+            torch.testing.assert_close(local, torch.from_numpy(take.pose)[:, joint], rtol=0, atol=1e-5)
+
+
+def test_statistics(takes):
+    together = tape(takes)
+    local = training.statistics_of(together, NetworkShape("rnn", 8))
+    targets = training.pose_targets(together.relative, NetworkShape("rnn", 8))
+    assert targets.shape[1] == 135
+    torch.testing.assert_close(local.target_mean, targets.mean(0))
+    torch.testing.assert_close(local.target_std, targets.std(0).clamp_min(1e-2))
+    # In the root's frame a degree weighs the same at every joint.
+    common = training.statistics_of(together, SMALL.network).target_std
+    assert common.shape == (60,)
+    assert common.unique().numel() == 1
+    assert all(torch.isfinite(x).all() and (x > 0).all() for x in (local.input_std, common))
+
+
+def test_loss_is_the_likelihood():
+    generator = torch.Generator().manual_seed(0)
+    mean, target = torch.randn(2, 5, 7, generator=generator)
+    deviation = 0.1 + torch.rand(5, 7, generator=generator)
+    expected = -torch.distributions.Normal(mean, deviation).log_prob(target)
+    got = training.likelihood_loss(mean, deviation, target, 0.0)
+    torch.testing.assert_close(got, expected.mean() - 0.5 * np.log(2 * np.pi))
+    # The weight of the beta-likelihood has no gradient of its own.
+    deviation.requires_grad_()
+    training.likelihood_loss(mean, deviation, target, 0.5).backward()
+    plain = 1 / deviation - (target - mean).square() / deviation**3
+    torch.testing.assert_close(deviation.grad, (plain * deviation / 35).detach())
+
+
+def test_accelerations_are_reconstructed_too(takes):
+    """The loss of a network that says 0 +- 1 for everything is half the mean square of all its targets."""
+    one = trainer(takes, replace(SMALL, beta=0.0))
+
+    def zero(x):
+        nothing = torch.zeros(*x.shape[:-1], 60 + 15)
+        return nothing, nothing + 1
+
+    batch = training.windows(one.train_tape, torch.tensor([0]), 20)
+    s = one.statistics
+    targets = (training.pose_targets(batch[2], SMALL.network) - s.target_mean) / s.target_std
+    inputs = training.network_input(*batch[:2])[..., -15:]
+    accelerations = (inputs - s.input_mean[-15:]) / s.input_std[-15:]
+    expected = 0.5 * torch.cat([targets, accelerations], -1).square().mean()
+    torch.testing.assert_close(one._loss(zero, batch, 0.0), expected)
+
+
+# --- batches ------------------------------------------------------------------------------------------------
+
+
+def test_windows_stay_inside_takes(takes):
+    together = tape(takes)
+    ends = together.starts.tolist()
+    for joined in (False, True):
+        others, cmu = training.window_starts(together, 20, joined)
+        assert set(cmu.tolist()) <= set(range(ends[0], ends[1]))  # 01_01 comes first
+        for start in torch.cat([others, cmu]).tolist():
+            inside = any(a <= start and start + 20 <= b for a, b in pairwise(ends))
+            assert inside or (joined and start + 20 <= ends[-1])
+    one = sum(len(x) for x in training.window_starts(together, 20, False))
+    assert one == sum(len(take.pose) - 19 for take in takes)
+    assert sum(len(x) for x in training.window_starts(together, 20, True)) == ends[-1] - 19
+
+
+@pytest.mark.parametrize("share", [0.25, 0.5])
+def test_share_of_cmu(takes, share):
+    starts = training.window_starts(tape(takes), 20, False)
+    drawn = training.draw(starts, 40, share, torch.Generator().manual_seed(0))
+    assert len(drawn) == 40
+    assert sum(int(s) in starts[1].tolist() for s in drawn) == 40 * share
+
+
+def test_takes_that_are_too_short(takes):
+    with pytest.raises(EdgeposeError, match="no training take is as long as the window of 500"):
+        trainer(takes, replace(SMALL, window=500))
+    with pytest.raises(EdgeposeError, match="no validation take is as long as the window of 50"):
+        Trainer(replace(SMALL, window=50), tape(takes), tape(takes[:1]), ABOUT)
+
+
+def test_own_recordings_without_a_validation_part(files, tmp_path):
+    train, validation = read_training_takes(files)
+    assert [take.name for take in validation] == ["01_01"]
+    assert len(train) == 2
+    (tmp_path / "a.npz").write_bytes((files / "01_01.npz").read_bytes())
+    with pytest.raises(EdgeposeError, match="one recording is not enough"):
+        read_training_takes(tmp_path)
+    (tmp_path / "03_01.npz").write_bytes((files / "01_01.npz").read_bytes())
+    train, validation = read_training_takes(tmp_path)
+    assert [[take.name for take in part] for part in (train, validation)] == [["a"], ["03_01"]]
+
+
+def changed(files, path, **arrays):
+    with np.load(files / "01_01.npz") as data:
+        np.savez(path, **({name: data[name] for name in data.files} | arrays))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"mocap_framerate": np.array(100.0)}, "--rate 60"),
+        ({"head_quat": np.tile([0.5, 0.5, 0.5, 0.5], (30, 1))}, "not aligned with the bones"),
+        ({"poses": np.zeros((29, 72))}, "differ in length"),
+        ({"poses": np.zeros((30, 156))}, "not a recording with true poses"),
+        ({"license": np.array(None)}, "not a recording with true poses"),
+    ],
+)
+def test_recordings_that_cannot_be_trained_on(files, tmp_path, arrays, message):
+    with pytest.raises(EdgeposeError, match=message):
+        read_take(changed(files, tmp_path / "x.npz", **arrays))
+
+
+@pytest.mark.parametrize("content", [b"", b"text", b"PK\x05\x06" + bytes(18)])
+def test_files_that_are_no_recordings(tmp_path, content):
+    (tmp_path / "x.npz").write_bytes(content)
+    with pytest.raises(EdgeposeError, match="make it with edgepose synthesize"):
+        read_take(tmp_path / "x.npz")
+
+
+# --- runs ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["birnn", "rnn"])
+def test_loss_falls(takes, tmp_path, kind):
+    shape = SMALL.network._replace(kind=kind)
+    config = replace(SMALL, network=shape, beta=0.0, steps=60, learning_rate=0.03, validate_every=30)
+    one = trainer(takes, config)
+    before = one.validate()
+    losses, validations = fit(one, tmp_path)
+    assert np.mean(losses[-10:]) < np.mean(losses[:10]) - 0.1
+    assert one.validate() < before - 0.1
+    assert [step for step, *_ in validations] == [30, 60]
+    log = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [(line["step"], line["train"], line["validation"]) for line in log] == validations
+
+
+@pytest.mark.parametrize("schedule", ["exponential", "cosine"])
+@pytest.mark.parametrize("bf16", [False, True])
+def test_resumed_run_is_the_uninterrupted_one(takes, tmp_path, bf16, schedule):
+    config = replace(SMALL, bf16=bf16, schedule=schedule)
+    whole = trainer(takes, config)
+    fit(whole, tmp_path)
+    first = trainer(takes, config)
+    for _ in range(8):
+        first.train_step()
+    save_checkpoint(first.state(), tmp_path / "half.pt")
+    torch.rand(3)  # other use of the random numbers in between
+    second = trainer(takes, config)
+    second.load(read_checkpoint(tmp_path / "half.pt"))
+    assert second.step == 8
+    fit(second, tmp_path)
+    a, b = whole.state(), second.state()
+    for key in ("network", "averaged", "optimiser", "generator", "step", "statistics", "data"):
+        assert same(a[key], b[key]), key
+    assert not same(a["network"], first.state()["network"])
+
+
+def test_checkpoints(takes, tmp_path):
+    one = trainer(takes)
+    fit(one, tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["best.pt", "checkpoint.pt", "log.jsonl"]
+    state = one.state()
+    assert same(read_checkpoint(tmp_path / "checkpoint.pt"), state)
+    best = read_checkpoint(tmp_path / "best.pt")
+    assert set(best) == {"config", "statistics", "averaged", "step", "data"}
+    assert config_from(json.loads(best["config"])) == SMALL
+    with pytest.raises(EdgeposeError, match=r"weights only.*--init"):
+        trainer(takes).load(best)
+
+
+def test_average_of_the_weights(takes):
+    one = trainer(takes, replace(SMALL, averaging=0.9))
+    mean = one.network.dense.weight.detach().clone()
+    for step in range(1, 4):
+        one.train_step()
+        decay = min(0.9, step / (step + 10))
+        mean = decay * mean + (1 - decay) * one.network.dense.weight.detach()
+    torch.testing.assert_close(one.averaged.dense.weight.detach(), mean)
+    plain = trainer(takes, replace(SMALL, averaging=0.0))
+    plain.train_step()
+    assert same(dict(plain.averaged.state_dict()), dict(plain.network.state_dict()))
+
+
+def test_full_disk_leaves_the_old_checkpoint(takes, tmp_path):
+    one = trainer(takes)
+    path = tmp_path / "checkpoint.pt"
+    save_checkpoint(one.state(), path)
+    old = path.read_bytes()
+    one.train_step()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(old) // 2, limits[1]))
+    try:
+        with pytest.raises(EdgeposeError, match=r"checkpoint\.pt: cannot be written: File too large"):
+            save_checkpoint(one.state(), path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert path.read_bytes() == old
+    assert [p.name for p in tmp_path.iterdir()] == ["checkpoint.pt"]
+
+
+def test_no_progress_ends_the_run(takes, tmp_path):
+    config = replace(SMALL, learning_rate=1e-12, averaging=0.0, patience=2, validate_every=1, steps=50)
+    one = trainer(takes, config)
+    one.best = -1e9
+    _, validations = fit(one, tmp_path)
+    assert len(validations) == 2
+    assert not (tmp_path / "best.pt").exists()
+
+
+@pytest.mark.parametrize("where", ["training", "validation"])
+def test_nan_ends_the_run_and_is_not_saved(takes, tmp_path, where):
+    one = trainer(takes)
+    broken = one.train_tape if where == "training" else one.validation_tape
+    broken.acceleration[:] = float("nan")
+    with pytest.raises(EdgeposeError, match=r"loss is nan at step.*lower learning rate"):
+        fit(one, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_fine_tuning_starts_from_the_average(takes, tmp_path):
+    first = trainer(takes)
+    fit(first, tmp_path)
+    state = read_checkpoint(tmp_path / "best.pt")
+    own = {"summary": "my walks", "licenses": ["mine"], "takes": 1, "hours": 0.5}
+    tuned = Trainer(replace(SMALL, seed=4), tape(takes), tape(takes[-1:]), own)
+    tuned.start_from(state)
+    assert tuned.step == 0
+    assert same(dict(tuned.network.state_dict()), state["averaged"])
+    assert same(dict(tuned.averaged.state_dict()), state["averaged"])
+    assert same(tuned.statistics._asdict(), state["statistics"])
+    assert tuned.data["summary"] == "walks, then my walks"
+    assert tuned.data["licenses"] == ["free", "mine"]
+    assert (tuned.data["takes"], tuned.data["hours"]) == (4, 0.501)
+    assert np.isfinite(tuned.train_step())
+    other = trainer(takes, replace(SMALL, network=SMALL.network._replace(kind="birnn")))
+    for start in (other.start_from, other.load):
+        with pytest.raises(EdgeposeError, match="the checkpoint holds"):
+            start(first.state())
+
+
+# --- checkpoints of strangers -------------------------------------------------------------------------------
+
+
+class Writer:
+    """Pickles to a call that writes a file."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.write_text, (self.path, "run")
+
+
+@pytest.mark.parametrize("form", ["torch", "pickle"])
+def test_code_in_a_checkpoint_is_not_run(takes, tmp_path, form):
+    target, path = tmp_path / "written", tmp_path / "evil.pt"
+    state = trainer(takes).state() | {"step": Writer(target)}
+    if form == "torch":
+        torch.save(state, path)
+    else:
+        path.write_bytes(pickle.dumps(state))
+    with pytest.raises(EdgeposeError, match="not a checkpoint of edgepose train"):
+        read_checkpoint(path)
+    assert not target.exists()
+    torch.load(path, weights_only=False) if form == "torch" else pickle.loads(path.read_bytes())
+    assert target.exists()
+
+
+def test_files_that_are_no_checkpoints(takes, tmp_path):
+    path = tmp_path / "x.pt"
+    with pytest.raises(EdgeposeError, match=r"x\.pt: No such file"):
+        read_checkpoint(path)
+    path.write_bytes(b"nothing")
+    with pytest.raises(EdgeposeError, match="not a checkpoint of edgepose train"):
+        read_checkpoint(path)
+    good = trainer(takes).state()
+    for change, message in (
+        ({"config": None}, "not a checkpoint that"),
+        ({"config": '{"steps": "many"}'}, "steps is 'many'"),
+        ({"config": "{"}, "not a checkpoint that"),
+        ({"averaged": {}}, "not a checkpoint that"),
+        ({"averaged": good["averaged"] | {"mean.weight": torch.ones(2)}}, "not a checkpoint that"),
+        ({"statistics": {}}, "not a checkpoint that"),
+    ):
+        torch.save(good | change, path)
+        with pytest.raises(EdgeposeError, match=message) as caught:
+            read_checkpoint(path)
+        assert "\n" not in str(caught.value)
+    torch.save({k: v for k, v in good.items() if k != "data"}, path)
+    with pytest.raises(EdgeposeError, match="entries are missing"):
+        read_checkpoint(path)
+    assert Statistics(**good["statistics"]).input_mean.shape == (60,)
+
+
+# --- configs ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.toml")), ids=lambda p: p.stem)
+def test_shipped_configs(path):
+    config = training.read_config(path)
+    assert config_from(training.config_values(config)) == config
+    assert config_from(json.loads(json.dumps(training.config_values(config)))) == config
+
+
+def test_paper_configs_are_the_papers():
+    for kind in ("birnn", "rnn"):
+        config = training.read_config(CONFIGS / f"dip-{kind}.toml")
+        assert config.network == NetworkShape(kind, 512, "local-matrix", "predicted")
+        assert (config.beta, config.input_dropout, config.learning_rate) == (0.0, 0.2, 1e-3)
+        assert (config.schedule, config.averaging, config.augmentation.mirror) == ("exponential", 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("steps = 'many'", "steps is 'many'; it takes a whole number"),
+        ("steps = 1.5", "steps is 1.5; it takes a whole number"),
+        ("steps = true", "steps is True; it takes a whole number"),
+        ("steps = 0", "steps is 0; it takes 1 to"),
+        ("joined = 1", "joined is 1; it takes true or false"),
+        ("learning_rate = -1", "learning_rate is -1; it takes"),
+        ("learning_rate = nan", "learning_rate is nan; it takes"),
+        ("input_dropout = 1.0", "input_dropout is 1.0; it takes 0 to 0.99"),
+        ("schedule = 'linear'", "schedule is 'linear'; it takes 'exponential' or 'cosine'"),
+        ("schedule = []", "schedule is []; it takes a text"),
+        ("speed = 1", "unknown field 'speed'"),
+        ("network = 3", r"network is 3; it takes a table [network]"),
+        ("[network]\nkind = 'gru'", "kind is 'gru'; it takes 'birnn' or 'rnn'"),
+        ("[network]\nhidden = 0", "hidden is 0; it takes 1 to"),
+        ("[network]\nlayers = 3", r"unknown field 'layers' in [network]"),
+        ("[network]\nmeasured = 'passed'", 'measured = "passed" needs targets = "global-6d"'),
+        ("[augmentation]\nmirror = 2", "mirror is 2; it takes 0 to 1"),
+        ("[augmentation]\nheading_deg = inf", "heading_deg is inf; it takes"),
+        ("[augmentation\n", "line 1"),
+    ],
+)
+def test_bad_configs_name_the_field(tmp_path, text, message):
+    path = tmp_path / "own.toml"
+    path.write_text(text)
+    with pytest.raises(EdgeposeError) as caught:
+        training.read_config(path)
+    assert str(path) in str(caught.value)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_config_that_cannot_be_read(tmp_path):
+    with pytest.raises(EdgeposeError, match="nosuch: No such file"):
+        training.read_config(Path("nosuch"))
+    (tmp_path / "x.toml").write_bytes(b"\xff\xfe")
+    with pytest.raises(EdgeposeError, match=r"x\.toml"):
+        training.read_config(tmp_path / "x.toml")
