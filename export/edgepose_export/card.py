@@ -62,8 +62,8 @@ def card(metadata: dict[str, Any]) -> str:
         "```",
         "",
         "MOCAP is a folder with the motion named above. For the shipped models: the BVH files of CMU "
-        "subjects 01, 02, 03, 05 - 09 and some further takes (cgspeed's conversion), and both Bandai-Namco Research "
-        "motion datasets. The whole config is in the archive's metadata.",
+        "subjects 01, 02, 03, 05 - 09 and some further takes (cgspeed's conversion), and both Bandai-Namco "
+        "Research motion datasets. The whole config is in the archive's metadata.",
         "",
     ]
     return "\n".join(lines)
