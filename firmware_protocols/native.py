@@ -9,12 +9,10 @@ from __future__ import annotations
 import struct
 from binascii import crc_hqx
 from collections.abc import Iterable
-from dataclasses import dataclass
-from math import floor, isfinite, sqrt
+from math import floor, isfinite
 from typing import NamedTuple
 
-Vector3 = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
+from firmware_protocols.sample import Counters, Quaternion, Sample, Vector3, unit_quaternion
 
 DATA_TYPE = 0x11
 """First body byte of a measurement: version 1 in the high half, type 1 in the low half."""
@@ -34,9 +32,12 @@ MAX_BODY = 66
 MAX_FRAME = MAX_BODY + 2 + 1
 """Longest frame without its closing 00, bytes: body, CRC, one byte that COBS adds."""
 
+QUAT_SCALE, ACC_SCALE, GYR_SCALE, MAG_SCALE, TEMPERATURE_SCALE = 32767, 100, 900, 10, 100
+"""Steps of an int16 in 1, m/s^2, rad/s, uT, degC."""
+
 
 class Packet(NamedTuple):
-    """One measurement of one sensor, SI units, in the sensor frame. Absent quantities are None.
+    """One measurement as it is sent: a Sample with what only the line needs. Absent quantities are None.
 
     Attributes:
         sensor_id: 0..255.
@@ -77,35 +78,6 @@ class Info(NamedTuple):
     segment: int | None = None
     frame: str = "unknown"
     rate_hz: float = 0.0
-
-
-@dataclass
-class Counters:
-    """What a decoder has seen since it was made.
-
-    Attributes:
-        bytes: bytes fed.
-        packets: measurements returned.
-        infos: INFO packets kept.
-        bad_frames: frames that are too short, too long or not COBS.
-        bad_crc: frames whose checksum is wrong.
-        rejected: intact frames with a content that is not allowed.
-        resyncs: times a good packet followed one or more bad frames.
-        lost: packets missing from the sequences.
-        late: packets dropped as duplicates or older than the last one of their sensor.
-        restarts: times a sensor's sequence and clock began anew, or paused too long to count what is missing.
-    """
-
-    bytes: int = 0
-    packets: int = 0
-    infos: int = 0
-    bad_frames: int = 0
-    bad_crc: int = 0
-    rejected: int = 0
-    resyncs: int = 0
-    lost: int = 0
-    late: int = 0
-    restarts: int = 0
 
 
 # --- framing --------------------------------------------------------------------------------------
@@ -163,7 +135,6 @@ _TEMPERATURE = 0x010
 _QUAT_F, _ACC_F, _GYR_F, _MAG_F = 0x020, 0x040, 0x080, 0x100
 _BATTERY = 0x200
 
-_QUAT_SCALE, _ACC_SCALE, _GYR_SCALE, _MAG_SCALE, _TEMPERATURE_SCALE = 32767, 100, 900, 10, 100
 _NO_SEGMENT = 255
 
 _BLOCKS = ("4h", "3h", "3h", "3h", "h", "4f", "3f", "3f", "3f", "BB")  # in the order of the mask bits
@@ -176,8 +147,12 @@ _LAYOUTS = {
 }
 
 
-def _fixed(values: Iterable[float], scale: int) -> list[int]:
-    """Values times scale as int16: to the nearest, halves away from zero, held at the ends of the range."""
+def fixed(values: Iterable[float], scale: int) -> list[int]:
+    """Values times scale as int16: to the nearest, halves away from zero, held at the ends of the range.
+
+    Raises:
+        ValueError: a value is NaN or infinite.
+    """
     result = []
     for value in values:
         if not isfinite(value):
@@ -211,10 +186,10 @@ def encode_body(packet: Packet, *, floats: bool = False) -> bytes:
     values: list[float] = []
     tail: list[float] = []
     for bit, scale, vector in (
-        (_QUAT, _QUAT_SCALE, packet.quat),
-        (_ACC, _ACC_SCALE, packet.acc),
-        (_GYR, _GYR_SCALE, packet.gyr),
-        (_MAG, _MAG_SCALE, packet.mag),
+        (_QUAT, QUAT_SCALE, packet.quat),
+        (_ACC, ACC_SCALE, packet.acc),
+        (_GYR, GYR_SCALE, packet.gyr),
+        (_MAG, MAG_SCALE, packet.mag),
     ):
         if vector is None:
             continue
@@ -223,10 +198,10 @@ def encode_body(packet: Packet, *, floats: bool = False) -> bytes:
             tail += _finite(vector)
         else:
             mask |= bit
-            values += _fixed(vector, scale)
+            values += fixed(vector, scale)
     if packet.temperature is not None:
         mask |= _TEMPERATURE
-        values += _fixed([packet.temperature], _TEMPERATURE_SCALE)
+        values += fixed([packet.temperature], TEMPERATURE_SCALE)
     if packet.battery is not None:
         percent, status = packet.battery
         mask |= _BATTERY
@@ -284,6 +259,21 @@ def encode_info(info: Info) -> bytes:
     return frame_body(encode_info_body(info))
 
 
+def body_size(data: bytes) -> int:
+    """Length of the body at the start of data, from its own fields.
+
+    Raises:
+        ValueError: unknown version, type or mask bits, or too few bytes to tell.
+    """
+    if len(data) >= _INFO.size:
+        if data[0] == INFO_TYPE:
+            return _INFO.size + data[_INFO.size - 1]
+        layout = _LAYOUTS.get(data[2] | data[3] << 8)
+        if data[0] == DATA_TYPE and layout is not None:
+            return layout.size
+    raise ValueError("unknown version, type or field mask")
+
+
 def decode_body(body: bytes) -> Packet | Info:
     """Packet or Info of a body without CRC and framing. Quaternions come out with norm 1.
 
@@ -314,26 +304,26 @@ def _decode_packet(body: bytes) -> Packet:
     battery: tuple[int, int] | None = None
     i = 5  # after the header
     if mask & _QUAT:
-        quat = _unit(v[i], v[i + 1], v[i + 2], v[i + 3], _QUAT_SCALE)
+        quat = _unit(v[i] / QUAT_SCALE, v[i + 1] / QUAT_SCALE, v[i + 2] / QUAT_SCALE, v[i + 3] / QUAT_SCALE)
         i += 4
     if mask & _ACC:
-        acc = (v[i] / _ACC_SCALE, v[i + 1] / _ACC_SCALE, v[i + 2] / _ACC_SCALE)
+        acc = (v[i] / ACC_SCALE, v[i + 1] / ACC_SCALE, v[i + 2] / ACC_SCALE)
         i += 3
     if mask & _GYR:
-        gyr = (v[i] / _GYR_SCALE, v[i + 1] / _GYR_SCALE, v[i + 2] / _GYR_SCALE)
+        gyr = (v[i] / GYR_SCALE, v[i + 1] / GYR_SCALE, v[i + 2] / GYR_SCALE)
         i += 3
     if mask & _MAG:
-        mag = (v[i] / _MAG_SCALE, v[i + 1] / _MAG_SCALE, v[i + 2] / _MAG_SCALE)
+        mag = (v[i] / MAG_SCALE, v[i + 1] / MAG_SCALE, v[i + 2] / MAG_SCALE)
         i += 3
     if mask & _TEMPERATURE:
-        temperature = v[i] / _TEMPERATURE_SCALE
+        temperature = v[i] / TEMPERATURE_SCALE
         i += 1
     if mask & (_QUAT_F | _ACC_F | _GYR_F | _MAG_F):
         # Sums of a few binary32 values cannot overflow here, so one is finite only if all its terms are.
         if not isfinite(sum(v[i:])):
             raise ValueError("NaN or infinity")
         if mask & _QUAT_F:
-            quat = _unit(v[i], v[i + 1], v[i + 2], v[i + 3], 1)
+            quat = _unit(v[i], v[i + 1], v[i + 2], v[i + 3])
             i += 4
         if mask & _ACC_F:
             acc = v[i : i + 3]
@@ -351,12 +341,11 @@ def _decode_packet(body: bytes) -> Packet:
     return Packet(v[1], v[3], v[4], quat, acc, gyr, mag, temperature, battery)
 
 
-def _unit(w: float, x: float, y: float, z: float, one: int) -> Quaternion:
-    norm = sqrt(w * w + x * x + y * y + z * z)
-    # A sensor that is still starting sends zeros or nonsense: normalising those would invent an orientation.
-    if not 0.9 * one <= norm <= 1.1 * one:
+def _unit(w: float, x: float, y: float, z: float) -> Quaternion:
+    quat = unit_quaternion(w, x, y, z)
+    if quat is None:
         raise ValueError("quaternion is not of unit length")
-    return (w / norm, x / norm, y / norm, z / norm)
+    return quat
 
 
 def _decode_info(body: bytes) -> Info:
@@ -391,62 +380,52 @@ _MIN_PERIOD_US = 500
 _SLACK = 64
 _LATE_US = 1_000_000
 
+_NOTHING = (None,) * 5
 
-class Decoder:
-    """Packets out of a byte stream that may be cut anywhere, start anywhere and contain noise.
+
+class Receiver:
+    """What the serial and the CAN decoder do alike: count, keep INFO and battery, drop late messages.
 
     Attributes:
         infos: the last INFO packet of each sensor id.
+        batteries: the last charge in percent and status bits of each sensor id that sends them.
         counters: what has been seen so far.
     """
 
     def __init__(self) -> None:
         """Start with nothing seen."""
         self.infos: dict[int, Info] = {}
+        self.batteries: dict[int, tuple[int, int]] = {}
         self.counters = Counters()
-        self._rest = b""  # the frame under way; at most MAX_FRAME + 1 bytes, the last of a longer one
         self._in_sync = True
         self._last: dict[int, tuple[int, int]] = {}  # seq, t_us by sensor id
 
-    def feed(self, data: bytes) -> list[Packet]:
-        """Measurements completed by the next bytes of the stream, in the order they came."""
-        self.counters.bytes += len(data)
-        *frames, rest = (self._rest + data).split(b"\0")
-        self._rest = rest[-MAX_FRAME - 1 :]
-        packets = []
-        for frame in frames:
-            # Nothing between two 00 is legal: senders may open with a 00 to end any noise.
-            message = self._message(frame) if frame else None
-            if message is None:
-                continue
-            if not self._in_sync:
-                self._in_sync = True
-                self.counters.resyncs += 1
-            if isinstance(message, Info):
-                self.infos[message.sensor_id] = message
-                self.counters.infos += 1
-            elif self._is_new(message):
-                packets.append(message)
-                self.counters.packets += 1
-        return packets
-
-    def _message(self, frame: bytes) -> Packet | Info | None:
-        try:
-            body = cobs_decode(frame) if len(frame) <= MAX_FRAME else b""
-        except ValueError:
-            body = b""
-        if len(body) < 3:
-            self.counters.bad_frames += 1
-        elif crc_hqx(body[:-2], 0xFFFF) != body[-2] | body[-1] << 8:
-            self.counters.bad_crc += 1
-        else:
-            try:
-                return decode_body(body[:-2])
-            except ValueError:
-                self.counters.rejected += 1
-                return None
+    def _bad(self) -> None:
+        self.counters.bad += 1
         self._in_sync = False
-        return _at_end(frame[-MAX_FRAME:])
+
+    def _good(self) -> None:
+        if not self._in_sync:
+            self._in_sync = True
+            self.counters.resyncs += 1
+
+    def _take(self, message: Packet | Info) -> Sample | None:
+        """The sample in an intact message, if it holds a new one."""
+        self._good()
+        if isinstance(message, Info):
+            self.infos[message.sensor_id] = message
+            self.counters.skipped += 1
+            return None
+        if not self._is_new(message):
+            return None
+        if message.battery is not None:
+            self.batteries[message.sensor_id] = message.battery
+        quantities = message[3:8]
+        if quantities == _NOTHING:
+            self.counters.skipped += 1
+            return None
+        self.counters.packets += 1
+        return Sample(message.sensor_id, message.t_us, *quantities)
 
     def _is_new(self, packet: Packet) -> bool:
         seq, t_us = packet.seq, packet.t_us
@@ -465,15 +444,55 @@ class Decoder:
         return True
 
 
-def _at_end(frame: bytes) -> Packet | Info | None:
-    """The packet at the end of a bad frame, where noise or a packet without its 00 ran into it, or None."""
-    # The first body byte is known, which leaves few places to try.
-    for start in range(len(frame) - 2):
-        if frame[start + 1] in (DATA_TYPE, INFO_TYPE):
+class Decoder(Receiver):
+    """Samples out of a byte stream that may be cut anywhere, start anywhere and contain noise.
+
+    INFO packets and packets with nothing for a Sample count as skipped; see `Receiver` for where they go.
+    """
+
+    WRAP_US = 1 << 32
+
+    def __init__(self) -> None:
+        """Start with nothing seen."""
+        super().__init__()
+        self._rest = b""  # the frame under way; at most MAX_FRAME + 1 bytes, the last of a longer one
+
+    def feed(self, data: bytes) -> list[Sample]:
+        """Samples completed by the next bytes of the stream, in the order they came."""
+        self.counters.bytes += len(data)
+        *frames, rest = (self._rest + data).split(b"\0")
+        self._rest = rest[-MAX_FRAME - 1 :]
+        samples = []
+        for frame in frames:
+            # Nothing between two 00 is legal: senders may open with a 00 to end any noise.
+            message = self._message(frame) if frame else None
+            sample = None if message is None else self._take(message)
+            if sample is not None:
+                samples.append(sample)
+        return samples
+
+    def _message(self, frame: bytes) -> Packet | Info | None:
+        if len(frame) <= MAX_FRAME:
             try:
-                body = cobs_decode(frame[start:])
-                if crc_hqx(body[:-2], 0xFFFF) == int.from_bytes(body[-2:], "little"):
-                    return decode_body(body[:-2])
+                return _open_frame(frame)
             except ValueError:
-                continue
-    return None
+                pass
+        self._bad()
+        # Noise, or a packet without its 00, may have run into a good packet at the end. Its first body byte
+        # is known, which leaves few places to try.
+        frame = frame[-MAX_FRAME:]
+        for start in range(len(frame) - 2):
+            if frame[start + 1] in (DATA_TYPE, INFO_TYPE):
+                try:
+                    return _open_frame(frame[start:])
+                except ValueError:
+                    continue
+        return None
+
+
+def _open_frame(frame: bytes) -> Packet | Info:
+    """Packet or Info of a frame without its closing 00; ValueError if there is anything wrong with it."""
+    body = cobs_decode(frame)
+    if crc_hqx(body[:-2], 0xFFFF) != int.from_bytes(body[-2:], "little"):
+        raise ValueError("wrong checksum")
+    return decode_body(body[:-2])

@@ -28,7 +28,7 @@ class NativeStream:
         """What has come in so far."""
         c = self._decoder.counters
         unknown = sum(self._unknown.values())
-        return Counters(c.packets - unknown, c.lost, c.bad_frames + c.bad_crc + c.rejected, unknown)
+        return Counters(c.packets - unknown, c.lost, c.bad, unknown)
 
     @property
     def byte_count(self) -> int:
@@ -51,11 +51,12 @@ class NativeStream:
             EdgeposeError: a device says that its inertial frame points down.
         """
         result = []
-        for packet in self._decoder.feed(data):
-            sensor = packet.sensor_id
+        for sample in self._decoder.feed(data):
+            sensor = sample.sensor
             if sensor < len(PLACEMENTS):
-                time_s = clock(sensor, packet.t_us)
-                result.append(ImuSample(sensor, time_s, packet.quat, packet.acc, packet.gyr, packet.mag))
+                assert sample.time_us is not None  # native packets always have one
+                time_s = clock(sensor, sample.time_us)
+                result.append(ImuSample(sensor, time_s, sample.quat, sample.acc, sample.gyr, sample.mag))
                 continue
             if sensor not in self._unknown:
                 _log.warning("%s: packets of sensor id %d are left out; ids are 0 to 5", self._name, sensor)

@@ -1,4 +1,5 @@
-/* Native packets of edgepose for firmware: C99 or C++, header only, no heap, nothing but the standard integer types.
+/* Native packets of edgepose for firmware, over a serial line, CAN 2.0 and CAN FD: C99 or C++, header only, no heap, nothing but
+ * the standard integer types.
  *
  * Layouts are in firmware_protocols/README.md. Numbers are taken apart as integers, so the bytes are the same on every board,
  * whatever its byte order, its floating-point unit and the compiler's optimisation flags; `float` must be IEEE 754 binary32.
@@ -210,6 +211,91 @@ static inline size_t edgepose_encode(const edgepose_packet *p, uint8_t *wire) {
 static inline size_t edgepose_encode_info(const edgepose_info *info, uint8_t *wire) {
     uint8_t body[EDGEPOSE_MAX_BODY];
     return edgepose_frame_body(body, edgepose_encode_info_body(info, body), wire);
+}
+
+/* --- CAN --------------------------------------------------------------------------------------------------------------- */
+
+#define EDGEPOSE_CAN_BASE 0x400u  /* usual base: identifiers 0x400..0x47F, 11 bits; above 0x780 all identifiers have 29 bits */
+#define EDGEPOSE_CAN_SYNC 0x080u  /* 11 bits */
+#define EDGEPOSE_CAN_MAX_FRAMES 4u
+#define EDGEPOSE_CANFD_MAX 64u
+
+typedef struct {
+    uint32_t id;
+    uint8_t length;
+    uint8_t data[8];
+} edgepose_can_frame;
+
+/* Identifier of a message of a sensor 0..31: 0 ACC or a CAN FD packet, 1 QUAT, 2 GYR, 3 MAG. */
+static inline uint32_t edgepose_can_id(uint32_t base, uint8_t message, uint8_t sensor_id) {
+    return base + (((uint32_t)message << 5) | sensor_id);
+}
+
+/* The 100 us time of CAN 2.0 frames from a microsecond clock, without a jump where that wraps. Start with zeros; call it with
+ * each t_us, of the same clock for all sensors, at least once in 71 minutes. */
+typedef struct {
+    uint32_t last_us;
+    uint32_t rest_us;
+    uint16_t ticks;
+} edgepose_can_clock;
+
+static inline uint16_t edgepose_can_ticks(edgepose_can_clock *clock, uint32_t t_us) {
+    const uint32_t passed = t_us - clock->last_us + clock->rest_us;
+    clock->last_us = t_us;
+    clock->rest_us = passed % 100u;
+    clock->ticks = (uint16_t)((clock->ticks + passed / 100u) & 0xFFFFu);
+    return clock->ticks;
+}
+
+/* The CAN 2.0 frames of a measurement: ACC, then GYR and MAG if it has them, then QUAT, which is empty if it has no quaternion.
+ * Send them in this order (no mailboxes that go by identifier), all of one sample before the next of the same sensor. Vectors
+ * go as int16 whichever form the mask has; sequence number, temperature and battery are left out. `frames` holds
+ * EDGEPOSE_CAN_MAX_FRAMES. Returns their number, or 0 if the sensor id is above 31, there is no acceleration, or a number is NaN
+ * or infinite. */
+static inline size_t edgepose_can_encode(const edgepose_packet *p, uint32_t base, uint16_t ticks, edgepose_can_frame *frames) {
+    static const uint8_t messages[3] = {0, 2, 3};
+    static const uint16_t scales[3] = {100, 900, 10};
+    const float *vectors[3];
+    const unsigned fields = (unsigned)p->fields | ((unsigned)p->fields >> 5);
+    size_t n = 0, i;
+    vectors[0] = p->acc;
+    vectors[1] = p->gyr;
+    vectors[2] = p->mag;
+    if (p->sensor_id > 31 || !(fields & EDGEPOSE_ACC)) return 0;
+    for (i = 0; i < 3; i++) {
+        uint8_t *end = frames[n].data;
+        if (!(fields & (EDGEPOSE_ACC << i))) continue;
+        end = edgepose_put_floats(end, vectors[i], 3, scales[i]);
+        if (!end) return 0;
+        edgepose_put16(end, ticks);
+        frames[n].id = edgepose_can_id(base, messages[i], p->sensor_id);
+        frames[n++].length = 8;
+    }
+    frames[n].id = edgepose_can_id(base, 1, p->sensor_id);
+    frames[n].length = 0;
+    if (fields & EDGEPOSE_QUAT) {
+        if (!edgepose_put_floats(frames[n].data, p->quat, 4, 32767)) return 0;
+        frames[n].length = 8;
+    }
+    return n + 1;
+}
+
+/* SYNC: the sender's time for other nodes to set their clocks to. */
+static inline void edgepose_can_sync(uint32_t t_us, edgepose_can_frame *frame) {
+    frame->id = EDGEPOSE_CAN_SYNC;
+    frame->length = 4;
+    edgepose_put32(frame->data, t_us);
+}
+
+/* Makes the data of a CAN FD frame (message 0) of a body of edgepose_encode_body or edgepose_encode_info_body: fills it with
+ * zeros up to a length that CAN FD has. `body` holds EDGEPOSE_MAX_BODY bytes. Returns the length, or 0 if n is 0 or above 64. */
+static inline size_t edgepose_canfd_pad(uint8_t *body, size_t n) {
+    static const uint8_t lengths[8] = {8, 12, 16, 20, 24, 32, 48, 64};
+    size_t i;
+    if (n == 0 || n > EDGEPOSE_CANFD_MAX) return 0;
+    for (i = 0; lengths[i] < n; i++) {}
+    memset(body + n, 0, lengths[i] - n);
+    return lengths[i];
 }
 
 #endif

@@ -2,6 +2,10 @@
  *   P sensor seq t fields q q q q a a a g g g m m m temperature percent status     a measurement, floats as hex of their bits
  *   I sensor segment frame rate hex-of-firmware-or--                                      an INFO packet
  *   C hex                                                                                  CRC, then COBS, of any bytes
+ *   2 base ticks, then as P                                                                CAN 2.0 frames, "id:data" each
+ *   F as P, J as I                                                                         data of a CAN FD frame
+ *   S t                                                                                    SYNC frame
+ *   T t                                                                                    ticks of one running clock
  */
 #include <stdio.h>
 #include <stdlib.h>
@@ -41,7 +45,7 @@ static void show(const uint8_t *data, size_t n) {
     printf("\n");
 }
 
-static void measurement(void) {
+static edgepose_packet measurement(void) {
     edgepose_packet p;
     p.sensor_id = (uint8_t)whole();
     p.seq = (uint16_t)whole();
@@ -54,32 +58,60 @@ static void measurement(void) {
     reals(&p.temperature, 1);
     p.battery_percent = (uint8_t)whole();
     p.battery_status = (uint8_t)whole();
-    /* The sizes the header promises, so that the sanitizers see any byte too many. */
-    {
-        uint8_t own[EDGEPOSE_MAX_WIRE];
-        show(own, edgepose_encode(&p, own));
-    }
+    return p;
 }
 
-static void info(void) {
+static edgepose_info info(void) {
     edgepose_info i;
-    uint8_t own[EDGEPOSE_MAX_WIRE];
     i.sensor_id = (uint8_t)whole();
     i.segment = (uint8_t)whole();
     i.frame = (uint8_t)whole();
     i.rate_dhz = (uint16_t)whole();
     bytes[hex()] = 0;
     i.firmware = (const char *)bytes;
-    show(own, edgepose_encode_info(&i, own));
+    return i;
+}
+
+static void show_frame(const edgepose_can_frame *frame) {
+    size_t i;
+    printf("%x:", (unsigned)frame->id);
+    for (i = 0; i < frame->length; i++) printf("%02x", frame->data[i]);
+    printf(" ");
 }
 
 int main(void) {
+    edgepose_can_clock clock = {0, 0, 0};
     char request;
     while (scanf(" %c", &request) == 1) {
+        /* The sizes the header promises, so that the sanitizers see any byte too many. */
+        uint8_t own[EDGEPOSE_MAX_WIRE], body[EDGEPOSE_MAX_BODY];
+        edgepose_can_frame frames[EDGEPOSE_CAN_MAX_FRAMES];
         if (request == 'P') {
-            measurement();
+            const edgepose_packet p = measurement();
+            show(own, edgepose_encode(&p, own));
+        } else if (request == 'F') {
+            const edgepose_packet p = measurement();
+            show(body, edgepose_canfd_pad(body, edgepose_encode_body(&p, body)));
         } else if (request == 'I') {
-            info();
+            const edgepose_info i = info();
+            show(own, edgepose_encode_info(&i, own));
+        } else if (request == 'J') {
+            const edgepose_info i = info();
+            show(body, edgepose_canfd_pad(body, edgepose_encode_info_body(&i, body)));
+        } else if (request == '2') {
+            const uint32_t base = (uint32_t)whole();
+            const uint16_t ticks = (uint16_t)whole();
+            const edgepose_packet p = measurement();
+            const size_t n = edgepose_can_encode(&p, base, ticks, frames);
+            size_t i;
+            for (i = 0; i < n; i++) show_frame(&frames[i]);
+            printf("\n");
+        } else if (request == 'S') {
+            edgepose_can_sync((uint32_t)whole(), frames);
+            show_frame(frames);
+            printf("\n");
+        } else if (request == 'T') {
+            printf("%u\n", edgepose_can_ticks(&clock, (uint32_t)whole()));
         } else {
             const size_t n = hex();
             printf("%04x", edgepose_crc16(bytes, n));

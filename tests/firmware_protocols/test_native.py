@@ -4,7 +4,6 @@ import math
 import random
 import struct
 from binascii import crc_hqx
-from dataclasses import asdict
 
 import pytest
 from cobs import cobs
@@ -13,7 +12,6 @@ from hypothesis import strategies as st
 
 from firmware_protocols import native
 from firmware_protocols.native import (
-    Counters,
     Decoder,
     Info,
     Packet,
@@ -22,6 +20,7 @@ from firmware_protocols.native import (
     encode_body,
     encode_info,
 )
+from firmware_protocols.sample import Counters, Sample
 
 VECTOR = Packet(3, 0x0102, 1_000_000, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 9.81), (0.0, 0.0, 0.0))
 LONGEST = Packet(8, 1, 1, (1.0, 0.0, 0.0, 0.0), *[(1.1, 1.2, 1.3)] * 3, 25.0, (100, 255))
@@ -92,6 +91,11 @@ def decode(data):
     return decoder.feed(data), decoder.counters
 
 
+def sample(packet):
+    """What a decoder makes of a packet that loses nothing on the wire."""
+    return Sample(packet.sensor_id, packet.t_us, *packet[3:8])
+
+
 def framed(body):
     return native.frame_body(bytes(body))
 
@@ -104,7 +108,7 @@ def test_reference_vector():
     assert encode_body(VECTOR) == BODY
     assert crc_hqx(BODY, 0xFFFF) == 0xD69B
     assert encode(VECTOR) == WIRE
-    assert decode(WIRE)[0] == [VECTOR]
+    assert decode(WIRE)[0] == [sample(VECTOR)]
 
 
 def test_layout_of_every_block():
@@ -126,7 +130,7 @@ def test_layout_of_every_block():
 @given(PACKETS, st.booleans())
 @settings(max_examples=150, deadline=None)
 def test_round_trip(packet, floats):
-    (back,), _ = decode(encode(packet, floats=floats))
+    back = decode_body(encode_body(packet, floats=floats))
     assert back[:3] == packet[:3]
     assert close(back.quat, packet.quat, 1e-6 if floats else 6e-5)
     assert back.quat is None or math.hypot(*back.quat) == pytest.approx(1, abs=1e-12)
@@ -138,6 +142,11 @@ def test_round_trip(packet, floats):
         0.005 + 1e-9,
     )
     assert back.battery == packet.battery
+    decoder = Decoder()
+    expected = [] if packet[3:8] == (None,) * 5 else [sample(back)]
+    assert decoder.feed(encode(packet, floats=floats)) == expected
+    assert (decoder.counters.packets, decoder.counters.skipped) == ((1, 0) if expected else (0, 1))
+    assert decoder.batteries.get(packet.sensor_id) == packet.battery
 
 
 @given(INFOS)
@@ -146,7 +155,7 @@ def test_info_round_trip(info):
     decoder = Decoder()
     assert decoder.feed(encode_info(info)) == []
     assert decoder.infos == {info.sensor_id: info}
-    assert decoder.counters.infos == 1
+    assert (decoder.counters.packets, decoder.counters.skipped) == (0, 1)
 
 
 def test_info_layout():
@@ -267,8 +276,8 @@ def test_rejected_content(body):
     with pytest.raises(ValueError, match=r"\w"):
         decode_body(body)
     packets, counters = decode(framed(body) + WIRE)
-    assert packets == [VECTOR]
-    assert asdict(counters) == asdict(Counters(bytes=len(framed(body) + WIRE), packets=1, rejected=1))
+    assert packets == [sample(VECTOR)]
+    assert counters == Counters(bytes=len(framed(body) + WIRE), packets=1, bad=1, resyncs=1)
 
 
 def test_quaternion_is_normalised():
@@ -276,8 +285,11 @@ def test_quaternion_is_normalised():
     assert packet.quat == (0.0, 0.0, -1.0, 0.0)
 
 
-def test_packet_without_fields():
-    assert decode(framed(head(0)))[0] == [Packet(1, 5, 6)]
+def test_packet_with_nothing_for_a_sample():
+    decoder = Decoder()
+    assert decoder.feed(framed(head(0)) + encode(Packet(1, 7, 8, battery=(60, 1)))) == []
+    assert decoder.batteries == {1: (60, 1)}
+    assert (decoder.counters.skipped, decoder.counters.lost) == (2, 1)
 
 
 # --- the stream -----------------------------------------------------------------------------------
@@ -321,10 +333,10 @@ def test_noise_costs_no_packet():
         sent = stream(20)
         data = b"".join(rng.randbytes(length) + encode(p) for p in sent) + rng.randbytes(length)
         packets, counters = decode(data)
-        assert packets == sent
+        assert packets == list(map(sample, sent))
         assert counters.lost == 0
         assert counters.resyncs == 20
-        assert counters.bad_frames + counters.bad_crc >= 20
+        assert counters.bad >= 20
 
 
 def test_every_single_bit_flip_costs_one_packet_at_most():
@@ -335,7 +347,7 @@ def test_every_single_bit_flip_costs_one_packet_at_most():
         broken[bit // 8] ^= 1 << bit % 8
         packets, counters = decode(encode(first) + bytes(broken) + encode(third))
         # A flip in the closing 00 joins the frame to the next one, which is still found.
-        assert packets == [first, third], bit
+        assert packets == [sample(first), sample(third)], bit
         assert counters.lost == 1
         assert counters.resyncs == 1
 
@@ -345,12 +357,11 @@ def test_every_truncation_costs_one_packet():
     good = encode(second)
     for keep in range(1, len(good)):
         packets, counters = decode(encode(first) + good[:keep] + encode(third))
-        expected = [first, third]
-        assert packets == expected, keep
-        assert counters.bad_frames + counters.bad_crc == 1
+        assert packets == [sample(first), sample(third)], keep
+        assert counters.bad == 1
     for start in range(1, len(good) - 1):
         packets, _ = decode(encode(first) + good[start:] + encode(third))
-        assert packets == [first, third]
+        assert packets == [sample(first), sample(third)]
 
 
 @pytest.mark.parametrize("noise", [1, 2, 68, 69, 70, 71, 500])
@@ -360,16 +371,16 @@ def test_longest_packet_after_noise(noise, size):
     decoder, packets = Decoder(), []
     for start in range(0, len(data), size):
         packets += decoder.feed(data[start : start + size])
-    assert [p.sensor_id for p in packets] == [LONGEST.sensor_id]
-    assert decoder.counters == Counters(bytes=len(data), packets=1, bad_frames=1, resyncs=1)
+    assert [p.sensor for p in packets] == [LONGEST.sensor_id]
+    assert decoder.counters == Counters(bytes=len(data), packets=1, bad=1, resyncs=1)
 
 
 def test_start_in_the_middle_and_unfinished_end():
     sent = stream(3)
     data = b"".join(map(encode, sent))
     packets, counters = decode(data[10:-1])
-    assert packets == sent[1:2]
-    assert (counters.lost, counters.bad_frames + counters.bad_crc) == (0, 1)
+    assert packets == [sample(sent[1])]
+    assert (counters.lost, counters.bad) == (0, 1)
 
 
 def test_oversize_frame_is_dropped_without_growing():
@@ -377,8 +388,8 @@ def test_oversize_frame_is_dropped_without_growing():
     for _ in range(1000):
         assert decoder.feed(b"\x55" * 1000) == []
         assert len(decoder._rest) <= native.MAX_FRAME + 1
-    assert decoder.feed(b"\0" + WIRE) == [VECTOR]
-    assert decoder.counters == Counters(bytes=1_000_001 + len(WIRE), packets=1, bad_frames=1, resyncs=1)
+    assert decoder.feed(b"\0" + WIRE) == [sample(VECTOR)]
+    assert decoder.counters == Counters(bytes=1_000_001 + len(WIRE), packets=1, bad=1, resyncs=1)
 
 
 def test_longest_frame_is_accepted():
@@ -403,8 +414,8 @@ def test_random_bodies_with_good_checksums_never_raise(body, kind):
 
 
 def test_accepts_every_bytes_like():
-    assert Decoder().feed(bytearray(WIRE)) == [VECTOR]
-    assert Decoder().feed(memoryview(WIRE)) == [VECTOR]
+    assert Decoder().feed(bytearray(WIRE)) == [sample(VECTOR)]
+    assert Decoder().feed(memoryview(WIRE)) == [sample(VECTOR)]
 
 
 # --- sequences ------------------------------------------------------------------------------------
@@ -415,8 +426,10 @@ def run(*seq_and_time, sensor=0):
     decoder = Decoder()
     out = []
     for seq, t in seq_and_time:
-        out += decoder.feed(encode(Packet(sensor, seq & 0xFFFF, round(t * 1e6) & 0xFFFFFFFF)))
-    return decoder.counters, [p.seq for p in out]
+        seq &= 0xFFFF
+        packet = Packet(sensor, seq, round(t * 1e6) & 0xFFFFFFFF, acc=(float(seq), 0.0, 0.0))
+        out += decoder.feed(encode(packet, floats=True))
+    return decoder.counters, [s.acc[0] for s in out]
 
 
 def test_loss_by_sensor():

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from firmware_protocols import native
+from firmware_protocols import native, native_can
 from firmware_protocols.native import Decoder, Info, Packet
 
 HERE = Path(__file__).parent
@@ -112,6 +112,14 @@ def request(packet, floats, extra_mask=0):
     )
 
 
+def info_request(info):
+    segment = 255 if info.segment is None else info.segment
+    return (
+        f"I {info.sensor_id} {segment} {native.FRAMES.index(info.frame)} "
+        f"{round(info.rate_hz * 10)} {info.firmware.encode().hex() or '-'}"
+    )
+
+
 @pytest.fixture(scope="session")
 def cases():
     rng = random.Random(20)
@@ -183,11 +191,7 @@ def test_info_equals_python(program):
         text = "".join(chr(rng.randrange(0x20, 0x7F)) for _ in range(rng.randrange(33)))
         frame, segment = rng.choice(native.FRAMES), rng.choice([None, *range(24)])
         infos.append(Info(rng.randrange(256), text, segment, frame, rng.randrange(65536) / 10))
-    requests = [
-        f"I {i.sensor_id} {255 if i.segment is None else i.segment} {native.FRAMES.index(i.frame)} "
-        f"{round(i.rate_hz * 10)} {i.firmware.encode().hex() or '-'}"
-        for i in infos
-    ]
+    requests = [info_request(i) for i in infos]
     answers = ask(program, requests)
     assert answers == [native.encode_info(i).hex() for i in infos]
     decoder = Decoder()
@@ -229,3 +233,65 @@ def test_compiles_as_cplusplus(tmp_path, cases):
     if shutil.which(command[0]) is None:
         pytest.skip("no C++ compiler")
     check_packets(compile_program(tmp_path / "plus", command, "-x", "c++", "-std=c++11"), cases[:300])
+
+
+# --- CAN ------------------------------------------------------------------------------------------
+
+
+def test_can_frames_equal_python(program, cases):
+    # The form that the mask names does not matter here.
+    cases = [(p._replace(sensor_id=p.sensor_id % 32), floats) for p, floats in cases]
+    bases = [0x400, 0x000, 0x81, 0x780, 0x781, 0x1FFFFF80]
+    requests = [
+        f"2 {bases[i % 6]} {p.t_us // 100 & 0xFFFF} {request(p, floats)[2:]}"
+        for i, (p, floats) in enumerate(cases)
+    ]
+    refused = 0
+    for i, ((packet, _), answer) in enumerate(zip(cases, ask(program, requests), strict=True)):
+        if packet.acc is None:
+            refused += 1
+            assert answer == ""
+        else:
+            frames = native_can.encode(packet, bases[i % 6])
+            assert answer == "".join(f"{can_id:x}:{data.hex()} " for can_id, data in frames), packet
+    assert 0 < refused < len(cases) / 2
+
+
+def test_can_refuses(program):
+    packet = Packet(31, 2, 3, (1.0, 0.0, 0.0, 0.0), *[(0.0, 0.0, 9.81)] * 3)
+    bad = [packet._replace(sensor_id=32), packet._replace(acc=None)]
+    nan = (0.0, math.nan, 0.0)
+    bad += [packet._replace(**{name: nan}) for name in ("acc", "gyr", "mag")]
+    bad += [packet._replace(quat=(math.inf, 0.0, 0.0, 0.0))]
+    assert set(ask(program, [f"2 1024 0 {request(p, False)[2:]}" for p in bad])) == {""}
+    assert ask(program, [f"2 1024 0 {request(packet, False)[2:]}"]) != [""]
+
+
+def test_can_fd_equals_python(program, cases):
+    cases = [(p._replace(sensor_id=p.sensor_id % 32), floats) for p, floats in cases]
+    answers = ask(program, ["F" + request(p, floats)[1:] for p, floats in cases])
+    too_long = 0
+    for (packet, floats), answer in zip(cases, answers, strict=True):
+        if len(native.encode_body(packet, floats=floats)) > 64:
+            too_long += 1
+            assert answer == ""
+        else:
+            assert answer == native_can.encode_fd(packet, floats=floats)[1].hex()
+    assert too_long
+    infos = [Info(3, "x" * n, 18, "ENU", 60.0) for n in range(33)]
+    answers = ask(program, ["J" + info_request(i)[1:] for i in infos])
+    assert answers == [native_can.encode_fd(i)[1].hex() for i in infos]
+
+
+def test_can_sync_equals_python(program):
+    can_id, data = native_can.encode_sync(0x12345678)
+    assert ask(program, [f"S {0x12345678}"]) == [f"{can_id:x}:{data.hex()} "]
+
+
+def test_can_clock_does_not_jump(program):
+    rng = random.Random(6)
+    times = [0]
+    while times[-1] < 3 * 2**32:
+        times.append(times[-1] + rng.choice([1, 99, 10_000, 4_000_000_000]))
+    answers = ask(program, [f"T {t % 2**32}" for t in times])
+    assert answers == [str(t // 100 % 65536) for t in times]

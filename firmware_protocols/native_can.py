@@ -1,0 +1,270 @@
+"""The native packet of self-built sensors on a CAN bus: two to four frames of CAN 2.0, or one of CAN FD.
+
+Layouts are in README.md next to this file; `c/edgepose_packet.h` is the sender for firmware. Everything is
+little-endian. Identifiers are `base + (message << 5 | sensor)`, 11 bits long if all of them fit, else 29.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+from firmware_protocols.native import (
+    ACC_SCALE,
+    GYR_SCALE,
+    MAG_SCALE,
+    QUAT_SCALE,
+    Info,
+    Packet,
+    Receiver,
+    body_size,
+    decode_body,
+    encode_body,
+    encode_info_body,
+    fixed,
+)
+from firmware_protocols.sample import Sample, Vector3, unit_quaternion
+
+BASE = 0x400
+"""Usual identifier of message 0 of sensor 0."""
+
+SENSORS = 32
+"""Sensors on one base."""
+
+SYNC_ID = 0x080
+"""Identifier (11 bits) of the frame by which one node gives its time to the others."""
+
+TICK_US = 100
+"""Step of the time in CAN 2.0 frames, microseconds."""
+
+ACC, QUAT, GYR, MAG = range(4)
+"""Messages. ACC opens a sample and QUAT closes it. On CAN FD message 0 is a whole packet."""
+
+FD_LENGTHS = (8, 12, 16, 20, 24, 32, 48, 64)
+"""Lengths that a body is padded to on CAN FD."""
+
+_VECTOR = struct.Struct("<3hH")
+_QUATERNION = struct.Struct("<4h")
+_SPAN = 4 * SENSORS
+
+
+def can_id(message: int, sensor: int, base: int = BASE) -> int:
+    """Identifier of a message of a sensor.
+
+    Raises:
+        ValueError: no such sensor or base.
+    """
+    _check_base(base)
+    if not 0 <= sensor < SENSORS:
+        raise ValueError(f"sensor ids on CAN are 0 to {SENSORS - 1}, not {sensor}")
+    return base + (message << 5 | sensor)
+
+
+def is_extended(base: int) -> bool:
+    """Whether the identifiers of a base have 29 bits: those that do not all fit in 11."""
+    return base + _SPAN > 1 << 11
+
+
+def _check_base(base: int) -> None:
+    if not 0 <= base <= (1 << 29) - _SPAN or base <= SYNC_ID < base + _SPAN:
+        raise ValueError(f"base {base:#x}: identifiers would not fit in 29 bits or would meet SYNC")
+
+
+# --- sending --------------------------------------------------------------------------------------
+
+
+def encode(packet: Packet, base: int = BASE) -> list[tuple[int, bytes]]:
+    """Identifiers and data of the CAN 2.0 frames of a measurement, in the order to send them.
+
+    Sequence number, temperature and battery are left out. The time may have more than 32 bits, and should
+    where it can: its wrap at 2^32 us would be a jump here.
+
+    Raises:
+        ValueError: no acceleration, a quantity is NaN or infinite, or there is no such sensor or base.
+    """
+    if packet.acc is None:
+        raise ValueError("CAN 2.0 frames need an acceleration")
+    ticks = packet.t_us // TICK_US & 0xFFFF
+    frames = [
+        (can_id(message, packet.sensor_id, base), _VECTOR.pack(*fixed(vector, scale), ticks))
+        for message, vector, scale in (
+            (ACC, packet.acc, ACC_SCALE),
+            (GYR, packet.gyr, GYR_SCALE),
+            (MAG, packet.mag, MAG_SCALE),
+        )
+        if vector is not None
+    ]
+    closing = b"" if packet.quat is None else _QUATERNION.pack(*fixed(packet.quat, QUAT_SCALE))
+    return [*frames, (can_id(QUAT, packet.sensor_id, base), closing)]
+
+
+def encode_fd(message: Packet | Info, base: int = BASE, *, floats: bool = False) -> tuple[int, bytes]:
+    """Identifier and data of the CAN FD frame of a measurement or an INFO packet.
+
+    Args:
+        message: what to send; time and sequence number as on a serial line.
+        base: identifier of message 0 of sensor 0.
+        floats: send vectors and quaternion as binary32 instead of int16.
+
+    Raises:
+        ValueError: as `native.encode_body`; no such sensor or base; or the body is longer than 64 bytes.
+    """
+    body = encode_info_body(message) if isinstance(message, Info) else encode_body(message, floats=floats)
+    for length in FD_LENGTHS:
+        if len(body) <= length:
+            return can_id(0, message.sensor_id, base), body.ljust(length, b"\0")
+    raise ValueError(f"cannot send {len(body)} bytes in one CAN FD frame; leave out a quantity")
+
+
+def encode_sync(t_us: int) -> tuple[int, bytes]:
+    """Identifier and data of a SYNC frame; the time wraps at 2^32 us."""
+    return SYNC_ID, (t_us & 0xFFFFFFFF).to_bytes(4, "little")
+
+
+# --- receiving ------------------------------------------------------------------------------------
+
+
+@dataclass
+class _Open:
+    """A CAN 2.0 sample that waits for its QUAT.
+
+    Attributes:
+        ticks: its time.
+        acc: its acceleration.
+        gyr: its angular rate, if that has come.
+        mag: its magnetic field, if that has come.
+        arrival_s: when its ACC came, if that is known.
+    """
+
+    ticks: int
+    acc: Vector3
+    gyr: Vector3 | None = None
+    mag: Vector3 | None = None
+    arrival_s: float | None = None
+
+
+class NativeCanDecoder(Receiver):
+    """Samples out of the frames of a bus, CAN 2.0 and CAN FD in any mixture.
+
+    In CAN 2.0 a QUAT belongs to the ACC before it only if it is the first QUAT after it. A sample of which
+    one of the two got lost is dropped and counted as lost; a GYR or MAG whose time is not that of the open
+    ACC shows such a loss too. Where only a GYR or MAG is lost, its quantity is None. CAN 2.0 has no sequence
+    numbers: samples of which nothing came are not counted. Frames of others on the bus count as skipped, like
+    INFO packets.
+
+    `Sample.time_us` wraps at WRAP_US, the range of the 16 bit time of CAN 2.0; the longer time of CAN FD is
+    brought to the same range without a step where it wraps itself.
+    """
+
+    WRAP_US = 65536 * TICK_US
+
+    def __init__(self, base: int = BASE) -> None:
+        """Start with nothing seen.
+
+        Raises:
+            ValueError: identifiers of this base would not fit in 29 bits or would meet SYNC.
+        """
+        super().__init__()
+        _check_base(base)
+        self._base = base
+        self._extended = is_extended(base)
+        self._open: dict[int, _Open] = {}
+        self._acc: dict[int, tuple[int, int]] = {}  # ticks of the last ACC and period, by sensor
+        self._fd_us: dict[int, int] = {}  # unwrapped time of CAN FD, by sensor
+
+    def feed(
+        self, can_id: int, data: bytes, extended: bool = False, time_s: float | None = None
+    ) -> list[Sample]:
+        """The sample that a frame completes, if any.
+
+        Args:
+            can_id: identifier.
+            data: up to 8 bytes of a CAN 2.0 frame or 64 of a CAN FD frame.
+            extended: the identifier has 29 bits.
+            time_s: when the frame was on the bus, seconds on any steady clock, only if controller or kernel
+                measured it. With it a QUAT that comes more than half a period after its ACC is refused: else
+                the loss of a QUAT and the very next ACC of its sensor cannot be seen.
+        """
+        self.counters.bytes += len(data)
+        offset = can_id - self._base
+        if extended != self._extended or not 0 <= offset < _SPAN:
+            self.counters.skipped += 1
+            return []
+        message, sensor = offset >> 5, offset & SENSORS - 1
+        if len(data) > 8:
+            sample = self._fd(message, sensor, bytes(data))
+        elif message == QUAT:
+            sample = self._close(sensor, data, time_s)
+        else:
+            self._vector(message, sensor, data, time_s)
+            return []
+        return [] if sample is None else [sample]
+
+    def _vector(self, message: int, sensor: int, data: bytes, time_s: float | None) -> None:
+        if len(data) != _VECTOR.size:
+            self._bad()
+            return
+        x, y, z, ticks = _VECTOR.unpack(data)
+        open_ = self._open.get(sensor)
+        if message == ACC:
+            if open_ is not None and open_.ticks != ticks:
+                self.counters.lost += 1  # its QUAT
+            acc = (x / ACC_SCALE, y / ACC_SCALE, z / ACC_SCALE)
+            self._open[sensor] = _Open(ticks, acc, arrival_s=time_s)
+            last, period = self._acc.get(sensor, (ticks, 0))
+            step = ticks - last & 0xFFFF
+            if step:
+                # The shortest of late, for steps over lost samples are too long.
+                period = min(step, period + period // 8 + 1) if period else step
+            self._acc[sensor] = ticks, period
+        elif open_ is None:
+            self._bad()
+        elif open_.ticks != ticks:
+            # QUAT of the open sample and ACC of this one are lost; the QUAT to come shows the second loss.
+            del self._open[sensor]
+            self.counters.lost += 1
+        elif message == GYR:
+            open_.gyr = (x / GYR_SCALE, y / GYR_SCALE, z / GYR_SCALE)
+        else:
+            open_.mag = (x / MAG_SCALE, y / MAG_SCALE, z / MAG_SCALE)
+
+    def _close(self, sensor: int, data: bytes, time_s: float | None) -> Sample | None:
+        open_ = self._open.pop(sensor, None)
+        if open_ is None:
+            # Its ACC is lost, unless the sensor has only just come into sight.
+            self.counters.lost += sensor in self._acc
+            return None
+        quat = None
+        if data:
+            if len(data) == _QUATERNION.size:
+                w, x, y, z = _QUATERNION.unpack(data)
+                quat = unit_quaternion(w / QUAT_SCALE, x / QUAT_SCALE, y / QUAT_SCALE, z / QUAT_SCALE)
+            if quat is None:
+                self._bad()
+                return None
+        if time_s is not None and open_.arrival_s is not None:
+            half_us = self._acc[sensor][1] * TICK_US / 2
+            if (time_s - open_.arrival_s) * 1e6 > half_us > 0:
+                self.counters.lost += 2  # a QUAT and an ACC
+                return None
+        self._good()
+        self.counters.packets += 1
+        return Sample(sensor, open_.ticks * TICK_US, quat, open_.acc, open_.gyr, open_.mag)
+
+    def _fd(self, message: int, sensor: int, data: bytes) -> Sample | None:
+        try:
+            size = body_size(data)
+            body = decode_body(data[:size])
+        except ValueError:
+            self._bad()
+            return None
+        if message or body.sensor_id != sensor or any(data[size:]):
+            self._bad()
+            return None
+        sample = self._take(body)
+        if sample is None or sample.time_us is None:
+            return None
+        last = self._fd_us.get(sensor, sample.time_us)
+        now = last + ((sample.time_us - last + 0x80000000) & 0xFFFFFFFF) - 0x80000000
+        self._fd_us[sensor] = now
+        return sample._replace(time_us=now % self.WRAP_US)
