@@ -1,0 +1,194 @@
+"""From samples to poses with a shipped network, a real source and a real sink."""
+
+from __future__ import annotations
+
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from edgepose import archive
+from edgepose.calibration import load_calibration
+from edgepose.engine import StreamEngine
+from edgepose.errors import EdgeposeError
+from edgepose.imu import ImuFrame
+from edgepose.pipeline import LATENCIES, RunSummary, run, status
+from edgepose.placements import PLACEMENTS
+from edgepose.poses import read_poses_csv
+from edgepose.sinks import Sink
+from edgepose.sinks.csv_file import CsvSink
+from edgepose.sources import open_source
+from edgepose.sync import FrameClock
+
+
+class Shelf(Sink):
+    """Keeps poses, up to its room; then it says that it is full."""
+
+    def __init__(self, room: int = 1 << 30) -> None:
+        self.poses, self.asked, self.room = [], 0, room
+
+    def write(self, pose):
+        self.asked += 1
+        if len(self.poses) == self.room:
+            raise EdgeposeError("the shelf is full")
+        self.poses.append(pose)
+
+    def close(self):
+        """Nothing is open."""
+
+
+@pytest.fixture(scope="module")
+def module():
+    return archive.load(archive.inspect(archive.find("birnn")))
+
+
+@pytest.fixture
+def walk(wearer, module):
+    """Runs the batches of the short recording, changed by a function of them, to sinks."""
+
+    def go(change=lambda batches: batches, sinks=(), past=4, future=3, **options):
+        engine = StreamEngine(module, past, future)
+        with open_source(file=wearer.short) as source:
+            return run(
+                change(source),
+                FrameClock(),
+                load_calibration(wearer.calibration),
+                engine,
+                list(sinks),
+                **options,
+            )
+
+    return go
+
+
+def indices(shelf):
+    return [pose.index for pose in shelf.poses]
+
+
+def imu_frame(*held):
+    return ImuFrame(
+        0, 0.0, np.zeros((6, 4)), np.zeros((6, 3)), np.array([name in held for name in PLACEMENTS]), 0.0
+    )
+
+
+@pytest.mark.parametrize(
+    ("held", "filling", "text"),
+    [
+        ((), False, "ok"),
+        ((), True, "filling window"),
+        (("head",), False, "held head"),
+        (("pelvis", "left_forearm"), True, "held left_forearm pelvis; filling window"),
+    ],
+)
+def test_status(held, filling, text):
+    assert status(imu_frame(*held), filling) == text
+
+
+def test_every_frame_comes_out_once_and_in_order(walk):
+    shelf = Shelf()
+    seen = []
+    summary = walk(sinks=[shelf], on_pose=lambda s: seen.append(s.poses))
+    assert summary.error is None
+    assert indices(shelf) == list(range(180))
+    assert seen == list(range(1, 181))
+    assert [pose.status for pose in shelf.poses] == ["filling window"] * 4 + ["ok"] * 176
+    assert (summary.poses, summary.filling, summary.held) == (180, 4, 0)
+    assert len(summary.latencies_s) == 180
+    assert min(summary.latencies_s) > 0
+    assert summary.seconds > 0
+
+
+def test_all_sinks_get_the_same(walk, tmp_path):
+    shelf, file = Shelf(), tmp_path / "poses.csv"
+    with CsvSink(file, "matrix") as sink:
+        walk(sinks=[shelf, sink])
+    frames, time_s, texts, rotations = read_poses_csv(file)
+    assert frames.tolist() == indices(shelf)
+    assert texts == [pose.status for pose in shelf.poses]
+    np.testing.assert_allclose(time_s, [pose.time_s for pose in shelf.poses], atol=1e-6)
+    np.testing.assert_allclose(rotations, [pose.rotations for pose in shelf.poses], atol=2e-6)
+
+
+def test_a_stop_brings_out_every_frame_that_was_seen(walk):
+    all_of_it, shelf = Shelf(), Shelf()
+    walk(sinks=[all_of_it])
+    asked = []
+    summary = walk(sinks=[shelf], stopped=lambda: bool(asked.append(1)) or len(asked) == 100)
+    assert summary.error is None
+    assert len(asked) == 100
+    # Batches hold a hundredth of a second, and the last frames are seen with less future.
+    assert indices(shelf) == list(range(60))
+    for pose, whole in zip(shelf.poses[:57], all_of_it.poses, strict=False):
+        np.testing.assert_array_equal(pose.rotations, whole.rotations)
+
+
+def test_what_came_before_an_error_of_the_source_comes_out(walk):
+    def unplugged(batches):
+        yield from islice(batches, 100)
+        raise EdgeposeError("the port disappeared")
+
+    shelf = Shelf()
+    summary = walk(unplugged, [shelf])
+    assert str(summary.error) == "the port disappeared"
+    assert indices(shelf) == list(range(60))
+
+
+def test_what_came_before_a_sample_without_orientation_comes_out(walk):
+    def bare(batches):
+        for i, (now_s, samples) in enumerate(batches):
+            yield now_s, [s._replace(quat=None) for s in samples] if i == 100 else samples
+
+    shelf = Shelf()
+    summary = walk(bare, [shelf])
+    assert str(summary.error).startswith("left_forearm: the device sends no orientation")
+    assert indices(shelf) == list(range(60))
+
+
+def test_nothing_is_written_after_an_output_failed(walk):
+    before, full, after = Shelf(), Shelf(room=50), Shelf()
+    summary = walk(sinks=[before, full, after])
+    assert str(summary.error) == "the shelf is full"
+    assert indices(before) == list(range(51))
+    assert indices(full) == indices(after) == list(range(50))
+    assert full.asked == 51
+    assert summary.poses == 50
+
+
+def test_a_sensor_that_stops_is_held_and_counted(walk):
+    silent = PLACEMENTS.index("head")
+
+    def without_head(batches):
+        for i, (now_s, samples) in enumerate(batches):
+            yield now_s, [s for s in samples if s.sensor != silent or not 100 <= i < 200]
+
+    shelf = Shelf()
+    summary = walk(without_head, [shelf])
+    texts = [pose.status for pose in shelf.poses]
+    held = [i for i, text in enumerate(texts) if text == "held head"]
+    assert indices(shelf) == list(range(180))
+    assert held == list(range(held[0], held[-1] + 1))
+    assert 55 <= len(held) <= 60
+    assert set(texts[4:]) == {"ok", "held head"}
+    assert summary.held == summary.held_by_sensor[silent] == sum(summary.held_by_sensor) == len(held)
+
+
+def test_sensors_that_never_report(walk):
+    def four(batches):
+        return ((now_s, [s for s in samples if s.sensor < 4]) for now_s, samples in batches)
+
+    shelf = Shelf()
+    summary = walk(four, [shelf])
+    assert "no samples of head, pelvis" in str(summary.error)
+    assert shelf.poses == []
+
+
+def test_a_source_without_samples(walk):
+    summary = walk(lambda batches: iter(()))
+    assert summary.error is None
+    assert summary.poses == 0
+
+
+def test_latencies_do_not_fill_the_memory():
+    summary = RunSummary()
+    summary.latencies_s.extend([0.0] * (LATENCIES + 10))
+    assert len(summary.latencies_s) == LATENCIES
