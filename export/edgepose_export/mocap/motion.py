@@ -53,7 +53,7 @@ _FEET = (7, 8, 10, 11)  # their angles are noisy, and nothing is learned from th
 
 
 def pieces(motion: Motion, shortest: float = 1.0) -> list[Motion]:
-    """The motion cut where the source jumps, without pieces that are shorter than `shortest` seconds.
+    """The motion cut where the source jumps, without cut pieces that are shorter than `shortest` seconds.
 
     To be used before `resample`, whose spline would ring at a jump. A jump turns a bone other than the feet,
     or moves the pelvis, faster than a body can. In some CMU takes of dance a thigh is turned by half a turn
@@ -63,6 +63,8 @@ def pieces(motion: Motion, shortest: float = 1.0) -> list[Motion]:
     turns[:, _FEET] = 0.0
     speed = np.linalg.norm(np.diff(motion.translation, axis=0), axis=1) * motion.rate
     cuts = 1 + np.flatnonzero((turns > FASTEST_TURN).any(axis=1) | (speed > FASTEST_PELVIS))
+    if not len(cuts):
+        return [motion]
     ends = [0, *cuts.tolist(), len(motion.rotations)]
     return [
         motion._replace(rotations=motion.rotations[a:b], translation=motion.translation[a:b])
