@@ -231,8 +231,8 @@ static inline uint32_t edgepose_can_id(uint32_t base, uint8_t message, uint8_t s
     return base + (((uint32_t)message << 5) | sensor_id);
 }
 
-/* The 100 us time of CAN 2.0 frames from a microsecond clock, without a jump where that wraps. Start with zeros; call it with
- * each t_us, of the same clock for all sensors, at least once in 71 minutes. */
+/* The 100 us time of CAN 2.0 frames from a microsecond clock, without a jump where that wraps. One for each sensor, zeros at
+ * first; call it with each of its t_us, at least once in 71 minutes. */
 typedef struct {
     uint32_t last_us;
     uint32_t rest_us;

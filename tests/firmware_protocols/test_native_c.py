@@ -1,10 +1,7 @@
 """The C sender against the Python encoder, byte for byte."""
 
 import math
-import os
 import random
-import shlex
-import shutil
 import struct
 import subprocess
 from binascii import crc_hqx
@@ -15,33 +12,14 @@ import pytest
 from firmware_protocols import native, native_can
 from firmware_protocols.native import Decoder, Info, Packet
 
-HERE = Path(__file__).parent
-HEADER = Path(native.__file__).parent / "c"
-WARNINGS = ["-Wall", "-Wextra", "-Werror", "-pedantic", "-I", str(HEADER)]
+SOURCE = Path(__file__).parent / "packet_encoder.c"
 FLT_MAX = 3.4028234663852886e38
 SCALES = (32767, 100, 900, 10, 100)
 
 
-def compile_program(output, command, *options):
-    source = HERE / "packet_encoder.c"
-    done = subprocess.run(
-        [*command, *options, *WARNINGS, str(source), "-o", str(output)], capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    return output
-
-
-@pytest.fixture(scope="session")
-def cc():
-    command = shlex.split(os.environ.get("CC", "cc"))
-    if shutil.which(command[0]) is None:
-        pytest.fail(f"no C compiler: {command[0]!r} is not installed (set CC or install gcc or clang)")
-    return command
-
-
 @pytest.fixture(scope="session")
 def program(cc, tmp_path_factory):
-    return compile_program(tmp_path_factory.mktemp("c") / "encoder", cc, "-std=c99")
+    return cc(tmp_path_factory.mktemp("c") / "encoder", "-std=c99", SOURCE)
 
 
 def ask(program, requests):
@@ -225,14 +203,11 @@ def test_crc_and_cobs_equal_python(program):
 
 
 def test_same_bytes_however_compiled(cc, tmp_path, cases):
-    check_packets(compile_program(tmp_path / "fast", cc, "-std=c99", "-O3", "-ffast-math"), cases[:300])
+    check_packets(cc(tmp_path / "fast", "-std=c99", "-O3", "-ffast-math", SOURCE), cases[:300])
 
 
-def test_compiles_as_cplusplus(tmp_path, cases):
-    command = shlex.split(os.environ.get("CXX", "c++"))
-    if shutil.which(command[0]) is None:
-        pytest.skip("no C++ compiler")
-    check_packets(compile_program(tmp_path / "plus", command, "-x", "c++", "-std=c++11"), cases[:300])
+def test_compiles_as_cplusplus(cxx, tmp_path, cases):
+    check_packets(cxx(tmp_path / "plus", "-std=c++11", "-x", "c++", SOURCE), cases[:300])
 
 
 # --- CAN ------------------------------------------------------------------------------------------
