@@ -286,9 +286,10 @@ class FrameClock:
 
 
 def _mean_force(entries: list[_Entry], start_s: float, end_s: float) -> Vector3:
-    """Mean over the time from start to end of the force that is linear between entries and constant beyond them.
+    """Mean over the time from start to end of a force that is linear between entries and constant beyond.
 
-    The mean over time, not over samples: with 5 samples in 3 frames the samples' mean would shake by a fraction of a period.
+    The mean over time, not over samples: with 5 samples in 3 frames the samples' mean would shake by a
+    fraction of a period.
     """
     x = y = z = 0.0
     t0 = start_s

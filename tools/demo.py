@@ -1,7 +1,7 @@
-"""The main job from end to end: six simulated IMUs on a serial port, calibration, poses, and how far they are from the truth.
+"""The main job from end to end: six simulated IMUs on a serial port, calibration, poses, and their error.
 
-A motion-capture clip that no shipped model has seen moves a body; six virtual sensors, strapped on at random angles, send native
-packets over a pty in real time. The commands that are run are those a wearer would run.
+A motion-capture clip that no shipped model has seen moves a body; six virtual sensors, strapped on at random
+angles, send native packets over a pty in real time. The commands that are run are those a wearer would run.
 """
 
 from __future__ import annotations
@@ -49,14 +49,11 @@ class Truth(NamedTuple):
         return rot.quat_to_matrix(rot.slerp(quats[i], quats[i + 1], np.repeat(share[:, None], 24, axis=1)))
 
 
-def edgepose(*words: str) -> list[str]:
-    """A command line of edgepose in this environment."""
-    return [sys.executable, "-m", "edgepose", *words]
-
-
-def show(words: list[str]) -> None:
-    """Prints a command as a user would type it."""
-    click.echo("\n$ " + " ".join(["edgepose", *words[3:]] if words[1:3] == ["-m", "edgepose"] else words), err=True)
+def edgepose(*words: object) -> list[str]:
+    """A command line of edgepose in this environment; prints it as a user would type it."""
+    text = [str(word) for word in words]
+    click.echo("\n$ " + " ".join(["edgepose", *text]), err=True)
+    return [sys.executable, "-m", "edgepose", *text]
 
 
 @contextmanager
@@ -64,10 +61,10 @@ def simulator(recording: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """The simulated sensors, standing still, and the port they send to."""
     words = [sys.executable, str(Path(__file__).parent / "simulate.py"), str(recording), "--stand"]
     process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    assert process.stdin and process.stdout
     try:
         yield process, said(process, "port")
     finally:
+        assert process.stdin
         process.stdin.close()
         process.wait(10)
 
@@ -102,19 +99,18 @@ class Listener(threading.Thread):
 
 
 def follow(process: subprocess.Popen[str], port: str, out: Path) -> tuple[float, float, Listener]:
-    """Calibrates, starts a run, lets the clip play; gives when it began and ended (Unix time) and what came by UDP."""
-    calibration, csv = out / "calibration.json", out / "poses.csv"
-    words = edgepose(
-        "calibrate", "--port", port, "--body-frame", "heading:0", "--hold", "3", "--countdown", "1", "--out", str(calibration)
-    )
-    show(words)
-    subprocess.run(words, check=True)
+    """Calibrates, starts a run, lets the clip play.
+
+    Returns:
+        When the clip began and ended, Unix time, and what came by UDP.
+    """
+    source, calibration = ("--port", port), out / "calibration.json"
+    hold = ("--body-frame", "heading:0", "--hold", 3, "--countdown", 1)
+    subprocess.run(edgepose("calibrate", *source, *hold, "--out", calibration), check=True)
     listener = Listener()
     listener.start()
-    destination = f"127.0.0.1:{listener.port}"
-    words = edgepose("run", "--port", port, "--calibration", str(calibration), "--csv", str(csv), "--udp", destination)
-    show(words)
-    run = subprocess.Popen(words)
+    outputs = ("--csv", out / "poses.csv", "--udp", f"127.0.0.1:{listener.port}")
+    run = subprocess.Popen(edgepose("run", *source, "--calibration", calibration, *outputs))
     try:
         while not listener.first.wait(0.5):
             if run.poll() is not None:
@@ -135,18 +131,22 @@ def follow(process: subprocess.Popen[str], port: str, out: Path) -> tuple[float,
 def report(begin: float, end: float, listener: Listener, truth: Truth, out: Path) -> None:
     """Prints error, latency and rate over the clip and draws it."""
     frames, time_s, status, poses = read_poses_csv(out / "poses.csv")
-    click.echo(f"\nposes.csv: {len(frames)} frames at 60 Hz, numbers missing between first and last: {np.sum(np.diff(frames) - 1)}")
+    missing = np.sum(np.diff(frames) - 1)
+    click.echo(
+        f"\nposes.csv: {len(frames)} frames at 60 Hz, {missing} numbers missing between first and last"
+    )
     clip = (time_s >= begin + HOLD_S + 1.0) & (time_s <= end)
     seconds = time_s[clip] - begin
     true = truth.at(seconds)
     offsets = default_body().offsets
-    click.echo(f"clip: {clip.sum()} frames in {seconds[-1] - seconds[0]:.1f} s; status ok in {np.mean([s == 'ok' for s, c in zip(status, clip, strict=True) if c]):.1%}")
+    ok = np.mean(np.array(status)[clip] == "ok")
+    click.echo(f"clip: {clip.sum()} frames in {seconds[-1] - seconds[0]:.1f} s; status ok in {ok:.1%}")
     click.echo("\nError against the clip's true pose:")
     click.echo(format_table({"birnn, online (20, 5)": summary(poses[clip], true, offsets, 60.0)}))
     delays = np.array([arrived - float(str(pose["time_s"])) for arrived, pose in listener.received]) * 1e3
     p50, p99 = np.percentile(delays, [50, 99])
-    click.echo(f"\nFrom a sensor's measurement to its pose arriving by UDP: {p50:.0f} ms median, {p99:.0f} ms p99")
-    click.echo("(83 ms of it are the 5 future frames that the bidirectional network waits for; --model rnn waits for none)")
+    click.echo(f"\nFrom measurement to the pose's arrival by UDP: {p50:.0f} ms median, {p99:.0f} ms p99")
+    click.echo("(83 ms of it are the network's 5 future frames; --model rnn waits for none)")
     wanted = np.linspace(0, len(seconds) - 1, 10).round().astype(int)
     picture = out / "skeletons.png"
     skeleton_strip(
@@ -157,20 +157,19 @@ def report(begin: float, end: float, listener: Listener, truth: Truth, out: Path
 
 
 @click.command(help=__doc__)
-@click.option("--out", type=click.Path(path_type=Path), default=Path("demo-output"), show_default=True, help="Folder for the results.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=Path("demo-output"), help="Folder for results."
+)
 def main(out: Path) -> None:
     """The command line."""
     out.mkdir(parents=True, exist_ok=True)
     recording = out / CLIP.with_suffix(".npz").name
-    words = edgepose(
-        "synthesize", str(CLIP), "--out", str(out), "--hold", f"{HOLD_S:g}", "--rate", f"{RATE:g}", "--mounting", "7"
-    )
-    show(words)
-    subprocess.run(words, check=True)
+    rig = ("--hold", HOLD_S, "--rate", RATE, "--mounting", 7)
+    subprocess.run(edgepose("synthesize", CLIP, "--out", out, *rig), check=True)
     with np.load(recording) as data:
         truth = Truth(data["t"], rot.rotvec_to_matrix(data["poses"].reshape(-1, 24, 3)))
     with simulator(recording) as (process, port):
-        click.echo(f"\nsix simulated IMUs stand still and send {RATE:g} packets a second each to {port}", err=True)
+        click.echo(f"\nsix simulated IMUs stand still and send {RATE:g} times a second to {port}", err=True)
         results = follow(process, port, out)
     report(*results, truth, out)
 

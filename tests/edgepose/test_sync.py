@@ -81,7 +81,7 @@ def check_ticks(frames, rate):
 
 
 def mean_force(stream, start, end):
-    """Mean over time, from start to end, of the true force at the samples with straight lines between them."""
+    """Mean over time, from start to end, of the true force at the samples with straight lines between."""
     times = np.array([s.time_s for s in stream])
     inside = np.unique(np.concatenate([[start, end], times[(times > start) & (times < end)]]))
     forces = np.stack([np.interp(inside, times, column) for column in true_force(times).T], axis=-1)
