@@ -2,8 +2,8 @@
 
 A decoder of a byte stream has `feed(data: bytes) -> list[Sample]`, one of a CAN bus
 `feed(can_id: int, data: bytes, extended: bool = False) -> list[Sample]`; both have `counters` and the class
-attribute `WRAP_US`. Feeding is incremental: any chunking of the same bytes gives the same samples. Nothing that
-comes from a wire raises.
+attribute `WRAP_US`. Feeding is incremental: any chunking of the same bytes gives the same samples. Nothing
+that comes from a wire raises.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ class Sample(NamedTuple):
     """One measurement, SI units; absent quantities are None.
 
     Attributes:
-        sensor: the device's own id on its line or bus (node id, source address, id byte); 0 where the protocol
-            has none.
+        sensor: the device's own id on its line or bus (node id, source address, id byte); 0 where the
+            protocol has none.
         time_us: device clock at the measurement, microseconds, wrapping at the decoder's WRAP_US; None where
             the device sends no time.
-        quat: unit quaternion w, x, y, z (scalar first) that turns vectors of the sensor frame into an inertial
-            frame with Z up.
+        quat: unit quaternion w, x, y, z (scalar first) that turns vectors of the sensor frame into an
+            inertial frame with Z up.
         acc: specific force in the sensor frame, m/s^2: +9.81 on the axis that points up at rest.
         gyr: angular rate in the sensor frame, rad/s.
         mag: magnetic field in the sensor frame, uT, or in the device's own unit where it is not calibrated to
@@ -81,7 +81,7 @@ def unit_quaternion(w: float, x: float, y: float, z: float, tolerance: float = 0
 
 
 def z_up(quat: Quaternion) -> Quaternion:
-    """A quaternion sensor -> NED turned into sensor -> ENU: (x, y, z) becomes (y, x, -z) on the inertial side."""
+    """A quaternion sensor -> NED made sensor -> ENU: (x, y, z) becomes (y, x, -z) on the inertial side."""
     w, x, y, z = quat
     # R_ENU_NED is a half turn about (1, 1, 0) / sqrt(2).
     h = 0.5**0.5
