@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from types import FrameType, TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from edgepose.cli.options import check_source, source_options
+from edgepose.cli.stop import Stop
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 
@@ -129,7 +128,7 @@ def run(
         from edgepose.sync import FrameClock
 
         engine = (StreamEngine if kind == "rnn" or online == "stream" else WindowEngine)(module, past, future)
-        stop = stack.enter_context(_Stop())
+        stop = stack.enter_context(Stop())
         sinks: list[Sink] = []
         if csv_path is not None:
             sinks.append(stack.enter_context(CsvSink(csv_path, rotations, std)))
@@ -151,32 +150,6 @@ def run(
         raise summary.error
     if source.damage:
         raise EdgeposeError(source.damage)
-
-
-class _Stop:
-    """Whether Ctrl-C or SIGTERM has come. A second one interrupts at once, as outside of this."""
-
-    def __init__(self) -> None:
-        self.asked = False
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> _Stop:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._before[number] = signal.signal(number, self._note)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._restore()
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        self.asked = True
-        self._restore()
-
-    def _restore(self) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
 
 
 def _is_same_file(output: str | None, given: Path) -> bool:

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
-import errno
-import os
-import select
-import stat
-import sys
 import time
-from io import RawIOBase
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from edgepose.appending import FLUSH_S, explain, is_regular, open_output, write_rows
 from edgepose.errors import EdgeposeError
 from edgepose.pose import PoseFrame
 from edgepose.rotations import matrix_to_quat, matrix_to_rotvec
@@ -29,9 +23,6 @@ FORMS = {
     "euler": ("rz", "rx", "ry"),
 }
 """Column endings of each representation; euler: R = Rz Rx Ry, turns about the axes as they have moved."""
-
-FLUSH_S = 1.0
-"""A killed run loses at most the rows of this time, seconds."""
 
 
 def pose_columns(rotations: str, std: bool) -> list[str]:
@@ -86,11 +77,10 @@ class CsvSink(Sink):
         self._rotations, self._std = rotations, std
         columns = pose_columns(rotations, std)
         self._format = ",".join(["%d,%.6f,%s"] + ["%.6f"] * (len(columns) - 3)) + "\n"
-        self._ours = str(path) != "-"
-        self._name = str(path) if self._ours else "standard output"
+        self._path = str(path)
         self._closed = False
-        self._file = self._open(Path(path)) if self._ours else _raw_stdout()
-        self._regular = _is_regular(self._file)
+        self._file = open_output(self._path, "poses")
+        self._regular = is_regular(self._file)
         self._rows = [",".join(columns) + "\n"]
         try:
             self._flush()
@@ -115,58 +105,16 @@ class CsvSink(Sink):
         try:
             self._flush()
         finally:
-            if self._ours:
+            if self._path != "-":
                 try:
                     self._file.close()
                 except OSError as error:  # Network file systems may report a full disk only here.
-                    raise EdgeposeError(self._explain(error)) from error
-
-    def _open(self, path: Path) -> RawIOBase:
-        try:
-            return path.open("wb", buffering=0)
-        except OSError as error:
-            raise EdgeposeError(self._explain(error)) from error
+                    raise EdgeposeError(explain(error, self._path, "poses")) from error
 
     def _flush(self) -> None:
         rows, self._rows = "".join(self._rows).encode(), []
         self._flushed = time.monotonic()
-        done = 0
         try:
-            while done < len(rows):
-                count = self._file.write(rows[done:])
-                if count is None:  # A pipe that another program has made non-blocking, and it is full.
-                    select.select([], [self._file], [])
-                done += count or 0
+            write_rows(self._file, rows)
         except OSError as error:
-            if self._regular:
-                self._drop_end(done - (rows.rfind(b"\n", 0, done) + 1))
-            raise EdgeposeError(self._explain(error)) from error
-
-    def _drop_end(self, count: int) -> None:
-        """Take the last `count` bytes, the beginning of a row, off the file."""
-        with contextlib.suppress(OSError):  # The error that led here is the one to report.
-            size = self._file.seek(0, os.SEEK_CUR) - count
-            self._file.truncate(size)
-            self._file.seek(size)
-
-    def _explain(self, error: OSError) -> str:
-        if isinstance(error, BrokenPipeError):
-            return f"the program that read the poses from {self._name} has ended"
-        if error.errno == errno.ENOENT:
-            return f"cannot write poses to {self._name}: its folder does not exist, create it first"
-        if error.errno == errno.ENOSPC:
-            return f"cannot write poses to {self._name}: the disk is full; rows written before are complete"
-        return f"cannot write poses to {self._name}: {error.strerror or error}"
-
-
-def _raw_stdout() -> Any:
-    """Standard output below Python's buffers: what they still held would fail at exit without a reader."""
-    sys.stdout.flush()
-    return getattr(sys.stdout.buffer, "raw", sys.stdout.buffer)
-
-
-def _is_regular(file: RawIOBase) -> bool:
-    try:
-        return stat.S_ISREG(os.fstat(file.fileno()).st_mode)
-    except OSError:  # Not a file of the operating system, such as a captured standard output.
-        return False
+            raise EdgeposeError(explain(error, self._path, "poses")) from error
