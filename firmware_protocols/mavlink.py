@@ -1,0 +1,265 @@
+"""MAVLink 1 and 2 through pymavlink: ATTITUDE_QUATERNION with SCALED_IMU or HIGHRES_IMU.
+
+pymavlink is an extra of its own (`pip install "edgepose[mavlink]"`) and only imported when a decoder or an
+encoder is made. Layouts are in docs/mavlink.md.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from math import isfinite
+from typing import Any, ClassVar
+
+from firmware_protocols.pairing import MAX_SENSORS, Pairing
+from firmware_protocols.sample import GRAVITY, Counters, Sample, Vector3, unit_quaternion, z_up
+
+_V1, _V2 = 0xFE, 0xFD
+_SIGNED = 0x01
+_SIGNATURE_BYTES = 13
+_ATTITUDE, _SCALED, _HIGHRES = 31, 26, 105
+_MG, _UT_OF_MGAUSS, _UT_OF_GAUSS = GRAVITY / 1000, 0.1, 100.0
+_WRAP_US = 1000 << 32
+_HIGHRES_ACC, _HIGHRES_GYR, _HIGHRES_MAG, _HIGHRES_TEMPERATURE = 0x007, 0x038, 0x1C0, 0x1000
+
+
+def _dialect() -> Any:
+    try:
+        return import_module("pymavlink.dialects.v20.common")
+    except ImportError as error:
+        raise RuntimeError(
+            f'MAVLink needs pymavlink ({error}): install it with  pip install "edgepose[mavlink]"'
+        ) from None
+
+
+class Decoder:
+    """Samples out of a byte stream that may be cut anywhere, start anywhere and contain noise.
+
+    Sensor is sysid << 8 | compid. An orientation and a reading of one component whose times are no more than
+    the tolerance apart become one sample with the orientation's time; either comes out alone if the other is
+    missing.
+    """
+
+    WRAP_US: ClassVar[int] = _WRAP_US
+
+    def __init__(self, tolerance_us: int = 5000, imu: int | None = None) -> None:
+        """Start with nothing seen.
+
+        Args:
+            tolerance_us: how far apart the times of what belongs together may be, below half of the period.
+            imu: which of several HIGHRES_IMU of a component to take; None if there is only one.
+
+        Raises:
+            RuntimeError: pymavlink is not installed.
+        """
+        dialect = _dialect()
+        self._unknown: type = dialect.MAVLink_unknown
+        self._decode = dialect.MAVLink(None).decode
+        self.counters = Counters()
+        self._imu = imu
+        self._pairing = Pairing(self.counters, tolerance_us, _WRAP_US)
+        self._rest = b""
+        self._bad = False
+        self._sequence: dict[int, int] = {}
+
+    def feed(self, data: bytes) -> list[Sample]:
+        """Samples completed by the next bytes of the stream."""
+        self.counters.bytes += len(data)
+        data = self._rest + data if self._rest else data
+        samples: list[Sample] = []
+        at, end = 0, len(data)
+        while at < end:
+            size = _size(data, at)
+            if size > end - at:
+                break
+            message = self._message(data[at : at + size]) if size else None
+            if message is None:
+                # A false length must not swallow the good messages behind it: go on one byte later.
+                if not self._bad:
+                    self._bad = True
+                    self.counters.bad += 1
+                at = self._next_start(data, at + 1)
+                continue
+            at += size
+            if self._bad:
+                self._bad = False
+                self.counters.resyncs += 1
+            samples += self._take(message)
+        self._rest = data[at:]
+        return samples
+
+    def flush(self) -> list[Sample]:
+        """What still waits for its partner, at the end of a recording."""
+        return self._pairing.flush()
+
+    @staticmethod
+    def _next_start(data: bytes, at: int) -> int:
+        starts = [place for place in (data.find(b"\xfd", at), data.find(b"\xfe", at)) if place >= 0]
+        return min(starts, default=len(data))
+
+    def _message(self, frame: bytes) -> Any:
+        try:
+            message = self._decode(bytearray(frame))
+        except Exception:  # its own error, and whatever else a parser of others finds in noise
+            return None
+        # The checksum of a kind that is not known cannot be known either.
+        return None if isinstance(message, self._unknown) else message
+
+    def _take(self, message: Any) -> list[Sample]:
+        sensor = message.get_srcSystem() << 8 | message.get_srcComponent()
+        count = message.get_seq()
+        last = self._sequence.get(sensor)
+        if last is None and len(self._sequence) >= MAX_SENSORS:
+            self._sequence.clear()
+        elif last is not None and count != last:
+            self.counters.lost += (count - last - 1) & 0xFF
+        self._sequence[sensor] = count
+
+        kind = message.get_msgId()
+        if kind == _ATTITUDE:
+            quat = unit_quaternion(message.q1, message.q2, message.q3, message.q4)
+            gyr = _vector(message.rollspeed, message.pitchspeed, message.yawspeed)
+            if quat is not None:
+                time_us = message.time_boot_ms * 1000
+                return self._pairing.add(Sample(sensor, time_us, z_up(quat), None, gyr), True)
+        elif kind == _SCALED:
+            return self._pairing.add(
+                Sample(
+                    sensor,
+                    message.time_boot_ms * 1000,
+                    None,
+                    (message.xacc * _MG, message.yacc * _MG, message.zacc * _MG),
+                    (message.xgyro / 1000, message.ygyro / 1000, message.zgyro / 1000),
+                    # Without a magnetometer it says 0, which no place on earth has.
+                    _vector(message.xmag, message.ymag, message.zmag, _UT_OF_MGAUSS)
+                    if message.xmag or message.ymag or message.zmag
+                    else None,
+                    # degC of 0 stands for none, 1 for 0.
+                    message.temperature / 100 if message.temperature else None,
+                ),
+                False,
+            )
+        elif kind == _HIGHRES and self._imu in (None, message.id):
+            has = message.fields_updated or _HIGHRES_ACC | _HIGHRES_GYR | _HIGHRES_MAG
+            acc = (
+                _vector(message.xacc, message.yacc, message.zacc)
+                if has & _HIGHRES_ACC == _HIGHRES_ACC
+                else None
+            )
+            gyr = (
+                _vector(message.xgyro, message.ygyro, message.zgyro)
+                if has & _HIGHRES_GYR == _HIGHRES_GYR
+                else None
+            )
+            mag = (
+                _vector(message.xmag, message.ymag, message.zmag, _UT_OF_GAUSS)
+                if has & _HIGHRES_MAG == _HIGHRES_MAG
+                else None
+            )
+            temperature = message.temperature if has & _HIGHRES_TEMPERATURE else None
+            if temperature is not None and not isfinite(temperature):
+                temperature = None
+            if acc is not None or gyr is not None:
+                time_us = message.time_usec % _WRAP_US
+                return self._pairing.add(Sample(sensor, time_us, None, acc, gyr, mag, temperature), False)
+        self.counters.skipped += 1
+        return []
+
+
+def _vector(x: float, y: float, z: float, scale: float = 1.0) -> Vector3 | None:
+    return (x * scale, y * scale, z * scale) if isfinite(x + y + z) else None
+
+
+def _size(data: bytes, at: int) -> int:
+    """Bytes of the message at a place, as far as they are known; 0 if none starts there."""
+    end = len(data)
+    if data[at] == _V2:
+        if end - at < 3:
+            return 12
+        flags = data[at + 2]
+        if flags & ~_SIGNED:
+            return 0
+        return data[at + 1] + 12 + (_SIGNATURE_BYTES if flags else 0)
+    if data[at] == _V1:
+        return data[at + 1] + 8 if end - at > 1 else 8
+    return 0
+
+
+class Encoder:
+    """The messages of samples, for simulation; counts them for each component."""
+
+    def __init__(self, *, highres: bool = True) -> None:
+        """Start counting at 0.
+
+        Args:
+            highres: readings as HIGHRES_IMU; otherwise as SCALED_IMU, in steps of 1 mg, 1 mrad/s, 0.1 uT.
+
+        Raises:
+            RuntimeError: pymavlink is not installed.
+        """
+        self._dialect = _dialect()
+        self._highres = highres
+        self._components: dict[int, Any] = {}
+
+    def encode(self, sample: Sample) -> bytes:
+        """A reading and an orientation, as far as the sample has them.
+
+        Raises:
+            ValueError: the sample has no time, only one of force and rate, or a value cannot be sent.
+        """
+        if sample.time_us is None or not 0 <= sample.sensor < 1 << 16:
+            raise ValueError("a message has a time, and sensor is sysid << 8 | compid")
+        if (sample.acc is None) != (sample.gyr is None):
+            raise ValueError("a reading has both force and rate")
+        link = self._components.get(sample.sensor)
+        if link is None:
+            link = self._dialect.MAVLink(None, sample.sensor >> 8, sample.sensor & 0xFF)
+            self._components[sample.sensor] = link
+        time_ms = sample.time_us // 1000 & 0xFFFFFFFF
+        messages = []
+        try:
+            if sample.acc is not None and sample.gyr is not None:
+                if self._highres:
+                    messages.append(self._highres_imu(sample, sample.acc, sample.gyr))
+                else:
+                    messages.append(
+                        self._dialect.MAVLink_scaled_imu_message(
+                            time_ms,
+                            *(round(x / _MG) for x in sample.acc),
+                            *(round(x * 1000) for x in sample.gyr),
+                            *(round(x / _UT_OF_MGAUSS) for x in sample.mag or (0.0, 0.0, 0.0)),
+                            0 if sample.temperature is None else round(sample.temperature * 100) or 1,
+                        )
+                    )
+            if sample.quat is not None:
+                # A half turn of the inertial frame is its own inverse.
+                messages.append(
+                    self._dialect.MAVLink_attitude_quaternion_message(
+                        time_ms, *z_up(sample.quat), *(sample.gyr or (0.0, 0.0, 0.0))
+                    )
+                )
+            parts = []
+            for message in messages:
+                parts.append(bytes(message.pack(link)))
+                link.seq = (link.seq + 1) % 256
+        except Exception as error:  # struct.error and others, as pymavlink has it
+            raise ValueError(f"cannot send {sample}: {error}") from None
+        return b"".join(parts)
+
+    def _highres_imu(self, sample: Sample, acc: Vector3, gyr: Vector3) -> Any:
+        has = _HIGHRES_ACC | _HIGHRES_GYR
+        mag = sample.mag or (0.0, 0.0, 0.0)
+        if sample.mag is not None:
+            has |= _HIGHRES_MAG
+        if sample.temperature is not None:
+            has |= _HIGHRES_TEMPERATURE
+        return self._dialect.MAVLink_highres_imu_message(
+            sample.time_us,
+            *acc,
+            *gyr,
+            *(x / _UT_OF_GAUSS for x in mag),
+            0.0,
+            0.0,
+            0.0,
+            sample.temperature or 0.0,
+            has,
+        )

@@ -1,0 +1,63 @@
+"""Rotations between the forms that devices send; quaternions are w, x, y, z and turn sensor to inertial."""
+
+from __future__ import annotations
+
+from math import asin, atan2, cos, sin, sqrt
+
+from firmware_protocols.sample import Quaternion, Vector3
+
+
+def from_yaw_pitch_roll(yaw: float, pitch: float, roll: float) -> Quaternion:
+    """Rz(yaw) Ry(pitch) Rx(roll), radians."""
+    cy, sy = cos(yaw / 2), sin(yaw / 2)
+    cp, sp = cos(pitch / 2), sin(pitch / 2)
+    cr, sr = cos(roll / 2), sin(roll / 2)
+    return (
+        cy * cp * cr + sy * sp * sr,
+        cy * cp * sr - sy * sp * cr,
+        cy * sp * cr + sy * cp * sr,
+        sy * cp * cr - cy * sp * sr,
+    )
+
+
+def to_yaw_pitch_roll(quat: Quaternion) -> Vector3:
+    """Inverse of `from_yaw_pitch_roll`: pitch from -pi/2 to pi/2."""
+    w, x, y, z = quat
+    return (
+        atan2(2 * (x * y + w * z), w * w + x * x - y * y - z * z),
+        asin(min(max(2 * (w * y - x * z), -1.0), 1.0)),
+        atan2(2 * (y * z + w * x), w * w - x * x - y * y + z * z),
+    )
+
+
+def from_matrix(m: tuple[float, ...]) -> Quaternion:
+    """Quaternion of a rotation matrix, row after row; of unit norm only if the matrix is a rotation."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = m
+    # The largest of the four squares is at least 1 (times 4), so that nothing small is divided by.
+    squares = (1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz)
+    largest = max(squares)
+    if not largest > 0.5:
+        return (0.0, 0.0, 0.0, 0.0)
+    s = 2 * sqrt(largest)
+    if largest == squares[0]:
+        return (s / 4, (zy - yz) / s, (xz - zx) / s, (yx - xy) / s)
+    if largest == squares[1]:
+        return ((zy - yz) / s, s / 4, (xy + yx) / s, (xz + zx) / s)
+    if largest == squares[2]:
+        return ((xz - zx) / s, (xy + yx) / s, s / 4, (yz + zy) / s)
+    return ((yx - xy) / s, (xz + zx) / s, (yz + zy) / s, s / 4)
+
+
+def rotate(quat: Quaternion, v: Vector3) -> Vector3:
+    """A vector of the sensor frame in the inertial frame."""
+    w, x, y, z = quat
+    a, b, c = v
+    # v + 2 u x (u x v + w v) with u the vector part
+    p, q, r = y * c - z * b + w * a, z * a - x * c + w * b, x * b - y * a + w * c
+    return (a + 2 * (y * r - z * q), b + 2 * (z * p - x * r), c + 2 * (x * q - y * p))
+
+
+def rotate_back(quat: Quaternion, v: Vector3) -> Vector3:
+    """A vector of the inertial frame in the sensor frame."""
+    w, x, y, z = quat
+    return rotate((w, -x, -y, -z), v)

@@ -1,0 +1,359 @@
+"""x-io x-IMU3: ASCII, binary and multiplexed messages over a serial line.
+
+Layouts are in docs/ximu3.md. Orientation and inertial messages come apart and carry the same time stamp when
+they are of the same instant: those two become one Sample. There is no checksum, so contents are checked for
+what can be true.
+"""
+
+from __future__ import annotations
+
+import struct
+from math import degrees, isfinite, radians
+from typing import ClassVar
+
+from firmware_protocols import rotation
+from firmware_protocols.pairing import MAX_SENSORS, Pairing
+from firmware_protocols.sample import GRAVITY, Counters, Quaternion, Sample, Vector3, unit_quaternion, z_up
+
+FRAMES = ("NWU", "ENU", "NED")
+"""Inertial frames that the device can be set to; NWU is its default."""
+
+MAX_MESSAGE = 1024
+"""Longest message that is looked at, bytes without the closing line feed."""
+
+_END, _ESC, _ESC_END, _ESC_ESC = 0x0A, 0xDB, 0xDC, 0xDD
+_MUX, _COMMAND = ord("^"), ord("{")
+_MAX_DEPTH = 2
+_MAX_TAIL = 256  # more than the longest message that is looked for behind a broken one
+
+_FLOATS = {"I": (6,), "Q": (4,), "R": (9,), "A": (3,), "L": (3, 7), "E": (3, 7), "M": (3,), "T": (1,)}
+_SKIPPED = "HUSYCBWONF"
+_JSON = "{"
+_BINARY = {
+    (0x80 + ord(letter), 9 + 4 * count): (letter, struct.Struct(f"<xQ{count}f"))
+    for letter, counts in _FLOATS.items()
+    for count in counts
+}
+_STARTS = frozenset(ord(letter) + high for letter in _FLOATS for high in (0, 0x80)) | {_MUX}
+
+# A flipped bit of an exponent or of a high digit of the time is all that tells a bad message from a good one.
+_MAX_RATE, _MAX_FORCE = 10_000.0, 250.0  # deg/s, g
+_MAX_STEP_US = 10_000_000
+_MAG_AGE_US, _TEMPERATURE_AGE_US = 100_000, 2_000_000
+
+_DEG = radians(1.0)
+
+_Message = tuple[int, str, int, tuple[float, ...]]  # sensor, letter, time, values
+
+
+class Decoder:
+    """Samples out of a byte stream that may be cut anywhere, start anywhere and contain noise.
+
+    A Sample has the time of its orientation and inertial messages. One whose partner is lost (or is not
+    switched on) comes out alone once a later message has come. Magnetometer and temperature have clocks of
+    their own: a reading goes with the next sample, once, if it is not older than 0.1 s and 2 s.
+
+    Sensor is 0 for the device on the line itself, the channel byte of multiplexed messages, and
+    outer << 8 | inner for a channel of a channel.
+    """
+
+    WRAP_US: ClassVar[int] = 1 << 64
+
+    def __init__(self, frame: str = "NWU") -> None:
+        """Start with nothing seen.
+
+        Raises:
+            ValueError: frame is not one of FRAMES.
+        """
+        if frame not in FRAMES:
+            raise ValueError(f"frame must be one of {', '.join(FRAMES)}, not {frame!r}")
+        self.counters = Counters()
+        self._ned = frame == "NED"
+        self._pairing = Pairing(self.counters)
+        self._rest = b""
+        self._in_sync = True
+        self._has_channels = False
+        self._time: dict[int, int] = {}
+        self._suspect: dict[int, int] = {}
+        self._mag: dict[int, tuple[int, Vector3]] = {}
+        self._temperature: dict[int, tuple[int, float]] = {}
+
+    def feed(self, data: bytes) -> list[Sample]:
+        """Samples completed by the next bytes of the stream."""
+        self.counters.bytes += len(data)
+        *messages, rest = (self._rest + data).split(b"\n")
+        self._rest = rest[-MAX_MESSAGE - 1 :]
+        samples: list[Sample] = []
+        for message in messages:
+            if message:
+                samples += self._line(message)
+        return samples
+
+    def flush(self) -> list[Sample]:
+        """What still waits for its partner, at the end of a recording."""
+        return self._with_slow(self._pairing.flush())
+
+    def _line(self, line: bytes) -> list[Sample]:
+        message = _parse(line) if len(line) <= MAX_MESSAGE else None
+        samples = self._take(message) if message is not None else None
+        if samples is None:
+            self.counters.bad += 1
+            self._in_sync = False
+            return self._at_end(line[-_MAX_TAIL:])
+        if not self._in_sync:
+            self._in_sync = True
+            self.counters.resyncs += 1
+        if message is not None and not message[1] and message[0] not in self._time:
+            # Any length fits these letters: where the time says nothing either, it may be noise.
+            return self._at_end(line[-_MAX_TAIL:])
+        return samples
+
+    def _at_end(self, line: bytes) -> list[Sample]:
+        """What a good message gives that follows, without a line feed between, on a broken one."""
+        for start in range(1, len(line) - 9):
+            if line[start] not in _STARTS:
+                continue
+            # Without its two leading bytes a message of a channel looks like one of the line itself.
+            if self._has_channels and line[start] != _MUX:
+                continue
+            message = _parse(line[start:])
+            if message is None or message[1] in ("", _JSON):
+                continue
+            # No checksum: it must also fit in time.
+            last = self._time.get(message[0])
+            if last is None or not 0 <= message[2] - last <= _MAX_STEP_US:
+                continue
+            samples = self._take(message)
+            if samples is not None:
+                self.counters.resyncs += not self._in_sync
+                self._in_sync = True
+                return samples
+        return []
+
+    def _take(self, message: _Message) -> list[Sample] | None:
+        """Samples of a message; None if its content cannot be true."""
+        sensor, letter, time_us, v = message
+        if letter in ("", _JSON):
+            last = self._time.get(sensor)
+            if not letter and last is not None and abs(time_us - last) > _MAX_STEP_US:
+                return None
+            self.counters.skipped += 1
+            return []
+        quat: Quaternion | None = None
+        acc: Vector3 | None = None
+        if letter == "I":
+            if max(map(abs, v[:3])) > _MAX_RATE or max(map(abs, v[3:])) > _MAX_FORCE:
+                return None
+        elif letter == "Q":
+            quat = unit_quaternion(v[0], v[1], v[2], v[3])
+        elif letter == "R":
+            quat = unit_quaternion(*rotation.from_matrix(v)) if max(map(abs, v)) < 1.1 else None
+        elif letter == "A":
+            roll, pitch, yaw = v
+            if abs(roll) <= 180.1 and abs(pitch) <= 90.1 and abs(yaw) <= 360.1:
+                quat = rotation.from_yaw_pitch_roll(yaw * _DEG, pitch * _DEG, roll * _DEG)
+        elif letter in "LE":
+            if max(map(abs, v[-3:])) > _MAX_FORCE:
+                return None
+            if len(v) == 3:
+                # Newer firmware sends no orientation with these two; inertial messages say the same.
+                self.counters.skipped += 1
+                return []
+            quat = unit_quaternion(v[0], v[1], v[2], v[3])
+        if letter in "QRALE" and quat is None:
+            return None
+        if not self._fits(sensor, time_us):
+            return None
+
+        if letter == "I":
+            # Positional: this is the hot path.
+            return self._with_slow(
+                self._pairing.add(
+                    Sample(
+                        sensor,
+                        time_us,
+                        None,
+                        (v[3] * GRAVITY, v[4] * GRAVITY, v[5] * GRAVITY),
+                        (v[0] * _DEG, v[1] * _DEG, v[2] * _DEG),
+                    ),
+                    False,
+                )
+            )
+        if quat is not None:
+            if letter in "LE":
+                moved = (v[4], v[5], v[6])
+                if letter == "E":
+                    moved = rotation.rotate_back(quat, moved)
+            if self._ned:
+                quat = z_up(quat)
+            if letter in "LE":
+                up = rotation.rotate_back(quat, (0.0, 0.0, 1.0))
+                acc = (
+                    (moved[0] + up[0]) * GRAVITY,
+                    (moved[1] + up[1]) * GRAVITY,
+                    (moved[2] + up[2]) * GRAVITY,
+                )
+            return self._with_slow(self._pairing.add(Sample(sensor, time_us, quat, acc), True))
+        if letter == "M":
+            if sensor in self._mag:
+                self.counters.skipped += 1
+            self._mag[sensor] = (time_us, (v[0], v[1], v[2]))
+        else:
+            if sensor in self._temperature:
+                self.counters.skipped += 1
+            self._temperature[sensor] = (time_us, v[0])
+        return []
+
+    def _fits(self, sensor: int, time_us: int) -> bool:
+        """If a time can follow the last one; a jump is a restart when a second message confirms it."""
+        last = self._time.get(sensor)
+        if last is None:
+            if len(self._time) >= MAX_SENSORS:
+                for known in (self._time, self._suspect, self._mag, self._temperature):
+                    known.clear()
+        elif not -_MAX_STEP_US <= time_us - last <= _MAX_STEP_US:
+            suspect = self._suspect.get(sensor)
+            if suspect is None or not 0 <= time_us - suspect <= _MAX_STEP_US:
+                self._suspect[sensor] = time_us
+                return False
+            self.counters.restarts += 1
+        self._time[sensor] = time_us
+        if self._suspect:
+            self._suspect.pop(sensor, None)
+        if sensor:
+            self._has_channels = True
+        return True
+
+    def _with_slow(self, samples: list[Sample]) -> list[Sample]:
+        if not samples or not (self._mag or self._temperature):
+            return samples
+        result = []
+        for sample in samples:
+            time_us = sample.time_us
+            assert time_us is not None
+            mag = self._mag.pop(sample.sensor, None)
+            temperature = self._temperature.pop(sample.sensor, None)
+            if mag is not None and abs(time_us - mag[0]) <= _MAG_AGE_US:
+                sample = sample._replace(mag=mag[1])
+            if temperature is not None and abs(time_us - temperature[0]) <= _TEMPERATURE_AGE_US:
+                sample = sample._replace(temperature=temperature[1])
+            result.append(sample)
+        return result
+
+
+def _parse(line: bytes) -> _Message | None:
+    """Message of a line without its line feed; the letter is empty if its content is not for a Sample."""
+    sensor = depth = start = 0
+    while line[start] == _MUX:
+        if depth == _MAX_DEPTH or len(line) < start + 3:
+            return None
+        sensor = sensor << 8 | line[start + 1]
+        depth += 1
+        start += 2
+    if start:
+        line = line[start:]
+    first = line[0]
+    if first >= 0x80:
+        if _ESC in line:
+            pieces = line.split(b"\xdb")
+            unstuffed = bytearray(pieces[0])
+            for piece in pieces[1:]:
+                if piece[:1] == b"\xdc":
+                    unstuffed.append(_END)
+                elif piece[:1] == b"\xdd":
+                    unstuffed.append(_ESC)
+                else:
+                    return None
+                unstuffed += piece[1:]
+            line = bytes(unstuffed)
+        known = _BINARY.get((first, len(line)))
+        if known is not None:
+            letter, layout = known
+            time_us, *values = layout.unpack(line)
+            # Sums of a few binary32 values cannot overflow here, so one is finite only if all its terms are.
+            return (sensor, letter, time_us, tuple(values)) if isfinite(sum(values)) else None
+        if len(line) >= 9 and chr(first - 0x80) in _SKIPPED:
+            return (sensor, "", int.from_bytes(line[1:9], "little"), ())
+        return None
+    if first == _COMMAND:
+        # JSON; a device answers with it to what it is asked.
+        return (sensor, _JSON, 0, ()) if line.rstrip()[-1:] == b"}" else None
+    name, *fields = line.rstrip(b"\r").split(b",")
+    letter = name.decode("latin-1")
+    counts = _FLOATS.get(letter)
+    try:
+        time_us = int(fields[0])
+        if counts is None:
+            return (sensor, "", time_us, ()) if letter in _SKIPPED and len(letter) == 1 else None
+        values = [float(field) for field in fields[1:]]
+    except (ValueError, IndexError):
+        return None
+    if len(values) not in counts or not 0 <= time_us < 1 << 64 or b"_" in line or not isfinite(sum(values)):
+        return None
+    return (sensor, letter, time_us, tuple(values))
+
+
+# --- for simulation -------------------------------------------------------------------------------
+
+
+def message(
+    letter: str, time_us: int, values: tuple[float, ...], *, sensor: int = 0, ascii: bool = False
+) -> bytes:
+    """The bytes of one message, line feed included.
+
+    Args:
+        letter: kind of message, one of those with numbers.
+        time_us: device clock.
+        values: in the device's units.
+        sensor: 0 for the device itself, else its channel or outer << 8 | inner channel.
+        ascii: text with four decimals instead of binary32.
+
+    Raises:
+        ValueError: a value cannot be sent.
+    """
+    if (
+        len(values) not in _FLOATS.get(letter, ())
+        or not all(map(isfinite, values))
+        or not 0 <= sensor < 1 << 16
+    ):
+        raise ValueError(f"cannot send {letter!r} {values} of sensor {sensor}")
+    if not 0 <= time_us < 1 << 64:
+        raise ValueError(f"time must be from 0 to 2^64 - 1, not {time_us}")
+    prefix = b"".join(bytes([_MUX, byte]) for byte in (sensor >> 8, sensor & 0xFF) if byte)
+    if b"\n" in prefix:
+        raise ValueError("channel 10 is the line feed")
+    if ascii:
+        return prefix + ",".join([letter, str(time_us), *(f"{x:.4f}" for x in values)]).encode() + b"\r\n"
+    try:
+        body = struct.pack(f"<BQ{len(values)}f", 0x80 + ord(letter), time_us, *values)
+    except (struct.error, OverflowError) as error:
+        raise ValueError(f"cannot send {values}: {error}") from None
+    return prefix + body.replace(b"\xdb", b"\xdb\xdd").replace(b"\n", b"\xdb\xdc") + b"\n"
+
+
+def encode(sample: Sample, *, ascii: bool = False, frame: str = "NWU") -> bytes:
+    """The messages of a sample: temperature, magnetometer, inertial, quaternion, as far as it has them.
+
+    Raises:
+        ValueError: the sample has no time, or only one of force and rate, or a value cannot be sent.
+    """
+    time_us = sample.time_us
+    if time_us is None:
+        raise ValueError("an x-IMU3 message has a time")
+    if (sample.acc is None) != (sample.gyr is None):
+        raise ValueError("an inertial message has both force and rate")
+    if frame not in FRAMES:
+        raise ValueError(f"frame must be one of {', '.join(FRAMES)}, not {frame!r}")
+    parts: list[tuple[str, tuple[float, ...]]] = []
+    if sample.temperature is not None:
+        parts.append(("T", (sample.temperature,)))
+    if sample.mag is not None:
+        parts.append(("M", sample.mag))
+    if sample.acc is not None and sample.gyr is not None:
+        parts.append(("I", (*map(degrees, sample.gyr), *(x / GRAVITY for x in sample.acc))))
+    if sample.quat is not None:
+        # A half turn of the inertial frame is its own inverse.
+        parts.append(("Q", z_up(sample.quat) if frame == "NED" else sample.quat))
+    return b"".join(
+        message(letter, time_us, values, sensor=sample.sensor, ascii=ascii) for letter, values in parts
+    )
