@@ -1,0 +1,129 @@
+"""HaritoraX full-body trackers on a serial port: text lines of the GX dongle and of the wired model.
+
+Layouts, and where the scales come from, are in docs/haritorax.md. No time, no angular rate, no checksum.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from base64 import b64decode, b64encode
+from collections.abc import Iterable
+from typing import ClassVar
+
+from firmware_protocols.sample import GRAVITY, Counters, Sample, unit_quaternion
+
+MAX_LINE = 512
+"""Longest line that is read, bytes; eight wired sensors need 155."""
+
+SLOTS = 8
+"""Places of trackers on one port of a dongle; the second sensor of tracker n is n + SLOTS."""
+
+_BLOCK = struct.Struct("<7h")
+_QUAT_STEPS = 16384
+# Of all captured quaternions the norm is 16384 to 0.02 %, so this tells most damaged lines from good ones.
+_TOLERANCE = 0.005
+_DONGLE_STEP = GRAVITY / 2048
+_WIRED_STEP = 1 / 256  # m/s^2
+_LINE = re.compile(rb"(?:X([0-7])|P):([A-Za-z0-9+/]+={0,2})\r*\Z")
+_OTHER = re.compile(rb"[a-z][0-9]?:[ -~]*\r*\Z")
+
+# Bytes of a dongle's line: one sensor and two bytes of ankle distance; or two sensors and two bytes of state
+# between them. Neither is a whole number of blocks.
+_DONGLE_BLOCKS = {16: (0,), 30: (0, 16)}
+_WIRED_LENGTHS = range(_BLOCK.size, 8 * _BLOCK.size + 1, _BLOCK.size)
+
+
+class Decoder:
+    """Samples out of a byte stream that may be cut anywhere, start anywhere and contain noise.
+
+    Sensor is the slot of the tracker on this port of the dongle (0 to 7; 8 more for the second sensor of a
+    leg tracker), or the place in the line of the wired model.
+
+    Attributes:
+        counters: what has been seen so far.
+    """
+
+    WRAP_US: ClassVar[int] = 1 << 64
+
+    def __init__(self) -> None:
+        """Start with nothing seen."""
+        self.counters = Counters()
+        self._rest = b""
+        self._in_sync = True
+
+    def feed(self, data: bytes) -> list[Sample]:
+        """Samples completed by the next bytes of the stream, in the order they came."""
+        self.counters.bytes += len(data)
+        *lines, rest = (self._rest + data).split(b"\n")
+        # One byte more than a line may have, so that a longer one cannot pass for a whole one.
+        self._rest = rest[-MAX_LINE - 1 :]
+        samples: list[Sample] = []
+        for line in lines:
+            if line.strip(b"\r"):
+                samples += self._line(line[-MAX_LINE - 1 :])
+        return samples
+
+    def _line(self, line: bytes) -> list[Sample]:
+        match = _LINE.search(line)
+        if match is None and len(line) <= MAX_LINE and _OTHER.match(line):
+            self.counters.skipped += 1  # buttons, battery, settings
+            return []
+        samples = _samples(match) if match is not None else []
+        # A good line may follow on a broken one that has lost its end.
+        if match is None or match.start() or not samples:
+            self.counters.bad += 1
+            self._in_sync = False
+        if samples:
+            if not self._in_sync:
+                self._in_sync = True
+                self.counters.resyncs += 1
+            self.counters.packets += len(samples)
+        return samples
+
+
+def _samples(match: re.Match[bytes]) -> list[Sample]:
+    """Samples of a line; none if it cannot be true."""
+    slot, text = match.groups()
+    if len(text) % 4:
+        return []
+    data = b64decode(text)
+    if slot is not None:
+        first, step, number = int(slot), _DONGLE_STEP, SLOTS
+        starts: Iterable[int] = _DONGLE_BLOCKS.get(len(data), ())
+    elif len(data) in _WIRED_LENGTHS:
+        first, step, number = 0, _WIRED_STEP, 1
+        starts = range(0, len(data), _BLOCK.size)
+    else:
+        return []
+    samples = []
+    for i, start in enumerate(starts):
+        x, y, z, w, a, b, c = _BLOCK.unpack_from(data, start)
+        quat = unit_quaternion(w / _QUAT_STEPS, x / _QUAT_STEPS, y / _QUAT_STEPS, z / _QUAT_STEPS, _TOLERANCE)
+        if quat is None:
+            return []
+        samples.append(Sample(first + i * number, None, quat, (a * step, b * step, c * step)))
+    return samples
+
+
+def encode(sample: Sample) -> bytes:
+    """The line by which a dongle gives the only sensor of tracker `sample.sensor`.
+
+    Raises:
+        ValueError: there is no such slot, or the sample has no orientation or no specific force.
+    """
+    if not 0 <= sample.sensor < SLOTS:
+        raise ValueError(f"slots of a dongle are 0 to {SLOTS - 1}, not {sample.sensor}")
+    return b"X%d:%s\n" % (sample.sensor, b64encode(_block(sample, _DONGLE_STEP) + b"\0\0"))
+
+
+def encode_wired(samples: Iterable[Sample]) -> bytes:
+    """The line of the wired model with all its sensors, in the order they are given."""
+    return b"P:" + b64encode(b"".join(_block(sample, _WIRED_STEP) for sample in samples)) + b"\n"
+
+
+def _block(sample: Sample, step: float) -> bytes:
+    if sample.quat is None or sample.acc is None:
+        raise ValueError("a block has both orientation and specific force")
+    w, *xyz = (round(value * _QUAT_STEPS) for value in sample.quat)
+    return _BLOCK.pack(*xyz, w, *(max(-32768, min(32767, round(value / step))) for value in sample.acc))

@@ -1,0 +1,161 @@
+"""LP-Research LPMS: LPBUS frames over a serial line (USB, UART, Bluetooth SPP).
+
+Layout in docs/lpms.md. Everything is little-endian. A frame does not say which quantities it holds: that is
+the setting of the sensor, and the decoder has to be told.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterable
+from math import isfinite
+
+from firmware_protocols._stream import StreamDecoder
+from firmware_protocols.sample import GRAVITY, Quaternion, Sample, Vector3, unit_quaternion
+
+SENSOR_DATA = 9
+"""Command of a measurement."""
+
+MAX_DATA = 256
+"""Most bytes of data in a frame; a measurement with all quantities has 108."""
+
+TICK_US = 2500
+"""Step of the time, microseconds."""
+
+# Numbers in a quantity and steps of an int16 in its unit, in the order on the wire.
+_QUANTITIES = {
+    "gyr": (3, 1000),  # rad/s, as measured
+    "acc": (3, 1000),  # g
+    "mag": (3, 100),  # uT
+    "rate": (3, 1000),  # rad/s, after the filter
+    "quat": (4, 10000),
+    "euler": (3, 10000),
+    "linear": (3, 1000),  # g, without gravity
+    "pressure": (1, 100),
+    "altitude": (1, 10),
+    "temperature": (1, 100),  # degC
+}
+
+FIELDS = tuple(_QUANTITIES)
+"""Quantities that a sensor can be set to send."""
+
+USUAL_FIELDS = ("gyr", "acc", "mag", "quat")
+"""What a sensor should be set to send."""
+
+_HEAD = struct.Struct("<3H")
+_START_BYTE, _END = b"\x3a", b"\r\n"
+_AROUND = 1 + _HEAD.size + 2 + len(_END)
+
+
+def _layout(fields: Iterable[str], floats: bool) -> tuple[tuple[str, ...], struct.Struct]:
+    """Quantities in the order on the wire, and the layout of time and values."""
+    wanted = tuple(fields)
+    unknown = [name for name in wanted if name not in FIELDS]
+    if unknown or not wanted:
+        raise ValueError(f"fields must be of {', '.join(FIELDS)}, not {', '.join(unknown) or 'none'}")
+    names = tuple(name for name in FIELDS if name in wanted)
+    count = sum(_QUANTITIES[name][0] for name in names)
+    return names, struct.Struct(f"<I{count}{'f' if floats else 'h'}")
+
+
+class LpmsDecoder(StreamDecoder):
+    """Measurements of the sensors on a line; `sensor` is the id in the frame (OpenMAT id).
+
+    The orientation on the wire turns inertial to sensor, and the acceleration points down at rest: both are
+    turned around here.
+    """
+
+    WRAP_US = (1 << 32) * TICK_US
+    _START = re.compile(_START_BYTE)
+
+    def __init__(self, fields: Iterable[str] = USUAL_FIELDS, floats: bool = True) -> None:
+        """Start with nothing seen.
+
+        Args:
+            fields: what the sensors are set to send, of FIELDS, in any order.
+            floats: numbers are binary32 and not int16.
+
+        Raises:
+            ValueError: unknown fields.
+        """
+        super().__init__()
+        names, self._layout = _layout(fields, floats)
+        self._at_of: dict[str, int] = {}
+        self._scale = {name: 1.0 if floats else 1.0 / _QUANTITIES[name][1] for name in names}
+        at = 1
+        for name in names:
+            self._at_of[name] = at
+            at += _QUANTITIES[name][0]
+        self._rate = "rate" if "rate" in names else "gyr"
+
+    def _length(self, buffer: bytes, at: int) -> int:
+        if len(buffer) - at < 1 + _HEAD.size:
+            return 0
+        length = buffer[at + 5] | buffer[at + 6] << 8
+        return length + _AROUND if length <= MAX_DATA else -1
+
+    def _intact(self, buffer: bytes, at: int, length: int) -> bool:
+        end = at + length
+        total = sum(buffer[at + 1 : end - 4]) & 0xFFFF
+        return buffer[end - 2 : end] == _END and total == buffer[end - 4] | buffer[end - 3] << 8
+
+    def _message(self, frame: bytes, samples: list[Sample]) -> None:
+        sensor, command, length = _HEAD.unpack_from(frame, 1)
+        if command != SENSOR_DATA:
+            self.counters.skipped += 1
+            return
+        if length != self._layout.size:  # the sensor is set to send something else
+            self.counters.bad += 1
+            return
+        v = self._layout.unpack_from(frame, 1 + _HEAD.size)
+        quat: Quaternion | None = None
+        at = self._at_of.get("quat")
+        if at is not None:
+            s = self._scale["quat"]
+            quat = unit_quaternion(v[at] * s, -v[at + 1] * s, -v[at + 2] * s, -v[at + 3] * s)
+        acc = self._vector(v, "acc", -GRAVITY)
+        gyr = self._vector(v, self._rate, 1.0)
+        mag = self._vector(v, "mag", 1.0)
+        temperature = None
+        at = self._at_of.get("temperature")
+        if at is not None and isfinite(v[at]):
+            temperature = v[at] * self._scale["temperature"]
+        self._give(Sample(sensor, v[0] * TICK_US, quat, acc, gyr, mag, temperature), samples)
+
+    def _vector(self, v: tuple[float, ...], name: str, unit: float) -> Vector3 | None:
+        at = self._at_of.get(name)
+        if at is None:
+            return None
+        s = self._scale[name] * unit
+        x, y, z = v[at] * s, v[at + 1] * s, v[at + 2] * s
+        return (x, y, z) if isfinite(x + y + z) else None
+
+
+def encode(sample: Sample, fields: Iterable[str] = USUAL_FIELDS, floats: bool = True) -> bytes:
+    """The frame of a sample; see `LpmsDecoder` for the settings. What the sample lacks is sent as zeros.
+
+    Raises:
+        ValueError: unknown fields, or a number that does not fit.
+    """
+    names, layout = _layout(fields, floats)
+    w, x, y, z = sample.quat or (0.0, 0.0, 0.0, 0.0)
+    known: dict[str, tuple[float, ...] | None] = {
+        "gyr": sample.gyr,
+        "acc": sample.acc and tuple(-value / GRAVITY for value in sample.acc),
+        "mag": sample.mag,
+        "rate": sample.gyr,
+        "quat": (w, -x, -y, -z),
+        "temperature": None if sample.temperature is None else (sample.temperature,),
+    }
+    values: list[float] = []
+    for name in names:
+        count, steps = _QUANTITIES[name]
+        numbers = known.get(name) or (0.0,) * count
+        values += numbers if floats else (max(-32768, min(32767, round(n * steps))) for n in numbers)
+    try:
+        data = layout.pack((sample.time_us or 0) // TICK_US & 0xFFFFFFFF, *values)
+        body = _HEAD.pack(sample.sensor, SENSOR_DATA, len(data)) + data
+    except (struct.error, OverflowError) as error:
+        raise ValueError(f"cannot send {sample}: {error}") from None
+    return _START_BYTE + body + (sum(body) & 0xFFFF).to_bytes(2, "little") + _END
