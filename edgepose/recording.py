@@ -72,7 +72,8 @@ class Recording(NamedTuple):
     Attributes:
         sensors: data by placement name, in the order of PLACEMENTS.
         metadata: rate, frame, units, placements and what else the file says about itself.
-        damage: one line for the user if the file's end is cut off (file, row, what to do); the rest is here.
+        damage: one line for the user if a part of the file is no good (file, row, what to do); the rest is
+            here.
     """
 
     sensors: dict[str, SensorData]
@@ -86,15 +87,32 @@ def read_recording(path: Path | str) -> Recording:
     Raises:
         EdgeposeError: the file cannot be read, or holds anything else than a recording of all six sensors.
     """
-    path = Path(path)
-    try:
-        recording = _read_npz(path) if path.suffix.lower() == ".npz" else _read_csv(path)
-    except (OSError, UnicodeDecodeError) as error:
-        raise EdgeposeError(f"{path}: cannot read it: {getattr(error, 'strerror', None) or error}") from None
-    missing = [name for name in PLACEMENTS if name not in recording.sensors]
+    recording = _read(Path(path), salvage=False)
+    missing = missing_sensors(recording)
     if missing:
         raise EdgeposeError(f"{path}: no samples of {', '.join(missing)}; a recording needs all six sensors")
-    return recording._replace(sensors={name: recording.sensors[name] for name in PLACEMENTS})
+    return recording
+
+
+def salvage_recording(path: Path | str) -> Recording:
+    """What is good in a recording, of any number of sensors: bad rows are left out, `damage` tells of them.
+
+    Raises:
+        EdgeposeError: the file cannot be read, or is no recording at all.
+    """
+    return _read(Path(path), salvage=True)
+
+
+def missing_sensors(recording: Recording) -> list[str]:
+    """Placements of which there is no sample."""
+    return [name for name in PLACEMENTS if name not in recording.sensors]
+
+
+def _read(path: Path, salvage: bool) -> Recording:
+    try:
+        return _read_npz(path, salvage) if path.suffix.lower() == ".npz" else _read_csv(path, salvage)
+    except (OSError, UnicodeDecodeError) as error:
+        raise EdgeposeError(f"{path}: cannot read it: {getattr(error, 'strerror', None) or error}") from None
 
 
 def samples(recording: Recording) -> Iterator[ImuSample]:
@@ -103,18 +121,34 @@ def samples(recording: Recording) -> Iterator[ImuSample]:
     return heapq.merge(*streams, key=attrgetter("time_s"))
 
 
-def from_samples(rows: Iterable[ImuSample], metadata: Mapping[str, str] | None = None) -> Recording:
-    """Recording of samples, each sensor's in time order."""
-    table = _Table("samples")
+def from_samples(
+    rows: Iterable[ImuSample],
+    metadata: Mapping[str, str] | None = None,
+    *,
+    name: str = "samples",
+    salvage: bool = False,
+) -> Recording:
+    """Recording of samples, each sensor's in time order.
+
+    Args:
+        rows: the samples.
+        metadata: of the recording.
+        name: where they are from, for messages.
+        salvage: leave bad ones out and say so in `damage` instead of raising.
+
+    Raises:
+        EdgeposeError: there is something in them that no sensor measures.
+    """
+    table = _Table(name, salvage)
     for number, sample in enumerate(rows, start=1):
         row = [sample.time_s]
         empty = 0
-        for name, size in QUANTITIES.items():
-            values = getattr(sample, name)
+        for quantity, size in QUANTITIES.items():
+            values = getattr(sample, quantity)
             row += (nan,) * size if values is None else values
             empty += size if values is None else 0
         table.add(PLACEMENTS[sample.sensor], number, row, empty)
-    return Recording(table.sensors(), dict(metadata or {}))
+    return Recording(table.sensors(), dict(metadata or {}), table.damage())
 
 
 def _sensor_samples(index: int, data: SensorData) -> Iterator[ImuSample]:
@@ -137,7 +171,8 @@ def _sensor_samples(index: int, data: SensorData) -> Iterator[ImuSample]:
 
 def csv_header(metadata: Mapping[str, str]) -> str:
     """First lines of a CSV recording, up to its column names."""
-    comments = [f"# {key}: {value}\n" for key, value in metadata.items()]
+    # A line break would start a row of its own.
+    comments = ["# " + " ".join(f"{key}: {value}".splitlines()) + "\n" for key, value in metadata.items()]
     return "".join(comments) + COLUMNS + "\n"
 
 
@@ -156,7 +191,7 @@ def write_csv(path: Path | str, recording: Recording) -> None:
         file.writelines(map(csv_row, samples(recording)))
 
 
-def _read_csv(path: Path) -> Recording:
+def _read_csv(path: Path, salvage: bool) -> Recording:
     # Bytes that are no UTF-8 become a mark that is no number either.
     opened = (
         nullcontext(sys.stdin)
@@ -166,17 +201,26 @@ def _read_csv(path: Path) -> Recording:
     with opened as file:
         lines = _Lines(path, file)
         metadata = _read_metadata(path, lines)
-        table, damage = _read_rows(path, lines)
-    return Recording(table.sensors(), metadata, damage)
+        lines.unlimited = salvage
+        table, cut = _read_rows(path, lines, salvage)
+    sensors = table.sensors()  # checks the last rows
+    return Recording(sensors, metadata, table.damage() or cut)
 
 
 class _Lines:
-    """Lines of a text file, counted, none longer than a recording's can be."""
+    """Lines of a text file, counted, none longer than a recording's can be.
+
+    Attributes:
+        number: of the present line, from 1.
+        line: the present line.
+        unlimited: give a line that is too long in pieces instead of raising.
+    """
 
     def __init__(self, path: Path, file: TextIO) -> None:
         self._path, self._file = path, file
         self.number = 0
-        self.line = ""
+        self.line = "\n"
+        self.unlimited = False
 
     def __iter__(self) -> _Lines:
         return self
@@ -185,9 +229,9 @@ class _Lines:
         line = self._file.readline(_MAX_LINE)
         if not line:
             raise StopIteration
+        self.number += not self.cut
         self.line = line
-        self.number += 1
-        if len(self.line) == _MAX_LINE:
+        if len(self.line) == _MAX_LINE and not self.unlimited:
             raise EdgeposeError(
                 f"{self._path}: row {self.number} is longer than {_MAX_LINE} characters; is it a CSV file?"
             )
@@ -214,25 +258,29 @@ def _read_metadata(path: Path, lines: _Lines) -> dict[str, str]:
     raise EdgeposeError(f"{path}: the file is empty; a recording starts with the columns {COLUMNS}")
 
 
-def _read_rows(path: Path, lines: _Lines) -> tuple[_Table, str | None]:
-    table = _Table(str(path))
-    try:
-        for cells in csv.reader(lines, quoting=csv.QUOTE_NONE):
-            if not cells:
-                continue
-            try:
+def _read_rows(path: Path, lines: _Lines, salvage: bool) -> tuple[_Table, str | None]:
+    """All rows, and what to say if the last one is cut off."""
+    table = _Table(str(path), salvage)
+    rows = csv.reader(lines, quoting=csv.QUOTE_NONE)
+    while True:
+        try:
+            cells = next(rows, None)
+            if cells is None:
+                return table, None
+            if cells:
                 sensor, numbers = _parse_row(cells, lines.cut)
-            except ValueError as error:
-                if not lines.cut:
-                    raise EdgeposeError(f"{path}: row {lines.number} {error}") from None
-                return table, (
-                    f"{path}: row {lines.number} is cut off, {table.count} samples before it are good; "
-                    "delete that row or copy the file again"
-                )
-            table.add(sensor, lines.number, numbers, cells.count(""))
-    except csv.Error as error:
-        raise EdgeposeError(f"{path}: row {lines.number}: {error}") from None
-    return table, None
+                table.add(sensor, lines.number, numbers, cells.count(""))
+        except csv.Error as error:
+            table.reject(f"row {lines.number}: {error}")
+        except ValueError as error:
+            # The pieces of a line that is too long have no end either.
+            if not lines.cut or len(lines.line) == _MAX_LINE:
+                table.reject(f"row {lines.number} {error}")
+                continue
+            return table, (
+                f"{path}: row {lines.number} is cut off, {table.count} samples before it are good; "
+                "delete that row or copy the file again"
+            )
 
 
 def _parse_row(cells: list[str], cut: bool) -> tuple[str, list[float]]:
@@ -287,7 +335,7 @@ def write_npz(path: Path | str, recording: Recording) -> None:
         np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
-def _read_npz(path: Path) -> Recording:
+def _read_npz(path: Path, salvage: bool) -> Recording:
     try:
         arrays = _load_arrays(path)
     except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, RuntimeError, MemoryError) as error:
@@ -299,11 +347,11 @@ def _read_npz(path: Path) -> Recording:
     for line in _lines_of(path, arrays, "metadata"):
         key, _, value = line.partition(":")
         metadata[key.strip()] = value.strip()
-    table = _Table(str(path))
+    table = _Table(str(path), salvage)
     for placement in PLACEMENTS:
         if any(f"{placement}_{name}" in arrays for name in QUANTITIES):
             _add_arrays(path, table, placement, arrays, sparse)
-    return Recording(table.sensors(), metadata)
+    return Recording(table.sensors(), metadata, table.damage())
 
 
 def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -371,16 +419,36 @@ class _Table:
     """Rows of numbers (time, then the quantities) by sensor, checked a block at a time.
 
     Attributes:
-        count: rows so far.
+        count: good rows so far, save those of the last, unchecked blocks that turn out bad.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, salvage: bool = False) -> None:
         self._name = name
+        self._salvage = salvage
+        self._left_out = 0
+        self._problem = ""  # of the first row left out
         self._rows: dict[str, list[list[float]]] = {}
         self._marks: dict[str, list[tuple[int, int]]] = {}  # number and empty cells of each of these rows
         self._blocks: dict[str, list[Array]] = {}
         self._checked = 0
         self.count = 0
+
+    def reject(self, problem: str) -> None:
+        """Leave a row out.
+
+        Raises:
+            EdgeposeError: nothing is to be left out.
+        """
+        if not self._salvage:
+            raise EdgeposeError(f"{self._name}: {problem}")
+        self._problem = self._problem or problem
+        self._left_out += 1
+
+    def damage(self) -> str | None:
+        """What to say of rows that were left out."""
+        if not self._left_out:
+            return None
+        return f"{self._name}: {self._left_out} bad rows left out, the first: {self._problem}"
 
     def add(self, sensor: str, number: int, row: list[float], empty: int) -> None:
         """Take one row: its number in the file, 14 numbers, how many of them are empty (NaN)."""
@@ -401,14 +469,15 @@ class _Table:
             return
         blocks = self._blocks.setdefault(sensor, [])
         before = blocks[-1][-1, 0] if blocks else -inf
+        good = np.ones(len(rows), dtype=bool)
 
         def check(bad: Any, problem: str) -> None:
-            if bad.any():
-                raise EdgeposeError(f"{self._name}: row {numbers[np.argmax(bad)]}: {sensor} {problem}")
+            for row in np.flatnonzero(bad & good):
+                self.reject(f"row {numbers[row]}: {sensor} {problem}")
+            good[bad] = False
 
-        check(~(np.abs(rows[:, 0]) < _MAX_TIME_S), "has no time")
-        check(np.diff(rows[:, 0], prepend=before) < 0, "goes back in time; sort the rows by time_s")
-        values = rows[:, 1:]
+        times, values = rows[:, 0], rows[:, 1:]
+        check(~(np.abs(times) < _MAX_TIME_S), "has no time")
         check(
             (np.abs(values) < _MAX_VALUE).sum(axis=1) + empty != values.shape[1],
             "has a number that is NaN or absurd",
@@ -420,18 +489,26 @@ class _Table:
             start += size
         norm = np.linalg.norm(values[:, :4], axis=1)
         check(np.abs(norm - 1.0) > 0.1, "has a quaternion that is not of unit length")
-        values[:, :4] /= norm[:, None]
-        blocks.append(rows)
+        reached = np.maximum.accumulate(np.concatenate([[before], np.where(good, times, -inf)]))[:-1]
+        check(good & (times < reached), "goes back in time; sort the rows by time_s")
+        if not good.all():
+            rows, norm = rows[good], norm[good]
+        rows[:, 1:5] /= norm[:, None]
+        if len(rows):
+            blocks.append(rows)
         self._checked += len(rows)
         if self._checked > MAX_SAMPLES:
             raise EdgeposeError(f"{self._name}: more than {MAX_SAMPLES} samples; split the recording")
 
     def sensors(self) -> dict[str, SensorData]:
-        """All data by sensor."""
+        """All data by sensor, in the order of PLACEMENTS."""
         for sensor in self._rows:
             self._close(sensor)
         result = {}
-        for sensor, blocks in self._blocks.items():
+        for sensor in PLACEMENTS:
+            blocks = self._blocks.get(sensor)
+            if not blocks:
+                continue
             rows = np.concatenate(blocks)
             quantities: list[Array | None] = []
             start = 1

@@ -18,7 +18,9 @@ from edgepose.recording import (
     csv_header,
     csv_row,
     from_samples,
+    missing_sensors,
     read_recording,
+    salvage_recording,
     samples,
     write_csv,
     write_npz,
@@ -184,6 +186,72 @@ def test_damaged_npz_is_an_error_or_still_a_recording(tmp_path_factory, place, c
     path.write_bytes(data)
     with contextlib.suppress(EdgeposeError):
         read_recording(path)
+
+
+# --- salvage ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        (",head,", ",hat,", "row 6 names an unknown sensor 'hat'"),
+        ("9.81", "abc", "row 2 holds something that is no number"),
+        ("9.81", "nan", "row 2: left_forearm has a number that is NaN or absurd"),
+        ("9.81", "", "row 2: left_forearm has only a part of acc"),
+        ("9.81", "9" * 9000, "row 2 has 9 columns"),
+        ("9.81", "\0" * 10, "row 2"),
+        ("0.010000,pelvis", "0.030000,pelvis", "row 19: pelvis goes back in time"),
+        ("0.010000,pelvis", "nan,pelvis", "row 13: pelvis has no time"),
+        (",1,0,0,0,", ",0,0,0,0,", "row 2: left_forearm has a quaternion that is not of unit length"),
+    ],
+)
+def test_a_bad_row_alone_is_left_out(tmp_path, old, new, problem):
+    recording = salvage_recording(write(tmp_path / "a.csv", text(rig()).replace(old, new, 1)))
+    assert len(list(samples(recording))) == 17
+    assert f"{tmp_path / 'a.csv'}: " in recording.damage
+    assert " bad rows left out, the first: " + problem in recording.damage
+    assert "\n" not in recording.damage
+
+
+def test_zeros_at_the_end_after_a_power_cut(tmp_path):
+    recording = salvage_recording(write(tmp_path / "a.csv", text(rig()) + "\0" * 10_000))
+    assert len(list(samples(recording))) == 18
+    assert "row 20" in recording.damage
+
+
+def test_salvage_takes_any_sensors(tmp_path):
+    rows = [sample for sample in rig() if sample.sensor in (2, 5)]
+    recording = salvage_recording(write(tmp_path / "a.csv", text(rows)))
+    assert list(recording.sensors) == ["left_lower_leg", "pelvis"]
+    assert missing_sensors(recording) == ["left_forearm", "right_forearm", "right_lower_leg", "head"]
+    assert recording.damage is None
+
+
+def test_salvage_of_what_is_no_recording(tmp_path):
+    with pytest.raises(EdgeposeError, match="columns"):
+        salvage_recording(write(tmp_path / "a.csv", "frame,time_s\n1,2\n"))
+
+
+def test_salvage_of_samples_and_arrays(tmp_path):
+    rows = rig()
+    rows[7] = rows[7]._replace(acc=(0.0, 0.0, 1e30))
+    with pytest.raises(EdgeposeError, match="absurd"):
+        from_samples(rows)
+    recording = from_samples(rows, name="port", salvage=True)
+    assert len(list(samples(recording))) == 17
+    assert recording.damage.startswith("port: 1 bad rows left out, the first: row 8: right_forearm")
+    with np.load(REAL) as file:
+        values = file["head_acc"].copy()
+    values[3] = np.nan
+    recording = salvage_recording(npz(tmp_path / "a.npz", head_acc=values))
+    assert len(list(samples(recording))) == 1799
+    assert "row 3: head" in recording.damage
+
+
+def test_metadata_cannot_start_a_row(tmp_path):
+    recording = from_samples(rig(), {"note": "a\n0,head", "x\r": "b"})
+    write_csv(tmp_path / "a.csv", recording)
+    assert read_recording(tmp_path / "a.csv").metadata == {"note": "a 0,head", "x": "b"}
 
 
 # --- hostile files ------------------------------------------------------------------------------------------
