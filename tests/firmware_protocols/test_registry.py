@@ -8,7 +8,7 @@ from firmware_protocols.sample import Sample
 
 NO_TIME = {
     *("hipnuc-canopen", "hipnuc-j1939", "witmotion-modbus", "witmotion-can", "bno08x-rvc"),
-    *("vectornav-ascii", "adafruit", "razor"),
+    *("vectornav-ascii", "haritorax", "adafruit", "razor"),
 }
 
 
