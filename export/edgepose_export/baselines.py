@@ -87,12 +87,17 @@ def _globals(local: Array) -> Array:
     return forward_kinematics(local, np.zeros((24, 3)))[0]
 
 
+NAMES = (
+    "mean pose",
+    "measured bones, others interpolated",
+    "measured bones, others interpolated + mean offsets",
+)
+"""The baselines, in the order of `poses`."""
+
+
 def poses(take: Take, baselines: Baselines) -> dict[str, Array]:
     """Local poses (T, 24, 3, 3) of each baseline, by its name; all of them know the root's orientation."""
     mean = np.tile(baselines.mean_pose, (len(take.pose), 1, 1, 1))
     mean[:, 0] = take.orientation[:, ROOT]
-    return {
-        "mean pose": mean,
-        "measured bones, others interpolated": interpolated(take),
-        "measured bones, others interpolated + mean offsets": interpolated(take, baselines.offsets),
-    }
+    results = (mean, interpolated(take), interpolated(take, baselines.offsets))
+    return dict(zip(NAMES, results, strict=True))

@@ -18,6 +18,12 @@ from edgepose_export.dataset import HELD_OUT, RATE, Take, read_takes
 Array = NDArray[np.float64]
 
 BATCH = 512
+"""Windows run at once."""
+
+GROUP = 64
+"""Takes run at once."""
+
+Progress = Callable[[list[list[Take]]], Iterable[list[Take]]]
 
 
 class Mode(NamedTuple):
@@ -36,32 +42,55 @@ class Mode(NamedTuple):
         return f"online, stream ({self.future} future)" if self.future else "online, step by step"
 
 
-def run_archive(module: torch.jit.ScriptModule, take: Take, mode: Mode) -> Array:
-    """Local poses (T, 24, 3, 3) of a take; every frame gets one, as in a run."""
-    orientation, acceleration = torch.from_numpy(take.orientation), torch.from_numpy(take.acceleration)
+def run_archive(module: torch.jit.ScriptModule, takes: list[Take], mode: Mode) -> list[Array]:
+    """Local poses (T, 24, 3, 3) of each take; every frame gets one, as in a run."""
     with torch.inference_mode():
-        if mode.name == "offline":
-            return module(orientation[None], acceleration[None])[0][0].double().numpy()
         if mode.name == "stream":
-            return _stream(module, orientation, acceleration, mode.future)
-        return _window(module, orientation, acceleration, mode)
+            return _stream(module, takes, mode.future)
+        run = _offline if mode.name == "offline" else _window
+        pairs = [(torch.from_numpy(take.orientation), torch.from_numpy(take.acceleration)) for take in takes]
+        return [run(module, *pair, mode).double().numpy() for pair in pairs]
 
 
-def _stream(
-    module: torch.jit.ScriptModule, orientation: torch.Tensor, acceleration: torch.Tensor, future: int
-) -> Array:
-    state = module.start(1, future)
-    parts = []
-    for o, a in zip(orientation, acceleration, strict=True):
-        rotations, _, state = module.stream(o[None], a[None], state)
-        parts.append(rotations[0])
-    parts.append(module.drain(state)[0][0])
-    return torch.cat(parts).double().numpy()
+def _offline(
+    module: torch.jit.ScriptModule, orientation: torch.Tensor, acceleration: torch.Tensor, mode: Mode
+) -> torch.Tensor:
+    poses: torch.Tensor = module(orientation[None], acceleration[None])[0][0]
+    return poses
+
+
+def _stream(module: torch.jit.ScriptModule, takes: list[Take], future: int) -> list[Array]:
+    """Frame by frame, all takes side by side as if each were a wearer, the longest first."""
+    order = sorted(range(len(takes)), key=lambda i: -len(takes[i].pose))
+    lengths = [len(takes[i].pose) for i in order]
+    poses: list[list[torch.Tensor]] = [[] for _ in order]
+    state, active = module.start(len(order), future), len(order)
+    for t in range(lengths[0] + 1):
+        while active and lengths[active - 1] == t:
+            active -= 1
+            poses[active].extend(module.drain(_wearers(state, slice(active, active + 1)))[0][0])
+            state = _wearers(state, slice(0, active))
+        if active:
+            frames = [takes[i] for i in order[:active]]
+            orientation = torch.from_numpy(np.stack([take.orientation[t] for take in frames]))
+            acceleration = torch.from_numpy(np.stack([take.acceleration[t] for take in frames]))
+            rotations, _, state = module.stream(orientation, acceleration, state)
+            for k, new in enumerate(rotations):
+                poses[k].extend(new)
+    result: list[Array] = [np.empty(0)] * len(takes)
+    for i, rotations in zip(order, poses, strict=True):
+        result[i] = torch.stack(rotations).double().numpy()
+    return result
+
+
+def _wearers(state: list[torch.Tensor], rows: slice) -> list[torch.Tensor]:
+    """The state of some wearers; a bidirectional state's last tensor is common to all."""
+    return [s if k == 7 else s[rows] for k, s in enumerate(state)]
 
 
 def _window(
     module: torch.jit.ScriptModule, orientation: torch.Tensor, acceleration: torch.Tensor, mode: Mode
-) -> Array:
+) -> torch.Tensor:
     """Many windows of equal length at once; each is the window that a run computes for that frame."""
     frames, result = len(orientation), torch.empty(len(orientation), 24, 3, 3)
     length = mode.past + 1 + mode.future
@@ -72,41 +101,38 @@ def _window(
     for t in [*range(min(mode.past, frames)), *range(max(mode.past, frames - mode.future), frames)]:
         low, high = max(0, t - mode.past), min(frames, t + mode.future + 1)
         result[t] = module.window(orientation[None, low:high], acceleration[None, low:high], t - low)[0][0]
-    return result.double().numpy()
+    return result
 
 
 Table = dict[str, dict[str, Measure]]
 """Row name to measures."""
 
 
-def evaluate(takes: Iterable[Take], methods: dict[str, Callable[[Take], Array]]) -> Table:
+Method = Callable[[list[Take]], list[Array]]
+"""Poses (T, 24, 3, 3) of some takes."""
+
+
+def evaluate(takes: list[Take], methods: dict[str, Method], progress: Progress = iter) -> Table:
     """Measures of several methods over all frames of some takes, on the default body."""
     offsets = default_body().offsets
     values: dict[str, dict[str, list[Array]]] = {}
-    for take in takes:
+    for group in progress([takes[i : i + GROUP] for i in range(0, len(takes), GROUP)]):
         for name, method in methods.items():
-            errors = per_frame(method(take), take.pose.astype(float), offsets, RATE)
-            for key, column in errors.items():
-                values.setdefault(name, {}).setdefault(key, []).append(column)
+            for take, poses in zip(group, method(group), strict=True):
+                for key, column in per_frame(poses, take.pose.astype(float), offsets, RATE).items():
+                    values.setdefault(name, {}).setdefault(key, []).append(column)
     return {
         name: {key: measure(np.concatenate(v)) for key, v in rows.items()} for name, rows in values.items()
     }
 
 
-def baseline_methods(learnt: baselines.Baselines) -> dict[str, Callable[[Take], Array]]:
+def baseline_methods(learnt: baselines.Baselines) -> dict[str, Method]:
     """The trivial baselines as methods for `evaluate`."""
 
-    def method(name: str) -> Callable[[Take], Array]:
-        return lambda take: baselines.poses(take, learnt)[name]
+    def method(name: str) -> Method:
+        return lambda takes: [baselines.poses(take, learnt)[name] for take in takes]
 
-    return {
-        name: method(name)
-        for name in (
-            "mean pose",
-            "measured bones, others interpolated",
-            "measured bones, others interpolated + mean offsets",
-        )
-    }
+    return {name: method(name) for name in baselines.NAMES}
 
 
 def modes_of(metadata: dict[str, Any]) -> list[Mode]:
@@ -123,15 +149,15 @@ def held_out_tables(
     data: Path,
     with_baselines: bool,
     parts: Iterable[str] = HELD_OUT,
-    progress: Callable[[list[Take]], Iterable[Take]] = iter,
+    progress: Progress = iter,
 ) -> dict[str, Table]:
     """Tables of an archive, and of baselines learnt from the training takes, on parts of a folder.
 
     A part is one of HELD_OUT, or "all" for every take there is.
     """
-    methods: dict[str, Callable[[Take], Array]] = {
-        str(mode): lambda take, mode=mode: run_archive(module, take, mode) for mode in modes
+    methods: dict[str, Method] = {
+        str(mode): lambda takes, mode=mode: run_archive(module, takes, mode) for mode in modes
     }
     if with_baselines:
         methods |= baseline_methods(baselines.learn(read_takes(data, "train")))
-    return {part: evaluate(progress(read_takes(data, part)), methods) for part in parts}
+    return {part: evaluate(read_takes(data, part), methods, progress) for part in parts}

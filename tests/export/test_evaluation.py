@@ -48,7 +48,7 @@ def run(engine, take):
 def test_window_is_what_a_run_computes(tiny, wearers, past, future, frames):
     module, take = tiny(BIRNN), made_up(wearers, frames)
     expected = run(WindowEngine(module, past, future), take)
-    got = run_archive(module, take, Mode("window", past, future))
+    got = run_archive(module, [take], Mode("window", past, future))[0]
     assert got.shape == (frames, 24, 3, 3)
     np.testing.assert_allclose(got, expected, atol=3e-5)
 
@@ -57,14 +57,23 @@ def test_window_is_what_a_run_computes(tiny, wearers, past, future, frames):
 def test_stream_is_what_a_run_computes(tiny, wearers, shape, future, frames):
     module, take = tiny(shape), made_up(wearers, frames)
     expected = run(StreamEngine(module, 0, future), take)
-    np.testing.assert_allclose(run_archive(module, take, Mode("stream", 0, future)), expected, atol=3e-5)
+    got = run_archive(module, [take], Mode("stream", 0, future))[0]
+    np.testing.assert_allclose(got, expected, atol=3e-5)
+
+
+@pytest.mark.parametrize(("shape", "future"), [(BIRNN, 3), (RNN, 0)])
+def test_takes_side_by_side_are_as_each_alone(tiny, wearers, shape, future):
+    module, mode = tiny(shape), Mode("stream", 0, future)
+    takes = [made_up(wearers, frames, seed) for seed, frames in enumerate((12, 2, 30, 30, 1))]
+    for got, take in zip(run_archive(module, takes, mode), takes, strict=True):
+        np.testing.assert_allclose(got, run_archive(module, [take], mode)[0], atol=3e-5)
 
 
 def test_offline_is_the_whole_take(tiny, walk):
     module = tiny(BIRNN)
     with torch.no_grad():
         expected = module(torch.tensor(walk.orientation)[None], torch.tensor(walk.acceleration)[None])[0][0]
-    np.testing.assert_allclose(run_archive(module, walk, Mode("offline")), expected, atol=1e-6)
+    np.testing.assert_allclose(run_archive(module, [walk], Mode("offline"))[0], expected, atol=1e-6)
 
 
 def test_modes():
@@ -78,7 +87,7 @@ def test_modes():
 def test_measures_are_over_all_frames_of_all_takes(wearers):
     takes = [made_up(wearers, frames, seed) for frames, seed in ((20, 1), (9, 2))]
     guess = made_up(wearers, 20, 3).pose.astype(float)
-    table = evaluation.evaluate(takes, {"a guess": lambda take: guess[: len(take.pose)]})
+    table = evaluation.evaluate(takes, {"a guess": lambda takes: [guess[: len(take.pose)] for take in takes]})
     offsets = default_body().offsets
     parts = [metrics.per_frame(guess[: len(t.pose)], t.pose.astype(float), offsets, 60.0) for t in takes]
     assert set(table) == {"a guess"}
