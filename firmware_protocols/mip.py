@@ -1,0 +1,261 @@
+"""MicroStrain MIP (3DM-GX, CV and CX series): packets of the sensor (0x80) and filter (0x82) data sets.
+
+Layouts are in docs/mip.md. Numbers are big-endian.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterable, Iterator
+from itertools import accumulate
+from math import isfinite
+
+from firmware_protocols._stream import StreamDecoder, finite, from_euler, matrix_quaternion, to_euler
+from firmware_protocols.sample import GRAVITY, Sample, unit_quaternion, z_up
+
+SENSOR_SET = 0x80
+"""Descriptor set of the IMU and its own attitude."""
+
+FILTER_SET = 0x82
+"""Descriptor set of the estimation filter."""
+
+_GAUSS_UT = 100.0
+_WEEK_US = 604_800_000_000
+
+_VECTOR = struct.Struct(">3f")
+_QUATERNION = struct.Struct(">4f")
+_MATRIX = struct.Struct(">9f")
+_VECTOR_VALID = struct.Struct(">3fH")
+_QUATERNION_VALID = struct.Struct(">4fH")
+_MATRIX_VALID = struct.Struct(">9fH")
+_NANOSECONDS = struct.Struct(">Q")
+_GPS_TIME = struct.Struct(">dHH")
+
+# What a field holds and how, by descriptor set << 8 | field descriptor.
+_FIELDS = {
+    0x8004: ("acc g", _VECTOR),
+    0x8005: ("gyr", _VECTOR),
+    0x8006: ("mag", _VECTOR),
+    0x8009: ("matrix", _MATRIX),
+    0x800A: ("quat", _QUATERNION),
+    0x800C: ("euler", _VECTOR),
+    0x8012: ("gps time", _GPS_TIME),
+    0x8014: ("temperature", _VECTOR),
+    0x80D5: ("time", _NANOSECONDS),
+    0x80D6: ("period", _NANOSECONDS),
+    0x8203: ("quat", _QUATERNION_VALID),
+    0x8204: ("matrix", _MATRIX_VALID),
+    0x8205: ("euler", _VECTOR_VALID),
+    0x820E: ("gyr", _VECTOR_VALID),
+    0x8211: ("gps time", _GPS_TIME),
+    0x821C: ("acc", _VECTOR_VALID),
+    0x8227: ("mag", _VECTOR_VALID),
+    0x82D5: ("time", _NANOSECONDS),
+    0x82D6: ("period", _NANOSECONDS),
+}
+
+
+def checksum(data: bytes) -> bytes:
+    """Fletcher checksum of 8 bit sums, as at the end of every packet."""
+    sums = list(accumulate(data))
+    return bytes([sums[-1] & 0xFF, sum(sums) & 0xFF]) if sums else b"\0\0"
+
+
+def fields(packet: bytes) -> Iterator[tuple[int, bytes]]:
+    """Field descriptors and data of a whole packet.
+
+    Raises:
+        ValueError: the fields do not fill the payload.
+    """
+    at, end = 4, len(packet) - 2
+    while at < end:
+        size = packet[at]
+        if size < 2 or at + size > end:
+            raise ValueError("fields do not fill the payload")
+        yield packet[at + 1], packet[at + 2 : at + size]
+        at += size
+
+
+class MipDecoder(StreamDecoder):
+    """Measurements out of the MIP stream of one device.
+
+    A packet with at least one quantity is a sample. The device's attitude turns its frame into north, east,
+    down; samples have it with Z up.
+    """
+
+    # Nanoseconds in 64 bits; nothing runs that long.
+    WRAP_US = (1 << 64) // 1000
+
+    _START = re.compile(rb"u(?:e|\Z)")
+
+    def __init__(self, sets: Iterable[int] = (SENSOR_SET, FILTER_SET)) -> None:
+        """Start with nothing seen.
+
+        Args:
+            sets: descriptor sets to read. A device may send an attitude in both, from two filters that need
+                not agree: then choose one.
+
+        Raises:
+            ValueError: unknown set.
+        """
+        super().__init__()
+        self._sets = frozenset(sets)
+        if not self._sets <= {SENSOR_SET, FILTER_SET}:
+            raise ValueError("sets must be out of 0x80 and 0x82")
+        self._last_ns: dict[int, int] = {}
+
+    def _length(self, buffer: bytes, at: int) -> int:
+        return buffer[at + 3] + 6 if at + 3 < len(buffer) else 0
+
+    def _possible(self, buffer: bytes, at: int, length: int) -> bool:
+        # The fields of a false packet end in the wrong place long before the packet does.
+        place, end = at + 4, at + length - 2
+        while length and place < len(buffer) and place < end:
+            if buffer[place] < 2:
+                return False
+            place += buffer[place]
+        return not length or place <= end
+
+    def _intact(self, buffer: bytes, at: int, length: int) -> bool | None:
+        place, end = at + 4, at + length - 2
+        while place < end:
+            if buffer[place] < 2:
+                return None
+            place += buffer[place]
+        return checksum(buffer[at:end]) == buffer[end : end + 2] if place == end else None
+
+    def _message(self, frame: bytes, samples: list[Sample]) -> None:
+        descriptor = frame[2]
+        if descriptor not in self._sets:
+            self.counters.skipped += 1
+            return
+        time_ns = period_ns = gps_us = temperature = quat = matrix = euler = acc = gyr = mag = None
+        place, end = 4, len(frame) - 2
+        while place < end:
+            start = place + 2
+            name, layout = _FIELDS.get(descriptor << 8 | frame[place + 1], ("", None))
+            place += frame[place]
+            if layout is None:
+                continue
+            if layout.size != place - start:
+                self.counters.bad += 1
+                return
+            values = layout.unpack_from(frame, start)
+            if descriptor == FILTER_SET and layout in _WITH_FLAGS:
+                if not values[-1]:  # the filter has no estimate yet
+                    continue
+                values = values[:-1]
+            if name == "acc g":
+                acc = finite(values, GRAVITY)
+            elif name == "acc":
+                acc = finite(values)
+            elif name == "gyr":
+                gyr = finite(values)
+            elif name == "mag":
+                mag = finite(values, _GAUSS_UT)
+            elif name == "quat":
+                quat = unit_quaternion(*values)
+            elif name == "euler":
+                euler = from_euler(*values)
+            elif name == "matrix":
+                # The wire has NED -> device by rows.
+                matrix = matrix_quaternion(values[0::3] + values[1::3] + values[2::3])
+            elif name == "time":
+                time_ns = values[0]
+            elif name == "period":
+                period_ns = values[0]
+            elif name == "gps time":
+                # Wrong before the receiver has time, but it runs on.
+                if 0 <= values[0] <= 1e6:
+                    gps_us = values[1] * _WEEK_US + round(values[0] * 1e6)
+            elif isfinite(values[2]):
+                temperature = values[2]  # least, largest and mean
+        if time_ns is not None:
+            self._count(descriptor, time_ns, period_ns)
+        quat = quat or matrix or euler
+        self._give(
+            Sample(
+                0,
+                gps_us if time_ns is None else time_ns // 1000,
+                None if quat is None else z_up(quat),
+                acc,
+                gyr,
+                mag,
+                temperature,
+            ),
+            samples,
+        )
+
+    def _count(self, descriptor: int, time_ns: int, period_ns: int | None) -> None:
+        # There is no counter, but a packet says how long ago the device sent the one before.
+        pause = time_ns - self._last_ns.get(descriptor, time_ns)
+        self._last_ns[descriptor] = time_ns
+        if pause < 0:
+            self.counters.restarts += 1
+        elif period_ns and pause > 1.5 * period_ns:
+            self.counters.lost += round(pause / period_ns) - 1
+
+
+_WITH_FLAGS = (_VECTOR_VALID, _QUATERNION_VALID, _MATRIX_VALID)
+
+
+def encode_packet(descriptor: int, parts: Iterable[tuple[int, bytes]]) -> bytes:
+    """The bytes of a packet of fields, given as field descriptor and data.
+
+    Raises:
+        ValueError: the fields are longer than 255 bytes.
+    """
+    payload = b"".join(bytes([len(data) + 2, field]) + data for field, data in parts)
+    if len(payload) > 255:
+        raise ValueError(f"payload of {len(payload)} bytes, at most 255 are allowed")
+    head = b"ue" + bytes([descriptor, len(payload)]) + payload
+    return head + checksum(head)
+
+
+def encode(
+    sample: Sample,
+    *,
+    descriptor: int = SENSOR_SET,
+    period_us: int | None = None,
+    euler: bool = False,
+) -> bytes:
+    """The bytes that go over the line for a sample.
+
+    Args:
+        sample: its sensor cannot be sent; a temperature only in the sensor set.
+        descriptor: SENSOR_SET or FILTER_SET.
+        period_us: time since the packet before, which shows losses; None leaves it out.
+        euler: send angles instead of a quaternion.
+
+    Raises:
+        ValueError: unknown set, or a number that does not fit.
+    """
+    if descriptor not in (SENSOR_SET, FILTER_SET):
+        raise ValueError(f"descriptor must be 0x80 or 0x82, not 0x{descriptor:X}")
+    filtered = descriptor == FILTER_SET
+    valid = b"\0\1" if filtered else b""
+    ned = None if sample.quat is None else z_up(sample.quat)
+    parts: list[tuple[int, bytes]] = []
+    try:
+        if sample.time_us is not None:
+            parts.append((0xD5, _NANOSECONDS.pack(sample.time_us * 1000)))
+            if period_us is not None:
+                parts.append((0xD6, _NANOSECONDS.pack(period_us * 1000)))
+        if sample.acc is not None:
+            scale = 1.0 if filtered else 1 / GRAVITY
+            parts.append((0x1C if filtered else 0x04, _VECTOR.pack(*(a * scale for a in sample.acc)) + valid))
+        if sample.gyr is not None:
+            parts.append((0x0E if filtered else 0x05, _VECTOR.pack(*sample.gyr) + valid))
+        if sample.mag is not None:
+            field = _VECTOR.pack(*(m / _GAUSS_UT for m in sample.mag))
+            parts.append((0x27 if filtered else 0x06, field + valid))
+        if ned is not None and euler:
+            parts.append((0x05 if filtered else 0x0C, _VECTOR.pack(*to_euler(ned)) + valid))
+        elif ned is not None:
+            parts.append((0x03 if filtered else 0x0A, _QUATERNION.pack(*ned) + valid))
+        if sample.temperature is not None and not filtered:
+            parts.append((0x14, _VECTOR.pack(*[sample.temperature] * 3)))
+    except (struct.error, OverflowError) as error:
+        raise ValueError(f"cannot send {sample}: {error}") from None
+    return encode_packet(descriptor, parts)

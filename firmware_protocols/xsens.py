@@ -1,0 +1,559 @@
+"""Xsens / Movella: Xbus frames with MTData2 on a serial line, and the CAN messages of the MTi-600 series.
+
+Layouts are in docs/xsens.md. Numbers are big-endian.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Callable, Iterator, Mapping
+from math import degrees, floor, radians
+from typing import Any
+
+from firmware_protocols._stream import (
+    Sequence,
+    StreamDecoder,
+    finite,
+    from_euler,
+    matrix_quaternion,
+    to_euler,
+)
+from firmware_protocols.rotation import rotate
+from firmware_protocols.sample import Counters, Quaternion, Sample, unit_quaternion, z_up
+
+MTDATA2 = 0x36
+"""Message id of measurements."""
+
+MAX_PAYLOAD = 2048
+"""Longest payload of a frame, bytes."""
+
+NUMBER_FORMATS = ("f32", "fp12.20", "fp16.32", "f64")
+"""Formats of real numbers; the index is the code in the lowest two bits of an item's id."""
+
+FRAMES = ("ENU", "NED", "NWU")
+"""Local frames of orientations; the index is the code in the next two bits."""
+
+_TICK_US = 100  # of SampleTimeFine
+_BROADCAST = 0xFF  # bus id of a device that is alone on its line
+_MAX_BUS_ID = 0x20
+
+_REALS = {
+    0x0810: 1,  # temperature
+    0x2010: 4,  # quaternion w, x, y, z
+    0x2020: 9,  # rotation matrix, by columns
+    0x2030: 3,  # roll, pitch, yaw
+    0x4010: 3,  # velocity increment
+    0x4020: 3,  # acceleration
+    0x4030: 3,  # free acceleration
+    0x4040: 3,  # acceleration, high rate
+    0x5010: 1,  # altitude above mean sea level
+    0x5020: 1,  # altitude above the ellipsoid
+    0x5030: 3,  # ECEF position
+    0x5040: 2,  # latitude, longitude
+    0x8020: 3,  # rate of turn
+    0x8030: 4,  # orientation increment
+    0x8040: 3,  # rate of turn, high rate
+    0xC020: 3,  # magnetic field
+    0xD010: 3,  # velocity
+}
+_INTEGERS = {
+    0x1010: ">IH6B",  # UTC: ns, year, month, day, hour, minute, second, flags
+    0x1020: ">H",  # packet counter
+    0x1030: ">I",  # GPS time of week, ms
+    0x1040: ">B",
+    0x1050: ">B",
+    0x1060: ">I",  # SampleTimeFine
+    0x1070: ">I",  # SampleTimeCoarse
+    0x1080: ">HH",
+    0x1090: ">B",
+    0x10A0: ">Q",
+    0x3010: ">I",  # pressure, Pa
+    0xE010: ">B",  # status byte
+    0xE020: ">I",  # status word
+    0xE080: ">I",  # device id
+    0xE090: ">H",  # location id
+}
+
+Values = tuple[Any, ...]
+_Reader = Callable[[bytes], Values]
+
+
+def _reader(count: int, number_format: int) -> tuple[int, _Reader]:
+    if number_format == 0:
+        layout = struct.Struct(f">{count}f")
+    elif number_format == 1:
+        layout = struct.Struct(f">{count}i")
+        return layout.size, lambda data: tuple(value / 1048576.0 for value in layout.unpack(data))
+    elif number_format == 2:
+        layout = struct.Struct(">" + "Ih" * count)
+
+        def read(data: bytes) -> Values:
+            raw = layout.unpack(data)
+            return tuple(raw[i + 1] + raw[i] / 4294967296.0 for i in range(0, 2 * count, 2))
+
+        return layout.size, read
+    else:
+        layout = struct.Struct(f">{count}d")
+    return layout.size, layout.unpack
+
+
+def _readers() -> dict[int, tuple[int, _Reader]]:
+    result: dict[int, tuple[int, _Reader]] = {}
+    for kind, count in _REALS.items():
+        for low in range(12):
+            result[kind | low] = _reader(count, low & 3)
+    for kind, layout in _INTEGERS.items():
+        reader = struct.Struct(layout)
+        for low in range(16):
+            # Whole numbers take no notice of the format bits.
+            result[kind | low] = (reader.size, reader.unpack)
+    return result
+
+
+_READERS = _readers()
+_NEEDED = {0x0810, 0x1020, 0x1060, 0x2010, 0x2020, 0x2030, 0x4020, 0x4040, 0x8020, 0x8040, 0xC020}
+_SAMPLE_READERS = {item: reader for item, reader in _READERS.items() if item & 0xFFF0 in _NEEDED}
+
+
+def mtdata2_items(payload: bytes) -> Iterator[tuple[int, Values | bytes]]:
+    """All items of an MTData2 payload: id as sent, values; plain bytes where the layout is not known.
+
+    Raises:
+        ValueError: the items do not fill the payload.
+    """
+    at, end = 0, len(payload)
+    while at < end:
+        if at + 3 > end or at + 3 + payload[at + 2] > end:
+            raise ValueError("items do not fill the payload")
+        item = payload[at] << 8 | payload[at + 1]
+        data = payload[at + 3 : at + 3 + payload[at + 2]]
+        at += 3 + len(data)
+        size, read = _READERS.get(item, (-1, None))
+        yield item, read(data) if read is not None and size == len(data) else data
+
+
+# --- the serial line ------------------------------------------------------------------------------
+
+
+class XbusDecoder(StreamDecoder):
+    """Measurements out of the Xbus stream of one device, or of a master with several sensors.
+
+    The sensor of a sample is the bus id behind a master, 0 for a device that is alone.
+    """
+
+    WRAP_US = (1 << 32) * _TICK_US
+
+    _START = re.compile(b"\xfa")
+
+    def __init__(self) -> None:
+        """Start with nothing seen."""
+        super().__init__()
+        self._sequence = Sequence(self.counters, self.WRAP_US)
+
+    def _length(self, buffer: bytes, at: int) -> int:
+        head = buffer[at : at + 6]
+        if len(head) > 1 and head[1] != _BROADCAST and head[1] > _MAX_BUS_ID:
+            return -1
+        if len(head) < 4:
+            return 0
+        if head[3] != 0xFF:
+            return head[3] + 5
+        if head[2] != MTDATA2:  # nothing else is that long
+            return -1
+        if len(head) < 6:
+            return 0
+        length = head[4] << 8 | head[5]
+        return length + 7 if length <= MAX_PAYLOAD else -1
+
+    def _possible(self, buffer: bytes, at: int, length: int) -> bool:
+        # The items of a false frame end in the wrong place long before the frame does.
+        if not length or buffer[at + 2] != MTDATA2:
+            return True
+        end = at + length - 1
+        place = at + (6 if buffer[at + 3] == 0xFF else 4)
+        while place + 2 < len(buffer) and place < end:
+            place += 3 + buffer[place + 2]
+        return place <= end
+
+    def _intact(self, buffer: bytes, at: int, length: int) -> bool | None:
+        if buffer[at + 2] == MTDATA2:
+            end = at + length - 1
+            place = at + (6 if buffer[at + 3] == 0xFF else 4)
+            while place + 2 < end:
+                place += 3 + buffer[place + 2]
+            if place != end:
+                return None
+        return not sum(buffer[at + 1 : at + length]) & 0xFF
+
+    def _message(self, frame: bytes, samples: list[Sample]) -> None:
+        if frame[2] != MTDATA2:
+            self.counters.skipped += 1
+            return
+        count = time_us = temperature = quat = euler = matrix = acc = gyr = mag = None
+        place = 6 if frame[3] == 0xFF else 4
+        end = len(frame) - 1
+        while place < end:
+            item = frame[place] << 8 | frame[place + 1]
+            start = place + 3
+            place = start + frame[place + 2]
+            size, read = _SAMPLE_READERS.get(item, (-1, None))
+            if read is None:
+                continue
+            if size != place - start:
+                self.counters.bad += 1
+                return
+            values = read(frame[start:place])
+            kind = item & 0xFFF0
+            if kind == 0x1020:
+                count = values[0]
+            elif kind == 0x1060:
+                time_us = values[0] * _TICK_US
+            elif kind == 0x2010:
+                quat = _z_up(unit_quaternion(*values), item)
+            elif kind == 0x2020:
+                # The wire has columns.
+                matrix = _z_up(matrix_quaternion(values[0::3] + values[1::3] + values[2::3]), item)
+            elif kind == 0x2030:
+                euler = _z_up(from_euler(*map(radians, values)), item)
+            elif kind == 0x4020 or (kind == 0x4040 and acc is None):
+                acc = finite(values)
+            elif kind == 0x8020 or (kind == 0x8040 and gyr is None):
+                gyr = finite(values)
+            elif kind == 0xC020:
+                mag = finite(values)
+            elif kind == 0x0810 and values[0] - values[0] == 0:  # neither NaN nor infinite
+                temperature = values[0]
+        sensor = 0 if frame[1] == _BROADCAST else frame[1]
+        if count is not None and not self._sequence.is_new(sensor, count, time_us):
+            return
+        self._give(Sample(sensor, time_us, quat or matrix or euler, acc, gyr, mag, temperature), samples)
+
+
+def _z_up(quat: Quaternion | None, item: int) -> Quaternion | None:
+    # ENU and NWU have Z up already.
+    return z_up(quat) if quat is not None and item & 0xC == 4 else quat
+
+
+def encode_xbus(message_id: int, payload: bytes = b"", bus_id: int = _BROADCAST) -> bytes:
+    """The bytes that go over the line for an Xbus message.
+
+    Raises:
+        ValueError: the payload is longer than 2048 bytes, or an id does not fit a byte.
+    """
+    if len(payload) > MAX_PAYLOAD:
+        raise ValueError(f"payload of {len(payload)} bytes, at most {MAX_PAYLOAD} are allowed")
+    length = bytes([len(payload)]) if len(payload) < 0xFF else b"\xff" + len(payload).to_bytes(2, "big")
+    body = bytes([bus_id, message_id]) + length + payload
+    return b"\xfa" + body + bytes([-sum(body) & 0xFF])
+
+
+def encode_mtdata2(
+    sample: Sample,
+    counter: int | None,
+    *,
+    number_format: str = "f32",
+    frame: str = "ENU",
+    orientation: str = "quaternion",
+) -> bytes:
+    """The bytes that go over the line for a sample.
+
+    Args:
+        sample: sensor 0 is sent as a device that is alone, others with their bus id.
+        counter: packet counter, wraps at 65536; None sends none.
+        number_format: one of NUMBER_FORMATS; reals have to fit into the fixed-point ones.
+        frame: local frame of the orientation on the wire, one of FRAMES. With "NWU" the sample's own frame is
+            taken as NWU.
+        orientation: "quaternion", "matrix" or "euler".
+
+    Raises:
+        ValueError: unknown options, or a number that does not fit.
+    """
+    if number_format not in NUMBER_FORMATS or frame not in FRAMES:
+        raise ValueError(f"no number format {number_format!r} or no frame {frame!r}")
+    low = NUMBER_FORMATS.index(number_format)
+    if not 0 <= sample.sensor <= _MAX_BUS_ID:
+        raise ValueError(f"sensor must be from 0 to {_MAX_BUS_ID}, not {sample.sensor}")
+    payload = b""
+    if sample.temperature is not None:
+        payload += _item(0x0810 | low, (sample.temperature,))
+    if counter is not None:
+        payload += b"\x10\x20\x02" + (counter & 0xFFFF).to_bytes(2, "big")
+    if sample.time_us is not None:
+        payload += b"\x10\x60\x04" + (sample.time_us // _TICK_US & 0xFFFFFFFF).to_bytes(4, "big")
+    if sample.quat is not None:
+        code = low | FRAMES.index(frame) << 2
+        quat = z_up(sample.quat) if frame == "NED" else sample.quat
+        if orientation == "quaternion":
+            payload += _item(0x2010 | code, quat)
+        elif orientation == "matrix":
+            columns = [rotate(quat, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]
+            payload += _item(0x2020 | code, columns[0] + columns[1] + columns[2])
+        elif orientation == "euler":
+            payload += _item(0x2030 | code, tuple(map(degrees, to_euler(quat))))
+        else:
+            raise ValueError(f"no orientation {orientation!r}")
+    for kind, vector in ((0x4020, sample.acc), (0x8020, sample.gyr), (0xC020, sample.mag)):
+        if vector is not None:
+            payload += _item(kind | low, vector)
+    return encode_xbus(MTDATA2, payload, sample.sensor or _BROADCAST)
+
+
+def _item(item: int, values: tuple[float, ...]) -> bytes:
+    data = b""
+    try:
+        for value in values:
+            if item & 3 == 0:
+                data += struct.pack(">f", value)
+            elif item & 3 == 1:
+                data += struct.pack(">i", floor(value * 1048576.0 + 0.5))
+            elif item & 3 == 2:
+                raw = floor(value * 4294967296.0 + 0.5)
+                data += struct.pack(">Ih", raw & 0xFFFFFFFF, raw >> 32)
+            else:
+                data += struct.pack(">d", value)
+    except (struct.error, OverflowError, ValueError) as error:
+        raise ValueError(f"cannot send {values}: {error}") from None
+    return struct.pack(">HB", item, len(data)) + data
+
+
+# --- CAN ------------------------------------------------------------------------------------------
+
+MTI600_IDS: Mapping[str, int] = {
+    "time": 0x005,
+    "counter": 0x006,
+    "quat": 0x021,
+    "euler": 0x022,
+    "gyr": 0x032,
+    "acc": 0x034,
+    "mag": 0x041,
+    "temperature": 0x051,
+}
+"""CAN ids of an MTi-600 as delivered."""
+
+_CAN_LAYOUTS = {
+    "time": ("I", 1.0),
+    "counter": ("H", 1.0),
+    "quat": ("4h", 1 / 32767),
+    "euler": ("3h", radians(2**-7)),
+    "gyr": ("3h", 2**-9),
+    "acc": ("3h", 2**-8),
+    "mag": ("3h", 2**-10),
+    "temperature": ("h", 2**-8),
+}
+
+# A sample is complete when all of these that its predecessors had are there.
+_AWAITED = ("time", "counter", "quat", "euler", "gyr", "acc")
+_MEMORY = 8  # samples after which a message that no longer comes is no longer waited for
+
+
+class _Group:
+    """The messages of one sensor that belong together."""
+
+    def __init__(self) -> None:
+        self.items: dict[str, Any] = {}
+        self.late: dict[str, Any] = {}
+        self.given = False  # the sample is out, what comes yet is late
+        self.number = 0
+        self.seen: dict[str, int] = {}  # number of the last group that had the message
+        self.opener: tuple[str, ...] = ()
+
+    def opens(self, kind: str) -> bool:
+        """If a message is the first of the next sample."""
+        if kind in self.items:
+            return True
+        return kind in self.opener and any(other not in self.opener for other in self.items)
+
+    def learn(self, kind: str) -> None:
+        if kind not in self.seen:
+            kinds = (*self.seen, kind)
+            # Time and counter come first. Without them it is the lowest id that is sent.
+            self.opener = tuple(k for k in ("time", "counter") if k in kinds) or next(
+                ((k,) for k in _AWAITED if k in kinds), ()
+            )
+        self.seen[kind] = self.number
+
+    def complete(self) -> bool:
+        # The first groups only show which messages there are.
+        return self.number >= 2 and all(
+            kind in self.items
+            for kind, number in self.seen.items()
+            if kind in _AWAITED and self.number - number <= _MEMORY
+        )
+
+
+class Mti600CanDecoder:
+    """Samples out of the CAN messages of MTi-600 sensors on one bus. Experimental: no capture was at hand.
+
+    The messages of a sample are put together from one sample time or group counter to the next, and given as
+    soon as all are there that the samples before had. Without time and counter, the quaternion (or the lowest
+    id that is sent) opens a sample.
+
+    Attributes:
+        counters: what has been seen so far.
+    """
+
+    WRAP_US = (1 << 32) * _TICK_US
+
+    def __init__(
+        self,
+        byte_order: str = "big",
+        time_unit_us: int = _TICK_US,
+        ids: Mapping[int, Mapping[str, int]] | None = None,
+        *,
+        extended: bool = False,
+        frame: str = "ENU",
+    ) -> None:
+        """Start with nothing seen.
+
+        Args:
+            byte_order: "big" or "little"; sources of this format do not settle it.
+            time_unit_us: one tick of the sample time, microseconds.
+            ids: the CAN ids of each sensor, named as in MTI600_IDS; None is one sensor, 0, with those.
+            extended: if all ids are 29 bit ones; ids above 0x7FF always are.
+            frame: local frame of the orientations, one of FRAMES.
+
+        Raises:
+            ValueError: unknown options, or two messages with one id.
+        """
+        if byte_order not in ("big", "little") or frame not in FRAMES:
+            raise ValueError(f"no byte order {byte_order!r} or no frame {frame!r}")
+        sign = ">" if byte_order == "big" else "<"
+        layouts = {kind: (struct.Struct(sign + f), scale) for kind, (f, scale) in _CAN_LAYOUTS.items()}
+        self.counters = Counters()
+        self.WRAP_US = (1 << 32) * time_unit_us
+        self._tick_us = time_unit_us
+        self._ned = frame == "NED"
+        self._sequence = Sequence(self.counters, self.WRAP_US)
+        self._in_sync = True
+        self._groups: dict[int, _Group] = {}
+        self._ids: dict[tuple[int, bool], tuple[int, str, struct.Struct, float]] = {}
+        for sensor, kinds in ({0: MTI600_IDS} if ids is None else ids).items():
+            self._groups[sensor] = _Group()
+            for kind, can_id in kinds.items():
+                if kind not in layouts:
+                    raise ValueError(f"no message {kind!r}, only {', '.join(layouts)}")
+                key = (can_id, extended or can_id > 0x7FF)
+                if key in self._ids:
+                    raise ValueError(f"CAN id 0x{can_id:X} is used twice")
+                self._ids[key] = (sensor, kind, *layouts[kind])
+
+    def feed(self, can_id: int, data: bytes, extended: bool = False) -> list[Sample]:
+        """Samples completed by one CAN message; messages with other ids are left alone."""
+        entry = self._ids.get((can_id, extended))
+        if entry is None:
+            return []
+        sensor, kind, layout, scale = entry
+        self.counters.bytes += len(data)
+        value: Any = None
+        if len(data) == layout.size:
+            raw = layout.unpack(data)
+            if kind == "quat":
+                value = unit_quaternion(*[x * scale for x in raw])
+            elif kind == "euler":
+                value = from_euler(*[x * scale for x in raw])
+            elif kind == "time":
+                value = raw[0] * self._tick_us
+            elif kind == "counter":
+                value = raw[0]
+            elif kind == "temperature":
+                value = raw[0] * scale
+            else:
+                value = (raw[0] * scale, raw[1] * scale, raw[2] * scale)
+        if value is None:
+            self.counters.bad += 1
+            self._in_sync = False
+            return []
+        if not self._in_sync:
+            self._in_sync = True
+            self.counters.resyncs += 1
+        group = self._groups[sensor]
+        samples: list[Sample] = []
+        if group.opens(kind):
+            if not group.given:
+                self._give(sensor, group, samples)
+            group.items = {}
+            group.given = False
+            group.number += 1
+        group.learn(kind)
+        if group.given:
+            # Too late for its sample. The successors wait for it, or a slow quantity goes with the next one.
+            if kind not in _AWAITED:
+                group.late[kind] = value
+            return samples
+        group.items[kind] = value
+        if group.complete():
+            self._give(sensor, group, samples)
+            group.given = True
+        return samples
+
+    def _give(self, sensor: int, group: _Group, samples: list[Sample]) -> None:
+        items = group.late | group.items
+        group.late = {}
+        quat = items.get("quat") or items.get("euler")
+        if quat is not None and self._ned:
+            quat = z_up(quat)
+        time_us, count = items.get("time"), items.get("counter")
+        if count is not None and not self._sequence.is_new(sensor, count, time_us):
+            return
+        sample = Sample(
+            sensor, time_us, quat, *(items.get(kind) for kind in ("acc", "gyr", "mag", "temperature"))
+        )
+        if sample[2:] == (None,) * 5:
+            self.counters.skipped += 1
+        else:
+            self.counters.packets += 1
+            samples.append(sample)
+
+
+def encode_mti600(
+    sample: Sample,
+    counter: int | None,
+    *,
+    byte_order: str = "big",
+    time_unit_us: int = _TICK_US,
+    ids: Mapping[str, int] = MTI600_IDS,
+    euler: bool = False,
+    frame: str = "ENU",
+) -> list[tuple[int, bytes]]:
+    """CAN ids and data of the messages of a sample, in the order a device sends them.
+
+    Args:
+        sample: what is out of the range of int16 is held at its ends.
+        counter: group counter, wraps at 65536; None sends none.
+        byte_order: "big" or "little".
+        time_unit_us: one tick of the sample time, microseconds.
+        ids: the sensor's CAN ids; quantities without one are not sent.
+        euler: send angles instead of a quaternion.
+        frame: local frame of the orientation on the wire, one of FRAMES.
+
+    Raises:
+        ValueError: unknown options, NaN or infinity.
+    """
+    if byte_order not in ("big", "little") or frame not in FRAMES:
+        raise ValueError(f"no byte order {byte_order!r} or no frame {frame!r}")
+    sign = ">" if byte_order == "big" else "<"
+    quat = z_up(sample.quat) if sample.quat is not None and frame == "NED" else sample.quat
+    values: dict[str, tuple[float, ...] | None] = {
+        "time": None if sample.time_us is None else (sample.time_us // time_unit_us & 0xFFFFFFFF,),
+        "counter": None if counter is None else (counter & 0xFFFF,),
+        "quat": None if euler else quat,
+        "euler": to_euler(quat) if euler and quat is not None else None,
+        "gyr": sample.gyr,
+        "acc": sample.acc,
+        "mag": sample.mag,
+        "temperature": None if sample.temperature is None else (sample.temperature,),
+    }
+    messages = []
+    for kind, numbers in values.items():
+        if numbers is None or kind not in ids:
+            continue
+        layout, scale = _CAN_LAYOUTS[kind]
+        try:
+            raw = [floor(number / scale + 0.5) for number in numbers]
+        except (ValueError, OverflowError):
+            raise ValueError(f"cannot send {numbers}") from None
+        if kind not in ("time", "counter"):
+            raw = [max(-32768, min(32767, number)) for number in raw]
+        messages.append((ids[kind], struct.pack(sign + layout, *raw)))
+    return messages
