@@ -157,44 +157,53 @@ def _std_sources(shape: NetworkShape) -> list[int]:
 
 
 class LstmCell(nn.Module):
-    """One LSTM direction as one Linear over input and state."""
+    """One LSTM direction, written out: the products of inputs and of states apart.
+
+    Over a sequence the products of all inputs are one; only those of the states have to wait for each other.
+    """
 
     def __init__(self, lstm: nn.LSTM, suffix: str) -> None:
         """Copies one direction's weights; `suffix` is torch's: "" forwards, "_reverse" backwards."""
         super().__init__()
-        weights = [getattr(lstm, f"weight_{part}_l0{suffix}").detach() for part in ("ih", "hh")]
-        biases = [getattr(lstm, f"bias_{part}_l0{suffix}").detach() for part in ("ih", "hh")]
         self.size = lstm.hidden_size
-        self.gates = nn.Linear(weights[0].shape[1] + self.size, 4 * self.size)
-        self.gates.weight = nn.Parameter(torch.cat(weights, dim=1))
-        self.gates.bias = nn.Parameter(biases[0] + biases[1])
+        weight_ih, weight_hh, bias_ih, bias_hh = (
+            getattr(lstm, f"{name}_l0{suffix}").detach()
+            for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+        )
+        # Gates in the order input, forget, output, candidate, so that the three sigmoids are one.
+        order = torch.arange(4 * self.size).view(4, -1)[[0, 1, 3, 2]].flatten()
+        self.input = nn.Linear(weight_ih.shape[1], 4 * self.size)
+        self.state = nn.Linear(self.size, 4 * self.size, bias=False)
+        self.input.weight, self.input.bias = (
+            nn.Parameter(weight_ih[order]),
+            nn.Parameter((bias_ih + bias_hh)[order]),
+        )
+        self.state.weight = nn.Parameter(weight_hh[order])
 
     def forward(self, x: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
         """New h and c (B, hidden) from input x (B, inputs) and the old ones."""
-        i, f, g, o = self.gates(torch.cat([x, h], dim=-1)).chunk(4, dim=-1)
-        c = torch.sigmoid(f) * c + torch.sigmoid(i) * torch.tanh(g)
-        return torch.sigmoid(o) * torch.tanh(c), c
+        return self.step(self.input(x) + self.state(h), c)
+
+    def step(self, gates: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+        """New h and c from the sum of both products (B, 4 hidden)."""
+        i, f, o = torch.sigmoid(gates[:, : 3 * self.size]).chunk(3, dim=1)
+        c = torch.addcmul(f * c, i, torch.tanh(gates[:, 3 * self.size :]))
+        return o * torch.tanh(c), c
 
     @torch.jit.export
-    def run(self, x: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Outputs (B, T, hidden) over x (B, T, inputs) in order, and the last state."""
-        outputs: list[Tensor] = []
-        for frame in x.unbind(1):
-            h, c = self.forward(frame, h, c)
+    def run(self, x: Tensor, reverse: bool) -> Tensor:
+        """Outputs (B, T, hidden) over x (B, T, inputs) from a zero state, in order or from last to first."""
+        products = self.input(x).unbind(1)
+        if reverse:
+            products = products[::-1]
+        h, c = self.step(products[0], x.new_zeros(x.shape[0], self.size))
+        outputs = [h]
+        for product in products[1:]:
+            h, c = self.step(product + self.state(h), c)
             outputs.append(h)
-        return torch.stack(outputs, dim=1), h, c
-
-    @torch.jit.export
-    def run_back(self, x: Tensor) -> Tensor:
-        """Outputs (B, T, hidden) over x (B, T, inputs) from last frame to first, from a zero state."""
-        zero = x.new_zeros(x.shape[0], self.size)
-        return self.run(x.flip(1), zero, zero)[0].flip(1)
-
-    @torch.jit.export
-    def run_from_zero(self, x: Tensor) -> Tensor:
-        """Outputs (B, T, hidden) over x (B, T, inputs) in order, from a zero state."""
-        zero = x.new_zeros(x.shape[0], self.size)
-        return self.run(x, zero, zero)[0]
+        if reverse:
+            outputs = outputs[::-1]
+        return torch.stack(outputs, dim=1)
 
 
 class Ends(nn.Module):
@@ -235,8 +244,8 @@ class RnnArchive(nn.Module):
 
     def forward(self, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
         """Poses of a whole sequence."""
-        x = self.cell1.run_from_zero(self.ends(orientation, acceleration))
-        return self.ends.pose(orientation, self.cell2.run_from_zero(x))
+        x = self.cell1.run(self.ends(orientation, acceleration), False)
+        return self.ends.pose(orientation, self.cell2.run(x, False))
 
     @torch.jit.export
     def window(self, orientation: Tensor, acceleration: Tensor, index: int) -> tuple[Tensor, Tensor]:
@@ -287,8 +296,8 @@ class BirnnArchive(nn.Module):
     def forward(self, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
         """Poses of a whole sequence."""
         x = self.ends(orientation, acceleration)
-        x = torch.cat([self.forward1.run_from_zero(x), self.backward1.run_back(x)], dim=-1)
-        x = torch.cat([self.forward2.run_from_zero(x), self.backward2.run_back(x)], dim=-1)
+        x = torch.cat([self.forward1.run(x, False), self.backward1.run(x, True)], dim=-1)
+        x = torch.cat([self.forward2.run(x, False), self.backward2.run(x, True)], dim=-1)
         return self.ends.pose(orientation, x)
 
     @torch.jit.export
@@ -298,9 +307,9 @@ class BirnnArchive(nn.Module):
         The second layer runs only over the frames that reach `index`.
         """
         x = self.ends(orientation, acceleration)
-        x = torch.cat([self.forward1.run_from_zero(x), self.backward1.run_back(x)], dim=-1)
-        before = self.forward2.run_from_zero(x[:, : index + 1])[:, -1]
-        after = self.backward2.run_back(x[:, index:])[:, 0]
+        x = torch.cat([self.forward1.run(x, False), self.backward1.run(x, True)], dim=-1)
+        before = self.forward2.run(x[:, : index + 1], False)[:, -1]
+        after = self.backward2.run(x[:, index:], True)[:, 0]
         return self.ends.pose(orientation[:, index], torch.cat([before, after], dim=-1))
 
     @torch.jit.export
@@ -322,9 +331,9 @@ class BirnnArchive(nn.Module):
         Forward states are carried; backward passes start anew at the newest frame (latency-controlled
         bidirectional LSTM).
         """
-        x = torch.cat([state[5], self.backward1.run_back(state[4])], dim=-1)
+        x = torch.cat([state[5], self.backward1.run(state[4], True)], dim=-1)
         h2, c2 = self.forward2(x[:, 0], state[2], state[3])
-        after = self.backward2.run_back(x)[:, 0]
+        after = self.backward2.run(x, True)[:, 0]
         rotations, std = self.ends.pose(state[6][:, 0], torch.cat([h2, after], dim=-1))
         rest = [state[0], state[1], h2, c2, state[4][:, 1:], state[5][:, 1:], state[6][:, 1:], state[7]]
         return rotations, std, rest
