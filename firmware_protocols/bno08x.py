@@ -7,7 +7,7 @@ counted from power-up, so every sensor has its own zero.
 from __future__ import annotations
 
 import struct
-from math import asin, atan2, cos, degrees, radians, sin
+from math import cos, degrees, radians, sin
 from typing import ClassVar
 
 from firmware_protocols import rotation
@@ -150,10 +150,10 @@ def encode(sample: Sample, index: int, *, order: str = "zxy", clockwise: bool = 
     if sample.quat is None or sample.acc is None:
         raise ValueError("a frame has both orientation and specific force")
     if _checked(order) == "zxy":
+        # Turned by 90 degrees about Z: X becomes Y, Y becomes -X.
         w, x, y, z = sample.quat
-        a = atan2(2 * (w * z - x * y), w * w - x * x + y * y - z * z)
-        b = asin(min(max(2 * (w * x + y * z), -1.0), 1.0))
-        c = atan2(2 * (w * y - x * z), w * w - x * x - y * y + z * z)
+        a, b, c = rotation.to_yaw_pitch_roll((w, -y, x, z))
+        c = -c
     else:
         a, c, b = rotation.to_yaw_pitch_roll(sample.quat)
         if order == "zyx":

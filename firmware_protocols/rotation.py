@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import asin, atan2, cos, sin, sqrt
+from math import atan2, cos, hypot, pi, remainder, sin, sqrt, tau
 
 from firmware_protocols.sample import Quaternion, Vector3
 
@@ -21,12 +21,14 @@ def from_yaw_pitch_roll(yaw: float, pitch: float, roll: float) -> Quaternion:
 
 
 def to_yaw_pitch_roll(quat: Quaternion) -> Vector3:
-    """Inverse of `from_yaw_pitch_roll`: pitch from -pi/2 to pi/2."""
+    """Inverse of `from_yaw_pitch_roll`: pitch from -pi/2 to pi/2, the others from -pi to pi."""
     w, x, y, z = quat
+    # Half the sum and half the difference of yaw and roll. Upright one of the two is any angle, and cancels.
+    half_sum, half_difference = atan2(z + x, w - y), atan2(z - x, w + y)
     return (
-        atan2(2 * (x * y + w * z), w * w + x * x - y * y - z * z),
-        asin(min(max(2 * (w * y - x * z), -1.0), 1.0)),
-        atan2(2 * (y * z + w * x), w * w - x * x - y * y + z * z),
+        remainder(half_sum + half_difference, tau),
+        pi / 2 - 2 * atan2(hypot(w - y, z + x), hypot(w + y, z - x)),
+        remainder(half_sum - half_difference, tau),
     )
 
 
