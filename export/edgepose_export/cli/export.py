@@ -60,17 +60,25 @@ def export(checkpoint: Path, out: Path, past: int, future: int, data: Path | Non
     if config.network.kind == "rnn":
         past, future = 0, 0
     metadata = archive.describe(out.stem, network, state, past, future)
-    if data:
-        metadata["measures"] = _measure(module, metadata, data)
     archive.save(module, out, metadata)
+    if data:
+        metadata["measures"] = _measure(out, data)
+        archive.save(module, out, metadata)
     out.with_suffix(".md").write_text(card(metadata), encoding="utf-8")
     click.echo(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB) and {out.with_suffix('.md')}", err=True)
 
 
-def _measure(module: Any, metadata: dict[str, Any], data: Path) -> dict[str, Any]:
+def _measure(path: Path, data: Path) -> dict[str, Any]:
+    """Measures of the archive as a run loads it, with one thread."""
+    from edgepose.archive import inspect, load
+    from edgepose_export.cli.progress import labelled
     from edgepose_export.evaluation import held_out_tables, modes_of
 
-    tables = held_out_tables(module, modes_of(metadata), data, with_baselines=True)
+    info = inspect(path)
+    module = load(info, trust=True)
+    tables = held_out_tables(
+        module, modes_of(info.metadata), data, with_baselines=True, progress=labelled("measuring")
+    )
     return {
         part: {row: {key: list(m) for key, m in columns.items()} for row, columns in table.items()}
         for part, table in tables.items()
