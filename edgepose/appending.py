@@ -8,6 +8,9 @@ import os
 import select
 import stat
 import sys
+import threading
+from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,25 +20,22 @@ FLUSH_S = 1.0
 """A killed program loses at most what came in this time, seconds."""
 
 
-def open_output(path: str, what: str, *, replace: bool = True) -> Any:
-    """A new file without a buffer; "-" is standard output.
+def open_output(path: str, what: str) -> Any:
+    """A new file without a buffer, in the place of one that is there already; "-" is standard output.
 
     Args:
         path: of the file.
         what: what goes into it, for the message.
-        replace: whether a file that is there already is replaced.
 
     Raises:
-        EdgeposeError: it cannot be written, or is there already.
+        EdgeposeError: it cannot be written.
     """
     if path == "-":
         # Below Python's buffers: what they still held would fail at exit without a reader.
         sys.stdout.flush()
         return getattr(sys.stdout.buffer, "raw", sys.stdout.buffer)
     try:
-        return Path(path).open("wb" if replace else "xb", buffering=0)
-    except FileExistsError:
-        raise EdgeposeError(f"{path} is there already; choose another name or give --overwrite") from None
+        return Path(path).open("wb", buffering=0)
     except OSError as error:
         raise EdgeposeError(explain(error, path, what)) from error
 
@@ -48,8 +48,8 @@ def is_regular(file: Any) -> bool:
         return False
 
 
-def write_rows(file: Any, rows: bytes) -> None:
-    """Write whole lines; where that fails, a file on a disk ends at a whole line.
+def write_rows(file: Any, rows: bytes, end: bytes = b"\n") -> None:
+    """Write whole rows; where that fails, a file on a disk ends with the `end` of one.
 
     Raises:
         OSError: as the system tells it.
@@ -63,7 +63,7 @@ def write_rows(file: Any, rows: bytes) -> None:
             done += count or 0
     except OSError:
         if is_regular(file):
-            _drop_end(file, done - (rows.rfind(b"\n", 0, done) + 1))
+            _drop_end(file, done - (rows.rfind(end, 0, done) + len(end)))
         raise
 
 
@@ -85,3 +85,119 @@ def _drop_end(file: Any, count: int) -> None:
         size = file.seek(0, os.SEEK_CUR) - count
         file.truncate(size)
         file.seek(size)
+
+
+class Appender:
+    """A file that grows by whole pieces.
+
+    A thread of its own writes and syncs them about once a second: a slow card must not keep the reader of a
+    port from its work, because the system holds back only a fraction of a second for it.
+    """
+
+    def __init__(self, path: str, what: str, start: bytes, end: bytes = b"\n") -> None:
+        """Open the file and write its start.
+
+        Args:
+            path: of the file; "-" is standard output.
+            what: what goes into it, for messages.
+            start: its first piece.
+            end: how pieces end; where the disk is full the file ends with it. Empty if it may end anywhere.
+
+        Raises:
+            EdgeposeError: it cannot be written.
+        """
+        self._path, self._what, self._end = path, what, end
+        self._file = open_output(path, what)
+        self._regular = is_regular(self._file)
+        self._pieces = deque([start])
+        self._error: EdgeposeError | None = None
+        self._closing = threading.Event()
+        self._flush()
+        if self._error is not None:
+            self._close_file()
+            raise self._error
+        if self._regular:
+            _sync_folder(Path(path).parent)
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def add(self, piece: bytes) -> None:
+        """Have a piece written.
+
+        Raises:
+            EdgeposeError: an earlier one could not be written; what is there is whole.
+        """
+        if self._error is not None:
+            raise self._error
+        self._pieces.append(piece)
+
+    def close(self) -> None:
+        """Write what is held back and close the file; a second call does nothing.
+
+        Raises:
+            EdgeposeError: something could not be written; what is there is whole.
+        """
+        if self._closing.is_set():
+            return
+        self._closing.set()
+        self._thread.join()
+        self._close_file()
+        if self._error is not None:
+            raise self._error
+
+    def _run(self) -> None:
+        closing = False
+        while not closing and self._error is None:
+            closing = self._closing.wait(FLUSH_S)
+            self._flush()
+
+    def _flush(self) -> None:
+        data = b"".join(self._pieces.popleft() for _ in range(len(self._pieces)))
+        if not data:
+            return
+        try:
+            write_rows(self._file, data, self._end)
+            if self._regular:
+                os.fsync(self._file.fileno())
+        except OSError as error:
+            self._error = EdgeposeError(explain(error, self._path, self._what))
+
+    def _close_file(self) -> None:
+        if self._path == "-":
+            return
+        try:
+            self._file.close()
+        except OSError as error:  # Network file systems may report a full disk only here.
+            self._error = self._error or EdgeposeError(explain(error, self._path, self._what))
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make the names in a folder last; a file that has no name after a power cut is lost."""
+    with contextlib.suppress(OSError):  # Windows cannot, and need not.
+        number = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
+
+
+def replace_file(path: Path, write: Callable[[Path], None], what: str) -> None:
+    """Have a file written under another name and put in its place at once: it is whole or as it was before.
+
+    Raises:
+        EdgeposeError: it cannot be written.
+    """
+    # The ending stays: writers look at it.
+    part = path.with_name(f"{path.stem}.new{path.suffix}")
+    try:
+        try:
+            write(part)
+            with part.open("rb+") as file:
+                os.fsync(file.fileno())
+            part.replace(path)
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise EdgeposeError(explain(error, str(path), what)) from error
+    _sync_folder(path.parent)

@@ -169,11 +169,15 @@ def _sensor_samples(index: int, data: SensorData) -> Iterator[ImuSample]:
 # --- CSV ----------------------------------------------------------------------------------------------------
 
 
+def comments(metadata: Mapping[str, str]) -> str:
+    """Metadata as lines `# key: value`."""
+    # A line break would start a row of its own.
+    return "".join("# " + " ".join(f"{key}: {value}".splitlines()) + "\n" for key, value in metadata.items())
+
+
 def csv_header(metadata: Mapping[str, str]) -> str:
     """First lines of a CSV recording, up to its column names."""
-    # A line break would start a row of its own.
-    comments = ["# " + " ".join(f"{key}: {value}".splitlines()) + "\n" for key, value in metadata.items()]
-    return "".join(comments) + COLUMNS + "\n"
+    return comments(metadata) + COLUMNS + "\n"
 
 
 def csv_row(sample: ImuSample) -> str:
