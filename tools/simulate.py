@@ -1,119 +1,488 @@
-"""Plays an IMU recording as six devices on a serial port (a pty), in real time, as native packets.
+r"""Plays an IMU recording or a motion-capture clip as six devices, in real time, in any wire format.
 
 \b
-    python tools/simulate.py recording.npz           # plays at once, then stands at the last sample
-    python tools/simulate.py recording.npz --stand   # stands at the first sample until a line comes on stdin
+    simulate.py recording.npz                         plays native packets, then stands at the last sample
+    simulate.py recording.npz --stand                 stands at the first sample until a line comes on stdin
+    simulate.py walk.bvh --protocol xsens             six ptys with one device on each
+    simulate.py walk.bvh --protocol native-can        CAN frames of a slcan adapter on a pty
+    simulate.py walk.bvh --protocol native-can --can socketcan:can0
 
-Prints `port NAME`, `started UNIX_TIME` and `ended UNIX_TIME`. Ends when standard input closes, though not
-in the middle of the recording, or at Ctrl-C.
+Prints `port NAME[,NAME...]` ready for --port (or `can NAME` ready for --can), `started UNIX_TIME` and
+`ended UNIX_TIME`. A clip stands straight for 6 s first. Ends when standard input closes, though not in the
+middle of the recording, or at Ctrl-C.
 """
 
 from __future__ import annotations
 
 import os
+import random
+import re
 import select
 import sys
 import time
 import tty
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple, Protocol
 
+import can
 import click
 import numpy as np
-from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
-from edgepose.recording import Recording, read_recording
-from firmware_protocols.native import Packet, encode
+from edgepose.recording import Recording, SensorData, read_recording
+from firmware_protocols.registry import PROTOCOLS, Frame
+from firmware_protocols.registry import Protocol as Format
+from firmware_protocols.rotation import rotate_back
+from firmware_protocols.sample import Sample
 
-TICK_S = 0.001
-"""Longest sleep between two looks at the clock, seconds."""
-
-
-def packet_maker(recording: Recording, sensor: int) -> Callable[[int, int, int], bytes]:
-    """A function of (row, sequence number, device time in us) that gives a sensor's packet on the wire."""
-    data = recording.sensors[PLACEMENTS[sensor]]
-    if data.quat is None or data.acc is None:
-        raise EdgeposeError(f"{PLACEMENTS[sensor]}: the recording lacks orientation or acceleration")
-    columns = [
-        [None] * len(data.time_s) if rows is None else [v if v[0] == v[0] else None for v in rows.tolist()]
-        for rows in (data.quat, data.acc, data.gyr)
-    ]
-
-    def make(row: int, seq: int, t_us: int) -> bytes:
-        quat, acc, gyr = (column[row] for column in columns)
-        return encode(Packet(sensor, seq & 0xFFFF, t_us & 0xFFFFFFFF, quat, acc, gyr))
-
-    return make
+CLIP_RATE, CLIP_HEIGHT_M, CLIP_HOLD_S = 100.0, 1.75, 6.0
+FIELD_UT = (0.0, 20.0, -40.0)
+"""Magnetic field in the inertial frame, for formats that cannot do without one."""
 
 
-def common_times(recording: Recording) -> NDArray[np.float64]:
-    """Times that all six sensors share."""
-    times = recording.sensors[PLACEMENTS[0]].time_s
-    for name, data in recording.sensors.items():
-        if not np.array_equal(data.time_s, times):
+class Faults(NamedTuple):
+    """What goes wrong; fields are the command's flags."""
+
+    loss: float = 0.0
+    corrupt: float = 0.0
+    jitter_ms: float = 0.0
+    drift_ppm: float = 0.0
+    kill: tuple[tuple[int, float, float], ...] = ()
+    duplicate_id: bool = False
+
+
+# --- input --------------------------------------------------------------------------------------------------
+
+
+def read_input(path: Path) -> Recording:
+    """A recording, or what sensors on the body of a motion-capture clip would have recorded.
+
+    Raises:
+        EdgeposeError: the file is neither, or the clip jumps in the middle.
+    """
+    if not is_motion(path):
+        return read_recording(path)
+    from edgepose_export.cli.synthesize import Job, convert
+
+    with TemporaryDirectory() as folder:
+        out = Path(folder)
+        job = Job(out, path.parent, CLIP_RATE, CLIP_HEIGHT_M, CLIP_HOLD_S, None)
+        problem = convert(path, job)
+        if problem is not None:
+            raise EdgeposeError(problem)
+        takes = sorted(out.iterdir())
+        if len(takes) > 1:
             raise EdgeposeError(
-                f"{name}: its times differ from those of {PLACEMENTS[0]}; the simulator plays sensors that "
-                "sample at the same instants"
+                f"{path}: jumps; make recordings of its {len(takes)} parts with edgepose synthesize"
             )
-    if len(times) < 2 or not (np.diff(times) > 0).all():
-        raise EdgeposeError("the recording needs two instants or more, each later than the one before")
-    return times
+        return read_recording(takes[0])
 
 
-def line_came() -> bool | None:
-    """True if standard input has a line, None at its end, False if there is nothing yet."""
-    if not select.select([sys.stdin], [], [], 0)[0]:
-        return False
-    return True if sys.stdin.readline() else None
+def is_motion(path: Path) -> bool:
+    """Whether a file is motion capture; an NPZ is if it has poses and no sensors."""
+    if path.suffix.lower() != ".npz":
+        return path.suffix.lower() in (".bvh", ".amc")
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return "poses" in arrays.files and f"{PLACEMENTS[0]}_acc" not in arrays.files
+    except (OSError, ValueError):
+        return False  # for the reader of recordings to explain
 
 
-def play(recording: Recording, stand: bool) -> None:
-    """Sends samples until standard input closes."""
-    times = common_times(recording)
-    makers = [packet_maker(recording, sensor) for sensor in range(len(PLACEMENTS))]
-    period = float(np.median(np.diff(times)))
-    rows = len(times)
-    master, slave = os.openpty()
-    tty.setraw(slave)
-    os.set_blocking(master, False)  # bytes that nobody reads are lost, as on a real line
-    print("port", os.ttyname(slave), flush=True)
-    start = time.monotonic()
-    unix = time.time() - start
-    first = None if stand else 0  # sample number at which the recording's first row is due
-    ended = False
-    for number in range(sys.maxsize):
-        due = start + number * period
-        while (wait := due - time.monotonic()) > 0:
-            time.sleep(min(wait, TICK_S))
-        if number % 5 == 0 or ended:
-            came = line_came()
-            if came is None and (ended or first is None):
-                return
-            if came and first is None:
-                first = number
-        if first == number:
-            print(f"started {unix + due:.6f}", flush=True)
-        row = 0 if first is None else min(number - first, rows - 1)
-        if first is not None and number - first == rows - 1:
-            ended = True
-            print(f"ended {unix + due:.6f}", flush=True)
-        t_us = round(number * period * 1e6)
+def rows_of(data: SensorData) -> list[Sample]:
+    """A sensor's rows without id and time."""
+    columns = [
+        [None] * len(data.time_s)
+        if rows is None
+        else [tuple(v) if v[0] == v[0] else None for v in rows.tolist()]
+        for rows in data[1:]
+    ]
+    return [Sample(0, None, *quantities) for quantities in zip(*columns, strict=True)]
+
+
+def with_field(sample: Sample) -> Sample:
+    """A sample with a magnetic field, if its orientation is known."""
+    if sample.mag is not None or sample.quat is None:
+        return sample
+    return sample._replace(mag=rotate_back(sample.quat, FIELD_UT))
+
+
+# --- lines --------------------------------------------------------------------------------------------------
+
+
+class Line(Protocol):
+    """Where packets go."""
+
+    name: str
+
+    def send(self, wire: Any) -> None:
+        """Sends a packet, or loses it if nobody takes it."""
+
+    def receive(self) -> bytes:
+        """What the other side has sent."""
+
+    def close(self) -> None:
+        """Gives it free."""
+
+
+class Pty:
+    """A pseudo terminal that takes whole packets or nothing: what nobody reads is lost, as on a real line."""
+
+    def __init__(self, slcan: bool = False) -> None:
+        """Opens it; with slcan, packets are CAN frames in the text form of an adapter."""
+        self.master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self.master, False)
+        self.name = os.ttyname(self._slave)
+        self._slcan = slcan
+        self._rest = b""
+
+    def send(self, wire: Any) -> None:
+        """Sends a packet."""
+        self._write()
+        if not self._rest:
+            self._rest = b"".join(map(slcan_line, wire)) if self._slcan else wire
+            self._write()
+
+    def _write(self) -> None:
         try:
-            for make in makers:
-                os.write(master, make(row, number, t_us))
+            while self._rest:
+                self._rest = self._rest[os.write(self.master, self._rest) :]
         except BlockingIOError:
             pass
+
+    def receive(self) -> bytes:
+        """Requests to a device, or the commands of an adapter's user."""
+        try:
+            return os.read(self.master, 4096)
+        except BlockingIOError:
+            return b""
+
+    def close(self) -> None:
+        """Hangs up."""
+        os.close(self.master)
+        os.close(self._slave)
+
+
+class Bus:
+    """A bus of python-can."""
+
+    def __init__(self, name: str, bitrate: int) -> None:
+        """Opens it; the name is INTERFACE:CHANNEL.
+
+        Raises:
+            EdgeposeError: it cannot be opened.
+        """
+        interface, _, channel = name.partition(":")
+        self.name = name
+        try:
+            self._bus = can.Bus(
+                channel=channel, interface=interface, bitrate=bitrate, receive_own_messages=False
+            )
+        except (can.CanError, OSError, ValueError, ImportError) as error:
+            raise EdgeposeError(f"{name}: cannot open it: {error}") from None
+
+    def send(self, wire: Sequence[Frame]) -> None:
+        """Sends the frames of a sample; a full bus loses them."""
+        for can_id, data, extended, fd in wire:
+            try:
+                self._bus.send(
+                    can.Message(arbitration_id=can_id, data=data, is_extended_id=extended, is_fd=fd)
+                )
+            except can.CanOperationError:
+                return
+
+    def receive(self) -> bytes:
+        """Nothing."""
+        return b""
+
+    def close(self) -> None:
+        """Leaves the bus."""
+        self._bus.shutdown()
+
+
+def slcan_line(frame: Frame) -> bytes:
+    """A frame as slcan adapters write it; CAN FD as the newer ones do."""
+    can_id, data, extended, fd = frame
+    kind = ("d" if fd else "t").upper() if extended else ("d" if fd else "t")
+    lengths = (*range(9), 12, 16, 20, 24, 32, 48, 64)
+    return (
+        f"{kind}{can_id:0{8 if extended else 3}X}{lengths.index(len(data)):X}{data.hex().upper()}\r".encode()
+    )
+
+
+def open_lines(spoken: Format, bus: str | None) -> list[Line]:
+    """One line for all six sensors, or six."""
+    if bus is not None:
+        return [Bus(bus, spoken.speed)]
+    if spoken.transport == "can":
+        return [Pty(slcan=True)]
+    return [Pty() for _ in range(len(PLACEMENTS) if spoken.alone else 1)]
+
+
+# --- playing ------------------------------------------------------------------------------------------------
+
+
+class Sensor:
+    """One simulated device: what it sends and when."""
+
+    def __init__(
+        self, index: int, data: SensorData, start_s: float, encode: Callable[[Sample, int], Any]
+    ) -> None:
+        """Nothing sent yet; `start_s` is the time of the recording's first sample."""
+        self.index = index
+        self.rows = rows_of(data)
+        self.times = (data.time_s - start_s).tolist()
+        if len(self.times) < 2 or not (np.diff(data.time_s) > 0).all():
+            raise EdgeposeError(
+                f"{PLACEMENTS[index]}: it needs two instants or more, each later than the one before"
+            )
+        self.period = float(np.median(np.diff(data.time_s)))
+        self.row = 0
+        self.count = 0
+        self.due = 0.0
+        self.wire: Any = None
+        self._encode = encode
+        self._add_field = False
+
+    def prepare(self, spoken: Format, sensor_id: int) -> None:
+        """Makes sure that the format can hold the first sample.
+
+        Raises:
+            EdgeposeError: it cannot.
+        """
+        self.rows = [row._replace(sensor=sensor_id) for row in self.rows]
+        try:
+            for self._add_field in (False, True):
+                try:
+                    spoken.encoder()(self._sample(0), 0)
+                    return
+                except ValueError:
+                    if self._add_field:
+                        raise
+        except ValueError as error:
+            raise EdgeposeError(
+                f"{PLACEMENTS[self.index]}: {spoken.name} cannot hold its samples: {error}"
+            ) from None
+
+    def _sample(self, t_us: int) -> Sample:
+        sample = self.rows[self.row]._replace(time_us=t_us)
+        return with_field(sample) if self._add_field else sample
+
+    def measure(self, t_us: int) -> None:
+        """Makes the packet of the present row; none if the format cannot hold it."""
+        try:
+            self.wire = self._encode(self._sample(t_us), self.count)
+        except ValueError:
+            self.wire = None
+        self.count += 1
+
+    def step(self, played_s: float | None) -> None:
+        """Goes to the next row; `played_s` is when the recording began to play, None if it has not."""
+        if played_s is None or self.row + 1 == len(self.rows):
+            self.due += self.period
+        else:
+            self.row += 1
+            self.due = played_s + self.times[self.row]
+
+
+class Player:
+    """Sends the packets of six sensors until standard input closes."""
+
+    def __init__(self, sensors: list[Sensor], lines: list[Line], spoken: Format, faults: Faults) -> None:
+        """Nothing sent yet."""
+        self._sensors, self._lines, self._faults = sensors, lines, faults
+        self._rng = random.Random(0)
+        self._queues: list[deque[tuple[float, Any]]] = [deque() for _ in lines]
+        self._requests: dict[bytes, Sensor] = {}
+        if spoken.request is not None:
+            ids = [sensor.rows[0].sensor for sensor in sensors]
+            self._requests = {spoken.request(i)[0]: s for i, s in zip(ids, sensors, strict=True)}
+        self._asked = [b"" for _ in lines]
+        # The six clocks run apart evenly.
+        self._clocks = [1.0 + faults.drift_ppm * 1e-6 * (sensor.index / 2.5 - 1.0) for sensor in sensors]
+        self._start = 0.0
+        self._played_s: float | None = None
+
+    def play(self, stand: bool) -> None:
+        """Runs to the end; with stand, the recording begins when a line comes on standard input."""
+        self._start = time.monotonic()
+        unix = time.time() - self._start
+        for sensor in self._sensors:
+            sensor.due = self._start
+        watched = [sys.stdin]
+        begun, announced, ended = not stand, False, False
+        while True:
+            if begun and self._played_s is None:
+                self._played_s = min(sensor.due for sensor in self._sensors)
+                for sensor in self._sensors:
+                    sensor.due = self._played_s + sensor.times[0]
+            if self._played_s is not None and not announced:
+                print(f"started {unix + self._played_s:.6f}", flush=True)
+                announced = True
+            came = self._wait(watched)
+            if came == "":
+                watched = []
+                if not begun:
+                    return
+            begun = begun or bool(came)
+            for sensor in self._sensors:
+                if sensor.due <= time.monotonic():
+                    self._measure(sensor)
+                    sensor.step(self._played_s)
+            if not ended and self._played_s is not None and self._at_end():
+                ended = True
+                end_s = self._played_s + max(sensor.times[-1] for sensor in self._sensors)
+                print(f"ended {unix + end_s:.6f}", flush=True)
+            self._release()
+            if ended and not watched:
+                return
+
+    def _at_end(self) -> bool:
+        """Whether all last rows have been measured."""
+        return all(
+            sensor.row + 1 == len(sensor.rows) and sensor.due > (self._played_s or 0.0) + sensor.times[-1]
+            for sensor in self._sensors
+        )
+
+    def _wait(self, watched: list[Any]) -> str | None:
+        """Sleeps until something is due or comes; a line of standard input, or "" at its end."""
+        dues = [sensor.due for sensor in self._sensors] + [queue[0][0] for queue in self._queues if queue]
+        ptys = {line.master: i for i, line in enumerate(self._lines) if isinstance(line, Pty)}
+        timeout = max(0.0, min(dues) - time.monotonic())
+        ready, _, _ = select.select([*watched, *ptys], [], [], timeout)
+        for file in ready:
+            if file in ptys:
+                self._answer(ptys[file])
+        return sys.stdin.readline() if sys.stdin in ready else None
+
+    def _measure(self, sensor: Sensor) -> None:
+        t_us = round((sensor.due - self._start) * self._clocks[sensor.index] * 1e6)
+        sensor.measure(t_us)
+        if not self._requests:
+            self._queue(sensor, sensor.index if len(self._lines) > 1 else 0, sensor.due)
+
+    def _answer(self, line: int) -> None:
+        asked = self._asked[line] + self._lines[line].receive()
+        for request, sensor in self._requests.items():
+            if request in asked:
+                asked = asked.replace(request, b"")
+                self._queue(sensor, line, time.monotonic())
+        self._asked[line] = asked[-64:]
+
+    def _queue(self, sensor: Sensor, line: int, due: float) -> None:
+        """Hands a packet to its line, unless something goes wrong."""
+        faults, wire = self._faults, sensor.wire
+        played = -1.0 if self._played_s is None else due - self._played_s
+        killed = any(i == sensor.index and begin <= played < end for i, begin, end in faults.kill)
+        if wire is None or killed or self._rng.random() < faults.loss:
+            return
+        if self._rng.random() < faults.corrupt:
+            wire = bytearray(wire)
+            wire[self._rng.randrange(len(wire))] ^= 1 << self._rng.randrange(8)
+        queue = self._queues[line]
+        release = due + self._rng.random() * faults.jitter_ms * 1e-3
+        # A line keeps its order.
+        queue.append((max(release, queue[-1][0]) if queue else release, wire))
+
+    def _release(self) -> None:
+        now = time.monotonic()
+        for queue, line in zip(self._queues, self._lines, strict=True):
+            while queue and queue[0][0] <= now:
+                line.send(queue.popleft()[1])
+
+
+# --- the command --------------------------------------------------------------------------------------------
+
+
+def parse_kill(ctx: click.Context, param: click.Parameter, values: Sequence[str]) -> tuple[Any, ...]:
+    """Sensor number, begin and end of each --kill."""
+    result = []
+    for value in values:
+        match = re.fullmatch(r"(\w+)@(\d+(?:\.\d+)?)\.\.(\d+(?:\.\d+)?)?", value)
+        if match is None or match[1] not in PLACEMENTS:
+            raise click.BadParameter(f"{value!r} is not SENSOR@T..T with a sensor of {', '.join(PLACEMENTS)}")
+        result.append((PLACEMENTS.index(match[1]), float(match[2]), float(match[3] or "inf")))
+    return tuple(result)
+
+
+def simulate(path: Path, spoken: Format, bus: str | None, stand: bool, faults: Faults) -> None:
+    """Opens the lines and plays the file on them."""
+    recording = read_input(path)
+    start_s = min(float(data.time_s[0]) for data in recording.sensors.values())
+    ids = [0] * len(PLACEMENTS) if spoken.alone else list(spoken.ids)
+    if faults.duplicate_id:
+        ids[1] = ids[0]
+    encoders = [spoken.encoder() for _ in range(len(PLACEMENTS) if spoken.alone else 1)]
+    sensors = []
+    for index, data in enumerate(recording.sensors.values()):
+        sensor = Sensor(index, data, start_s, encoders[index % len(encoders)])
+        sensor.prepare(spoken, ids[index])
+        sensors.append(sensor)
+    lines = open_lines(spoken, bus)
+    name = ",".join(line.name for line in lines)
+    if spoken.transport == "bytes":
+        print("port", name, flush=True)
+    else:
+        print("can", name if bus else f"slcan:{name}", flush=True)
+    try:
+        Player(sensors, lines, spoken, faults).play(stand)
+    finally:
+        for line in lines:
+            line.close()
 
 
 @click.command(help=__doc__)
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option("--stand", is_flag=True, help="Repeat the first sample until a line comes on standard input.")
-def main(recording: Path, stand: bool) -> None:
+@click.option("--protocol", type=click.Choice(list(PROTOCOLS)), default="native", show_default=True)
+@click.option(
+    "--can", "bus", metavar="INTERFACE:CHANNEL", help="Send CAN frames here  [default: slcan on a pty]"
+)
+@click.option("--loss", type=click.FloatRange(0, 1), default=0.0, help="Share of packets that are lost.")
+@click.option(
+    "--corrupt", type=click.FloatRange(0, 1), default=0.0, help="Share of packets with a wrong bit."
+)
+@click.option(
+    "--jitter", type=click.FloatRange(0), default=0.0, metavar="MS", help="Packets are up to this late."
+)
+@click.option(
+    "--drift", type=float, default=0.0, metavar="PPM", help="Clocks of the six go wrong by -PPM to PPM."
+)
+@click.option(
+    "--kill",
+    multiple=True,
+    callback=parse_kill,
+    metavar="SENSOR@T..T",
+    help="Silent from .. to, s since started.",
+)
+@click.option("--duplicate-id", is_flag=True, help="The second sensor has the id of the first.")
+def main(
+    recording: Path,
+    stand: bool,
+    protocol: str,
+    bus: str | None,
+    loss: float,
+    corrupt: float,
+    jitter: float,
+    drift: float,
+    kill: tuple[tuple[int, float, float], ...],
+    duplicate_id: bool,
+) -> None:
     """The command line."""
+    spoken = PROTOCOLS[protocol]
+    if bus is not None and spoken.transport != "can":
+        raise click.UsageError(f"{protocol} does not go over CAN")
+    if corrupt and spoken.transport == "can":
+        raise click.UsageError("a CAN controller passes no wrong bits on; use --loss")
+    if duplicate_id and spoken.alone:
+        raise click.UsageError(f"{protocol} has one sensor on a line, whatever its id")
     try:
-        play(read_recording(recording), stand)
+        simulate(recording, spoken, bus, stand, Faults(loss, corrupt, jitter, drift, kill, duplicate_id))
     except EdgeposeError as error:
         raise click.ClickException(str(error)) from error
     except KeyboardInterrupt:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import runpy
 import select
 import signal
 import subprocess
@@ -14,6 +15,7 @@ from binascii import crc_hqx
 from itertools import pairwise
 from pathlib import Path
 
+import can
 import numpy as np
 import pytest
 
@@ -21,8 +23,11 @@ from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
 from edgepose.recording import from_samples, read_recording, write_csv, write_npz
 from firmware_protocols.native import cobs_decode, decode_body
+from firmware_protocols.registry import PROTOCOLS
+from firmware_protocols.rotation import rotate
 
 SIMULATOR = Path(__file__).parents[2] / "tools" / "simulate.py"
+CLIP = SIMULATOR.parent / "data" / "09_12.bvh"
 ROWS = 150
 STEP = 0.05  # m/s^2 between two rows
 
@@ -63,16 +68,19 @@ class Line:
         tty.setraw(self.file)
         self.rest = b""
         self.packets = []
+        self.broken = 0
 
     def until(self, enough):
         while not enough():
             if select.select([self.file], [], [], 0.2)[0]:
                 *frames, self.rest = (self.rest + os.read(self.file, 65536)).split(b"\0")
+                self.broken += len(frames)
                 for frame in frames:
                     with contextlib.suppress(ValueError):  # cut where a buffer was full
                         body = cobs_decode(frame)
                         if crc_hqx(body[:-2], 0xFFFF) == int.from_bytes(body[-2:], "little"):
                             self.packets.append(decode_body(body[:-2]))
+                            self.broken -= 1
 
     def of(self, sensor):
         return [packet for packet in self.packets if packet.sensor_id == sensor]
@@ -163,29 +171,28 @@ def drop_orientation(sensors):
     sensors["head"] = sensors["head"]._replace(quat=None)
 
 
-def shorten(sensors):
-    sensors["head"] = type(sensors["head"])(*(c if c is None else c[:-1] for c in sensors["head"]))
-
-
 def one_instant(sensors):
     for name in PLACEMENTS:
         sensors[name] = type(sensors[name])(*(c if c is None else c[:1] for c in sensors[name]))
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "words", "says"),
     [
-        (drop_orientation, "head: the recording lacks orientation"),
-        (shorten, "head: its times differ from those of left_forearm"),
-        (one_instant, "the recording needs two instants or more"),
+        (
+            drop_orientation,
+            ["--protocol", "hipnuc"],
+            "head: hipnuc cannot hold its samples: needs quaternion",
+        ),
+        (one_instant, [], "left_forearm: it needs two instants or more"),
     ],
 )
-def test_a_recording_that_cannot_be_played(recording, tmp_path, change, says):
+def test_a_recording_that_cannot_be_played(recording, tmp_path, change, words, says):
     source = read_recording(recording)
     change(source.sensors)
     file = tmp_path / "recording.npz"
     write_npz(file, source)
-    with start(file) as process:
+    with start(file, *words) as process:
         output, errors = process.communicate(timeout=30)
     assert process.returncode == 1
     assert output == ""
@@ -198,3 +205,184 @@ def test_a_file_that_is_not_there(tmp_path):
         _, errors = process.communicate(timeout=30)
     assert process.returncode == 1
     assert errors.startswith(f"Error: {tmp_path / 'nowhere.npz'}: cannot read it")
+
+
+def test_sensors_that_sample_at_other_times(recording, tmp_path):
+    source = read_recording(recording)
+    head = source.sensors["head"]
+    # Every other row of the head, from the third on.
+    source.sensors["head"] = type(head)(*(c if c is None else c[2::2] for c in head))
+    file = tmp_path / "recording.npz"
+    write_npz(file, source)
+    with start(file, "--stand") as process, Line(process.stdout.readline().split()[1]) as line:
+        line.until(lambda: len(line.packets) > 12)
+        process.stdin.write("go\n")
+        process.stdin.flush()
+        line.until(lambda: len(line.of(4)) > 12 and row_of(line.of(4)[-1]) == ROWS - 2)
+        process.stdin.close()
+        assert process.wait(20) == 0
+    pelvis = {row_of(packet): packet.t_us for packet in line.of(5)}
+    playing = [packet for packet in line.of(4) if 2 < row_of(packet) < ROWS - 2]
+    assert {row_of(packet) % 2 for packet in playing} == {0}
+    common = [packet for packet in playing if row_of(packet) in pelvis]
+    assert len(common) > ROWS // 8
+    assert all(abs(packet.t_us - pelvis[row_of(packet)]) <= 1 for packet in common)
+
+
+# --- other wire formats -------------------------------------------------------------------------------------
+
+
+def read_ports(spoken, ports, enough, ask=()):
+    """Samples of each port until there are enough on all of them."""
+    files = [os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK) for port in ports]
+    samples, decoders = {file: [] for file in files}, {}
+    for file in files:
+        tty.setraw(file)
+        decoders[file] = spoken.decoder()
+    try:
+        while min(map(len, samples.values())) < enough:
+            for request in ask:
+                os.write(files[0], request)
+            for file in select.select(files, [], [], 0.02)[0]:
+                samples[file] += decoders[file].feed(os.read(file, 65536))
+    finally:
+        for file in files:
+            os.close(file)
+    return list(samples.values())
+
+
+@pytest.mark.parametrize(("name", "lines"), [("xsens", 6), ("haritorax", 1), ("witmotion-modbus", 1)])
+def test_other_wire_formats(recording, name, lines):
+    spoken = PROTOCOLS[name]
+    ask = [spoken.request(sensor)[0] for sensor in spoken.ids] if spoken.request else ()
+    with start(recording, "--stand", "--protocol", name) as process:
+        word, ports = process.stdout.readline().split()
+        assert (word, ports.count(",")) == ("port", lines - 1)
+        got = read_ports(spoken, ports.split(","), 60 // lines, ask)
+        process.stdin.close()
+        assert process.wait(20) == 0
+        assert process.stderr.read() == ""
+    first = [data.quat[0] for data in read_recording(recording).sensors.values()]
+    for line, samples in enumerate(got):
+        for sample in samples:
+            index = line if spoken.alone else list(spoken.ids).index(sample.sensor)
+            assert abs(np.dot(sample.quat, first[index])) == pytest.approx(1.0, abs=1e-6)
+    if not spoken.alone:
+        assert {sample.sensor for sample in got[0]} == set(spoken.ids)
+
+
+def frames_until(bus, spoken, enough):
+    decoder, samples = spoken.decoder(), []
+    while len(samples) < enough:
+        message = bus.recv(0.5)
+        if message is not None:
+            samples += decoder.feed(message.arbitration_id, bytes(message.data), message.is_extended_id)
+    return samples
+
+
+def test_can_frames_of_an_adapter(recording):
+    with start(recording, "--stand", "--protocol", "native-can") as process:
+        word, name = process.stdout.readline().split()
+        interface, channel = name.split(":")
+        assert (word, interface) == ("can", "slcan")
+        bus = can.Bus(interface=interface, channel=channel, bitrate=500_000, sleep_after_open=0)
+        samples = frames_until(bus, PROTOCOLS["native-can"], 60)
+        bus.shutdown()
+        process.stdin.close()
+        assert process.wait(20) == 0
+    assert {sample.sensor for sample in samples} == set(range(6))
+    assert {row_of(sample) for sample in samples} == {0}
+
+
+def test_can_frames_on_a_bus_of_python_can(recording):
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    words = ["--stand", "--protocol", "hipnuc-j1939", "--can", f"slcan:{os.ttyname(slave)}"]
+    with start(recording, *words) as process:
+        assert process.stdout.readline().split() == ["can", words[-1]]
+        text = b""
+        while text.count(b"\r") < 100:
+            text += os.read(master, 4096)
+        process.stdin.close()
+        assert process.wait(20) == 0
+    os.close(master)
+    os.close(slave)
+    commands, *lines = text.split(b"\rT", 1)
+    assert commands.split(b"\r")[-1] == b"O"  # the bus was opened before anything was sent
+    assert lines[0].startswith(b"0CFF34018")
+
+
+def test_every_format_takes_the_samples_of_a_clip():
+    tool = runpy.run_path(str(SIMULATOR))
+    recording = tool["read_input"](CLIP)
+    for name, spoken in PROTOCOLS.items():
+        data = recording.sensors["pelvis"]
+        sensor = tool["Sensor"](5, data, data.time_s[0], spoken.encoder())
+        sensor.prepare(spoken, 0 if spoken.alone else spoken.ids[5])
+        sensor.measure(0)
+        assert sensor.wire, name
+    # The clip stands straight first: gravity is all there is.
+    rows = sensor.rows[:500]
+    for row in rows[::100]:
+        assert rotate(row.quat, row.acc) == pytest.approx((0.0, 0.0, 9.81), abs=0.01)
+
+
+# --- what goes wrong on demand ------------------------------------------------------------------------------
+
+
+def play(words, recording):
+    """What comes while a recording plays, from its first row to its last."""
+    with start(recording, "--stand", *words) as process, Line(process.stdout.readline().split()[1]) as line:
+        line.until(lambda: len(line.packets) > 12)
+        process.stdin.write("go\n")
+        process.stdin.flush()
+        line.until(lambda: any(row_of(packet) == ROWS - 1 for packet in line.of(0)[-5:]))
+        process.stdin.close()
+        assert process.wait(20) == 0
+        assert process.stderr.read() == ""
+    return line
+
+
+def test_lost_packets_a_dead_sensor_and_clocks_that_run_apart(recording):
+    line = play(["--loss", "0.3", "--kill", "head@0.4..0.9", "--drift", "50000"], recording)
+    rows = [[row_of(packet) for packet in line.of(sensor)] for sensor in range(6)]
+    for playing in rows:
+        # A busy machine may lose more, but not fewer.
+        assert 10 < len({row for row in playing if 0 < row < ROWS - 1}) < 0.85 * ROWS
+    assert not {row for row in rows[4] if 41 <= row < 89}
+    assert {row for row in rows[3] if 41 <= row < 89}
+    for sensor, step in ((0, 9_500), (5, 10_500)):
+        playing = [packet for packet in line.of(sensor) if 0 < row_of(packet) < ROWS - 1]
+        for a, b in pairwise(playing):
+            assert abs(b.t_us - a.t_us - step * (row_of(b) - row_of(a))) <= 2
+
+
+def test_broken_and_late_packets_and_two_sensors_with_one_id(recording):
+    line = play(["--corrupt", "0.5", "--jitter", "30", "--duplicate-id"], recording)
+    assert line.broken > 0.2 * len(line.packets)
+    assert line.of(1) == []
+    assert len(line.of(0)) > 1.2 * len(line.of(2))
+    # Late, but in their order.
+    times = [packet.t_us for packet in line.of(2)]
+    assert times == sorted(times)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--can", "slcan:x"], "native does not go over CAN"),
+        (["--protocol", "native-can", "--corrupt", "0.1"], "use --loss"),
+        (["--protocol", "xsens", "--duplicate-id"], "one sensor on a line"),
+        (["--kill", "nose@1..2"], "'nose@1..2' is not SENSOR@T..T"),
+        (["--kill", "head"], "'head' is not SENSOR@T..T"),
+        (["--protocol", "native-can", "--can", "slcan:/nowhere"], "slcan:/nowhere: cannot open it"),
+        (["--protocol", "native-can", "--can", "nonsense:x"], "nonsense:x: cannot open it"),
+    ],
+)
+def test_flags_that_mean_nothing(recording, words, says):
+    with start(recording, *words) as process:
+        output, errors = process.communicate(timeout=30)
+    assert process.returncode in (1, 2)
+    assert output == ""
+    assert says in errors
+    assert "Traceback" not in errors
