@@ -142,7 +142,7 @@ def report(begin: float, end: float, listener: Listener, truth: Truth, out: Path
     ok = np.mean(np.array(status)[clip] == "ok")
     click.echo(f"clip: {clip.sum()} frames in {seconds[-1] - seconds[0]:.1f} s; status ok in {ok:.1%}")
     click.echo("\nError against the clip's true pose:")
-    click.echo(format_table({"birnn, online (20, 5)": summary(poses[clip], true, offsets, 60.0)}))
+    click.echo(format_table({"birnn, online": summary(poses[clip], true, offsets, 60.0)}))
     delays = np.array([arrived - float(str(pose["time_s"])) for arrived, pose in listener.received]) * 1e3
     p50, p99 = np.percentile(delays, [50, 99])
     click.echo(f"\nFrom measurement to the pose's arrival by UDP: {p50:.0f} ms median, {p99:.0f} ms p99")
