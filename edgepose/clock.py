@@ -1,6 +1,7 @@
 """Device clocks on the source's time line: jitter of arrival taken out, drift followed, reboots survived.
 
-A device stamps samples with microseconds in 32 bits, which start at any value and wrap after 71.6 minutes.
+A device stamps samples with microseconds that start at any value and wrap, those of native packets after 71.6
+minutes; or with nothing, and then arrivals have to do.
 """
 
 from __future__ import annotations
@@ -8,6 +9,8 @@ from __future__ import annotations
 from math import inf
 
 WRAP_US = 1 << 32
+"""Where the clocks of native packets wrap, microseconds."""
+
 STEP_S = 1e-6
 """Smallest step between two times of one sensor, seconds."""
 
@@ -18,10 +21,17 @@ _AHEAD_S = 1.0
 _BACK_S = 0.1
 
 
-def unwrap(t_us: int, expected_s: float) -> float:
-    """Seconds of a 32 bit microsecond clock, in the turn that comes nearest to the expected time."""
-    turns = round((expected_s * 1e6 - t_us) / WRAP_US)
-    return (t_us + turns * WRAP_US) * 1e-6
+_PULL_BACK, _PULL_ON, _PULL_PERIOD = 0.5, 0.05, 0.02
+_FIRST = 16  # arrivals that tell the period
+_UNEVEN_S = 0.02  # a USB converter delivers every 16 ms
+_SHORTEST_S = 0.0005  # period
+_PAUSE_S, _PAUSE_PERIODS = 0.25, 4.0
+
+
+def unwrap(t_us: int, expected_s: float, wrap_us: int = WRAP_US) -> float:
+    """Seconds of a microsecond clock that wraps, in the turn that comes nearest to the expected time."""
+    turns = round((expected_s * 1e6 - t_us) / wrap_us)
+    return (t_us + turns * wrap_us) * 1e-6
 
 
 class DeviceClock:
@@ -37,9 +47,10 @@ class DeviceClock:
         resets: times the offset began anew.
     """
 
-    def __init__(self) -> None:
-        """Start with no packet seen."""
+    def __init__(self, wrap_us: int = WRAP_US) -> None:
+        """Start with no packet seen; the clock wraps at wrap_us."""
         self.resets = 0
+        self._wrap_us = wrap_us
         self._started = False
         self._device_s = 0.0  # newest device time, unwrapped
         self._arrival_s = 0.0
@@ -52,7 +63,7 @@ class DeviceClock:
         """Host time of a measurement, seconds; always larger than that of the call before.
 
         Args:
-            t_us: device time, microseconds modulo 2^32.
+            t_us: device time, microseconds modulo wrap_us.
             arrival_s: host time at which the packet came, seconds.
         """
         if not self._started:
@@ -60,7 +71,7 @@ class DeviceClock:
             self._restart(t_us, arrival_s)
             self._result = arrival_s
             return arrival_s
-        device_s = unwrap(t_us, self._device_s + arrival_s - self._arrival_s)
+        device_s = unwrap(t_us, self._device_s + arrival_s - self._arrival_s, self._wrap_us)
         step = device_s - self._device_s
         late = arrival_s - device_s - self._offset
         if step < -_BACK_S or late < -_AHEAD_S:
@@ -84,13 +95,82 @@ class DeviceClock:
         return self._result
 
     def _time(self, t_us: int) -> float:
-        return unwrap(t_us, self._device_s) + self._offset
+        return unwrap(t_us, self._device_s, self._wrap_us) + self._offset
 
     def _restart(self, t_us: int, arrival_s: float) -> None:
         self._device_s = t_us * 1e-6
         self._arrival_s = self._window_s = arrival_s
         self._offset = arrival_s - self._device_s
         self._least_late = inf
+
+
+class ArrivalClock:
+    """Times of one sensor's samples that come without any: arrivals, with the line's unevenness taken out.
+
+    A steady rate is assumed, and followed: where a line delivers several samples at once they are a period
+    apart. As nothing comes before it is measured, an early arrival corrects the times at once and a late one
+    slowly, unless it is so late that samples must be missing. After a pause the times begin anew.
+    """
+
+    def __init__(self) -> None:
+        """Start with no packet seen."""
+        self._count = 0
+        self._first_s = 0.0
+        self._period_s = 0.0
+        self._result = -inf
+
+    def host_time(self, arrival_s: float) -> float:
+        """Host time of a measurement, seconds; always larger than that of the call before."""
+        self._count += 1
+        expected_s = self._result + self._period_s
+        late = arrival_s - expected_s
+        if self._count == 1:
+            self._first_s = time_s = arrival_s
+        elif late > max(_PAUSE_S, _PAUSE_PERIODS * self._period_s):
+            # The period is as it was, if it is known.
+            if self._count <= _FIRST:
+                self._count, self._first_s = 1, arrival_s
+            time_s = arrival_s
+        elif self._count <= _FIRST:
+            if self._count == _FIRST:
+                self._period_s = max((arrival_s - self._first_s) / (_FIRST - 1), _SHORTEST_S)
+            time_s = arrival_s
+        else:
+            if late > max(_UNEVEN_S, 0.6 * self._period_s):
+                missing = round(late / self._period_s) * self._period_s
+                expected_s += missing
+                late -= missing
+            pull = late * (_PULL_BACK if late < 0.0 else _PULL_ON)
+            self._period_s = max(self._period_s + _PULL_PERIOD * pull, _SHORTEST_S)
+            time_s = expected_s + pull
+        self._result = max(self._result + STEP_S, time_s)
+        return self._result
+
+
+class HostClocks:
+    """The clocks of all sensors on a line whose arrivals are known.
+
+    Attributes:
+        devices: of the sensors that send a time.
+    """
+
+    def __init__(self, wrap_us: int) -> None:
+        """Start with no packet seen; the devices' clocks wrap at wrap_us."""
+        self.devices: dict[int, DeviceClock] = {}
+        self._arrivals: dict[int, ArrivalClock] = {}
+        self._wrap_us = wrap_us
+
+    def time(self, sensor: int, t_us: int | None, arrival_s: float) -> float:
+        """Host time of a measurement, seconds; t_us is None where the device sends no time."""
+        if t_us is not None:
+            clock = self.devices.get(sensor)
+            if clock is None:
+                clock = self.devices[sensor] = DeviceClock(self._wrap_us)
+            return clock.host_time(t_us, arrival_s)
+        arrivals = self._arrivals.get(sensor)
+        if arrivals is None:
+            arrivals = self._arrivals[sensor] = ArrivalClock()
+        return arrivals.host_time(arrival_s)
 
 
 class CaptureClock:
@@ -100,8 +180,9 @@ class CaptureClock:
     back or ahead (reboot; a pause over a minute), is set to the newest time reached.
     """
 
-    def __init__(self) -> None:
-        """Start with no packet seen."""
+    def __init__(self, wrap_us: int = WRAP_US) -> None:
+        """Start with no packet seen; the clocks wrap at wrap_us."""
+        self._wrap_us = wrap_us
         self._now: float | None = None
         self._offsets: dict[int, float] = {}
         self._last: dict[int, float] = {}  # result of each sensor's last packet
@@ -111,7 +192,7 @@ class CaptureClock:
         last = self._last.get(sensor)
         now = t_us * 1e-6 if self._now is None else self._now
         offset = self._offsets.get(sensor, 0.0)
-        result = unwrap(t_us, (now if last is None else last) - offset) + offset
+        result = unwrap(t_us, (now if last is None else last) - offset, self._wrap_us) + offset
         strange = abs(result - now) > 1.0 if last is None else not -_BACK_S < result - last < 60.0
         if strange:
             self._offsets[sensor] = now - t_us * 1e-6

@@ -16,13 +16,15 @@ import numpy as np
 
 from edgepose import __version__, calibration
 from edgepose.calibration import Calibration, HeadingReset, Hold, HoldSummary, MovedError
-from edgepose.cli.options import check_source, source_options
+from edgepose.cli.options import SourceFlags, source_options
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
 from edgepose.recording import read_recording
 from edgepose.rotations import Array
-from edgepose.sources import Batch, open_source
+from edgepose.sources import Batch
+from edgepose.sources.files import is_recording
+from edgepose.sources.sensor_map import read_map
 
 REPEATS = 3
 """How often a live hold with movement in it is tried again."""
@@ -105,11 +107,7 @@ def _body_frame(ctx: click.Context, param: click.Parameter, value: str) -> str:
     help="Time before each live hold, seconds.",
 )
 def calibrate(
-    port: str | None,
-    baud: int,
-    path: Path | None,
-    realtime: bool,
-    protocol: str,
+    source: SourceFlags,
     out: str,
     pose: str,
     body_frame: str,
@@ -120,16 +118,16 @@ def calibrate(
 ) -> None:
     """Find out how the six sensors sit on their wearer.
 
-    The wearer holds a pose for a few seconds, live (--port) or in a recording (--file). The calibration says
-    which way the wearer faces and how each sensor is turned on its bone; `edgepose run` needs it. Repeat it
-    whenever a sensor was taken off or slipped.
+    The wearer holds a pose for a few seconds, live (--port, --can) or in a recording (--file). The
+    calibration says which way the wearer faces and how each sensor is turned on its bone; `edgepose run`
+    needs it. Repeat it whenever a sensor was taken off or slipped.
 
     \b
       edgepose calibrate --port /dev/ttyUSB0
+      edgepose calibrate --sensors rig.toml --pose t-pose
       edgepose calibrate --file walk.csv --from 2.5 --body-frame heading:0 --out walk.json
     """
-    check_source(port, path)
-    live = port is not None or realtime
+    live = source.live
     if live and from_s is not None:
         raise click.UsageError("--from needs a recording that is read at once: --file without --realtime")
     if heading_reset == "live" and not live:
@@ -140,24 +138,29 @@ def calibrate(
     say = _Guide(err=out == "-")
     metadata: dict[str, Any] = {
         "program": f"edgepose {__version__}",
-        "source": port or str(path),
+        "source": source.name,
         "hold_s": hold,
     }
     reset: HeadingReset | None = None
     if heading_reset is not None and heading_reset != "live":
         say(f"Heading reset from {heading_reset}.")
-        lying, _ = _window(heading_reset, _read(Path(heading_reset), protocol), None, hold, say)
+        lying, _ = _window(
+            heading_reset,
+            _read(source._replace(file=Path(heading_reset), port=None, can=None)),
+            None,
+            hold,
+            say,
+        )
         reset = calibration.heading_offsets(lying)
     if live:
-        with open_source(port=port, baud=baud, file=path, realtime=realtime, protocol=protocol) as source:
-            batches = _all_reporting(iter(source), say)
+        with source.open() as opened:
+            batches = _all_reporting(iter(opened), say)
             if heading_reset == "live":
                 reset = _repeated(batches, "lying", countdown, hold, say, calibration.heading_offsets)
                 _wait_for_enter(batches, say)
             summary = _repeated(batches, pose, countdown, hold, say, calibration.check_hold)
     else:
-        assert path is not None
-        held, metadata["from_s"] = _window(str(path), _read(path, protocol), from_s, hold, say)
+        held, metadata["from_s"] = _window(source.name, _read(source), from_s, hold, say)
         if from_s is None:
             say("If the wearer stood in the pose at another time, say so with --from.")
         summary = calibration.check_hold(held, "choose a still part with --from, or record again")
@@ -176,6 +179,9 @@ def calibrate(
         heading_offset=None if reset is None else reset.offset,
         metadata=metadata,
     )
+    if source.sensors is not None:
+        for warning in read_map(source.sensors).mounting_warnings(calibration.mounting(result)):
+            click.echo(f"warning: {warning}", err=True)
     if out == "-":
         click.echo(calibration.to_json(result), nl=False)
     else:
@@ -212,15 +218,17 @@ def _check_writable(out: str) -> None:
 # --- recordings ---------------------------------------------------------------------------------------------
 
 
-def _read(path: Path, protocol: str) -> tuple[Hold, str | None]:
+def _read(source: SourceFlags) -> tuple[Hold, str | None]:
     """Everything in a recording or a raw capture, and what is wrong with its end."""
-    if path.suffix.lower() in (".csv", ".npz") or str(path) == "-":
+    path = source.file
+    assert path is not None
+    if is_recording(path):
         recording = read_recording(path)
         return calibration.hold_from_recording(recording), recording.damage
-    with open_source(file=path, protocol=protocol) as source:
+    with source._replace(realtime=False).open() as opened:
         return calibration.hold_from_samples(
-            chain.from_iterable(samples for _, samples in source)
-        ), source.damage
+            chain.from_iterable(samples for _, samples in opened)
+        ), opened.damage
 
 
 def _window(

@@ -3,46 +3,120 @@
 from __future__ import annotations
 
 import logging
+import sys
+from typing import TYPE_CHECKING
 
 import click
 
+from edgepose.errors import EdgeposeError
+
+if TYPE_CHECKING:
+    from edgepose.sources.probe import Finding
+
 
 @click.command()
-def devices() -> None:
-    """List the serial ports and CAN interfaces of this machine.
+@click.argument("names", nargs=-1, metavar="[PORT|INTERFACE:CHANNEL]...")
+@click.option(
+    "--probe",
+    is_flag=True,
+    help="Listen to each for some seconds, to the ports at the usual speeds, and tell protocol, sensor ids "
+    "and rates. Nothing is sent to the sensors.",
+)
+def devices(names: tuple[str, ...], probe: bool) -> None:
+    """List the serial ports and CAN interfaces of this machine, or those that are named.
 
     \b
-    Example:
+    Examples:
       edgepose devices
+      edgepose devices --probe
+      edgepose devices --probe /dev/ttyUSB0 slcan:/dev/ttyACM0
     """
+    ports = dict.fromkeys((name for name in names if not _is_bus(name)), "") if names else _ports()
+    buses = [name for name in names if _is_bus(name)] if names else None
+    if ports or not names:
+        click.echo("Serial ports (edgepose run --port NAME):")
+        width = max(map(len, ports), default=0)
+        for name, what in ports.items():
+            click.echo(f"  {name.ljust(width)}  {what}".rstrip())
+            if probe:
+                click.echo(f"    {_port_says(name)}")
+        if not ports:
+            click.echo(
+                "  none found; plug the hub in, or check that its driver is loaded and you may read it "
+                "(group dialout)"
+            )
+    if buses is None:
+        buses = _buses()
+    if buses or not names:
+        click.echo("CAN interfaces (edgepose run --can NAME):")
+        for name in buses:
+            click.echo(f"  {name}")
+            if probe:
+                click.echo(f"    {_bus_says(name)}")
+        if not buses:
+            click.echo("  none found; adapters on a serial port are named slcan:PORT")
+
+
+def _is_bus(name: str) -> bool:
+    # Not COM3, nor anything under /dev.
+    return ":" in name and not name.startswith("/")
+
+
+def _ports() -> dict[str, str]:
+    """Ports found and what is known of them."""
     from serial.tools import list_ports
 
-    ports = sorted(list_ports.comports())
-    click.echo("Serial ports (edgepose run --port NAME):")
-    width = max((len(port.device) for port in ports), default=0)
-    for port in ports:
+    result = {}
+    for port in sorted(list_ports.comports()):
         what = port.description if port.description != "n/a" else ""
         serial_number = f"serial number {port.serial_number}" if port.serial_number else ""
-        click.echo(
-            "  "
-            + "  ".join(part for part in (port.device.ljust(width), what, serial_number) if part).rstrip()
-        )
-    if not ports:
-        click.echo(
-            "  none found; plug the hub in, or check that its driver is loaded and you may read it "
-            "(group dialout)"
-        )
+        result[port.device] = "  ".join(part for part in (what, serial_number) if part)
+    return result
 
+
+def _buses() -> list[str]:
+    """CAN interfaces found."""
     # No CAN backend is configured here; importing python-can costs more than the rest of this command.
     import can
 
     # It tells of every vendor's library that is not installed.
     logging.getLogger("can").setLevel(logging.CRITICAL)
-    click.echo("CAN interfaces (python-can):")
-    channels = can.detect_available_configs(
+    found = can.detect_available_configs(
         interfaces=["socketcan", "pcan", "vector", "kvaser", "ixxat", "usb2can"]
     )
-    for config in channels:
-        click.echo(f"  {config['interface']}:{config['channel']}")
-    if not channels:
-        click.echo("  none found")
+    return [f"{config['interface']}:{config['channel']}" for config in found]
+
+
+def _port_says(name: str) -> str:
+    from edgepose.sources.probe import probe_port
+
+    _tell(name)
+    try:
+        finding, baud = probe_port(name)
+    except EdgeposeError as error:
+        return str(error)
+    return _says(finding, "bytes", f" at --baud {baud}")
+
+
+def _bus_says(name: str) -> str:
+    from edgepose.sources.probe import probe_bus
+
+    _tell(name)
+    try:
+        return _says(probe_bus(name), "frames", "")
+    except EdgeposeError as error:
+        return str(error)
+
+
+def _tell(name: str) -> None:
+    if sys.stderr.isatty():
+        click.echo(f"listening to {name} ...", err=True)
+
+
+def _says(finding: Finding, unit: str, speed: str) -> str:
+    if finding.protocol is None:
+        if not finding.amount:
+            return "nothing comes"
+        return f"{finding.amount} {unit} came, of no known protocol; the device may be set to another speed"
+    ids = ", ".join(f"id {sensor} at {rate:.0f} Hz" for sensor, rate in finding.rates_hz.items())
+    return f"--protocol {finding.protocol}{speed}: {ids}"

@@ -2,53 +2,146 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-Command = TypeVar("Command", bound=Callable[..., Any])
+from edgepose.errors import EdgeposeError
+from edgepose.placements import PLACEMENTS
+from edgepose.sources.detection import protocol_named
+from firmware_protocols.registry import PROTOCOLS
+
+if TYPE_CHECKING:
+    from edgepose.sources import Source
+
+BITS_PER_SECOND = click.IntRange(1)
 
 
-def source_options(command: Command) -> Command:
-    """Adds the flags that say where samples come from: --port, --baud, --file, --realtime, --protocol."""
+class SourceFlags(NamedTuple):
+    """Where samples come from; the fields are the arguments of `edgepose.sources.open_source`."""
+
+    port: str | None
+    baud: int | None
+    can: str | None
+    bitrate: int | None
+    fd: bool
+    file: Path | None
+    realtime: bool
+    protocol: str
+    sensors: Path | None
+
+    @property
+    def live(self) -> bool:
+        """Whether samples come at their own pace."""
+        return self.file is None or self.realtime
+
+    @property
+    def name(self) -> str:
+        """The source, for people."""
+        return ",".join(
+            str(name) for name in (self.file, self.port, self.can, self.sensors) if name is not None
+        )
+
+    def open(self, raw: list[tuple[float, Any]] | None = None) -> Source:
+        """The source; nothing is opened before it is entered.
+
+        Args:
+            raw: filled with what comes over live lines.
+
+        Raises:
+            EdgeposeError: a flag or the map of sensors means nothing.
+        """
+        from edgepose.sources import open_source
+
+        return open_source(**self._asdict(), raw=raw)
+
+
+def _protocol(ctx: click.Context, param: click.Parameter, value: str) -> str:
+    # The file of a pattern is read later.
+    if value != "auto" and not value.endswith(".toml"):
+        try:
+            protocol_named(value)
+        except EdgeposeError as error:
+            raise click.BadParameter(str(error)) from None
+    return value
+
+
+protocol_option = click.option(
+    "--protocol",
+    metavar="NAME|auto",
+    callback=_protocol,
+    default="auto",
+    show_default=True,
+    help=f"Wire format: {', '.join(PROTOCOLS)}, or a .toml file that describes text lines. auto "
+    "listens and decides.",
+)
+"""The flag --protocol."""
+
+sensors_option = click.option(
+    "--sensors",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="TOML file that says which port, bus and id is worn where; see docs/sensors.md. Names of "
+    "ports and buses in it need no --port and --can.  [default: ids in the usual order]",
+)
+"""The flag --sensors."""
+
+
+def source_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Adds the flags that say where samples come from; the command gets them as `source: SourceFlags`."""
     flags = [
         click.option(
             "--port",
-            metavar="PORT",
-            help="Serial port that the sensors send to, such as /dev/ttyUSB0 or COM3.",
+            metavar="PORT[,PORT...]",
+            help="Serial ports that the sensors send to, such as /dev/ttyUSB0 or COM3. Where each sensor has "
+            f"a port to itself: {', '.join(PLACEMENTS)}, in this order.",
         ),
         click.option(
             "--baud",
-            type=click.IntRange(1),
-            default=115200,
-            show_default=True,
-            help="Bits per second of the port.",
+            type=BITS_PER_SECOND,
+            help="Bits per second of the ports.  [default: the protocol's usual speed, or 115200]",
         ),
         click.option(
+            "--can",
+            metavar="INTERFACE:CHANNEL",
+            help="CAN bus that the sensors send to, as python-can names it: socketcan:can0, "
+            "slcan:/dev/ttyACM0, pcan:PCAN_USBBUS1.",
+        ),
+        click.option(
+            "--bitrate",
+            type=BITS_PER_SECOND,
+            help="Bits per second of the CAN bus; SocketCAN has its own.  [default: the protocol's usual "
+            "speed, or 500000]",
+        ),
+        click.option("--fd", is_flag=True, help="Take CAN FD frames too."),
+        click.option(
             "--file",
-            "path",
             type=click.Path(path_type=Path),
-            help="Recording (.csv, .npz) or raw serial capture (.bin, .raw) to read instead of a port.",
+            help="Read instead: a recording (.csv, .npz), a raw serial capture (.bin, .raw) or a log of a "
+            "CAN bus (.asc, .blf, .log, .mf4, .trc, .csv of python-can).",
         ),
         click.option(
             "--realtime", is_flag=True, help="Replay --file at its own pace instead of as fast as possible."
         ),
-        click.option(
-            "--protocol",
-            type=click.Choice(["auto", "native"]),
-            default="auto",
-            show_default=True,
-            help="Wire format of a port or a raw capture.",
-        ),
+        protocol_option,
+        sensors_option,
     ]
+
+    @functools.wraps(command)
+    def with_source(**words: Any) -> Any:
+        source = SourceFlags(*(words.pop(name) for name in SourceFlags._fields))
+        _check(source)
+        return command(source=source, **words)
+
     for flag in reversed(flags):
-        command = flag(command)
-    return command
+        with_source = flag(with_source)
+    return with_source
 
 
-def check_source(port: str | None, path: Path | None) -> None:
-    """Raises click.UsageError unless exactly one source is given."""
-    if (port is None) == (path is None):
-        raise click.UsageError("give one source: --port PORT or --file PATH")
+def _check(source: SourceFlags) -> None:
+    """Raises click.UsageError unless the flags name one source."""
+    lines = source.port is not None or source.can is not None
+    if (source.file is not None and lines) or not (lines or source.file or source.sensors):
+        raise click.UsageError("give one source: --port PORT, --can INTERFACE:CHANNEL or --file PATH")

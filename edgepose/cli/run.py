@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from edgepose.cli.options import check_source, source_options
+from edgepose.cli.options import SourceFlags, source_options
 from edgepose.cli.stop import Stop
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
@@ -41,11 +41,11 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--online",
-    type=click.Choice(["window", "stream"]),
-    default="window",
+    type=click.Choice(["stream", "window"]),
+    default="stream",
     show_default=True,
-    help="How a bidirectional model runs: anew over a window for each frame, or with its forward state "
-    "carried on (cheaper). A unidirectional one always carries its state.",
+    help="How a bidirectional model runs: with its forward state carried on, or anew over a window for each "
+    "frame, as in the paper (dearer). A unidirectional one always carries its state.",
 )
 @click.option(
     "--past",
@@ -71,11 +71,7 @@ if TYPE_CHECKING:
 )
 @click.option("--udp", metavar="HOST:PORT[,format=json|binary]", help="Send each pose as a datagram.")
 def run(
-    port: str | None,
-    baud: int,
-    path: Path | None,
-    realtime: bool,
-    protocol: str,
+    source: SourceFlags,
     calibration_path: Path,
     model: str,
     trust: bool,
@@ -93,12 +89,13 @@ def run(
     Examples:
       edgepose run --port /dev/ttyUSB0 --calibration calib.json --csv poses.csv --udp 127.0.0.1:9000
       edgepose run --port COM3 --calibration calib.json --model rnn --udp 10.0.0.5:9000,format=binary
+      edgepose run --can socketcan:can0 --protocol hipnuc-canopen --calibration calib.json --csv poses.csv
+      edgepose run --sensors rig.toml --calibration calib.json --udp 127.0.0.1:9000
       edgepose run --file walk.csv --calibration calib.json --csv - | head
     """
-    check_source(port, path)
     if csv_path is None and udp is None:
         raise click.UsageError("give at least one output: --csv FILE or --udp HOST:PORT")
-    for flag, given in (("--file", path), ("--calibration", calibration_path)):
+    for flag, given in (("--file", source.file), ("--calibration", calibration_path)):
         if given is not None and _is_same_file(csv_path, given):
             raise click.UsageError(f"--csv would overwrite {given}, which is {flag}; name another file")
 
@@ -107,7 +104,6 @@ def run(
     from edgepose.sinks import Sink
     from edgepose.sinks.csv_file import CsvSink
     from edgepose.sinks.udp import UdpSink, parse_destination
-    from edgepose.sources import open_source
 
     destination = None if udp is None else parse_destination(udp)
     calibration = load_calibration(calibration_path)
@@ -119,9 +115,7 @@ def run(
         raise click.UsageError(f"{model} is unidirectional: --future must be 0")
     with ExitStack() as stack:
         # The source is opened before the model is loaded: a wrong port is told at once.
-        source = stack.enter_context(
-            open_source(port=port, baud=baud, file=path, realtime=realtime, protocol=protocol)
-        )
+        opened = stack.enter_context(source.open())
         module = archive.load(info, trust)
         from edgepose.engine import StreamEngine, WindowEngine
         from edgepose.pipeline import run as run_pipeline
@@ -138,18 +132,18 @@ def run(
         way = "stream" if isinstance(engine, StreamEngine) else "window"
         _say(f"running {model} ({kind}, {way}); Ctrl-C ends the run")
         summary = run_pipeline(
-            source, clock, calibration, engine, sinks, _progress(), stopped=lambda: stop.asked
+            opened, clock, calibration, engine, sinks, _progress(), stopped=lambda: stop.asked
         )
         for sink in sinks:
             try:
                 sink.close()
             except EdgeposeError as error:
                 summary.error = summary.error or error
-    _report(summary, source, clock.dropped, rate, future, live=port is not None or realtime)
+    _report(summary, opened, clock.dropped, rate, future, live=source.live)
     if summary.error:
         raise summary.error
-    if source.damage:
-        raise EdgeposeError(source.damage)
+    if opened.damage:
+        raise EdgeposeError(opened.damage)
 
 
 def _is_same_file(output: str | None, given: Path) -> bool:

@@ -6,15 +6,15 @@
 
 `now_s` is the time on the source's clock up to which everything has been delivered. Live: Unix time, taken
 once at the start and carried on by the monotonic clock, so that it never jumps; a batch comes at least every
-20 ms, empty if need be. Files: their own times.
+20 ms, empty if need be, also while a line has disappeared. Files: their own times.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
@@ -61,42 +61,53 @@ class Source(AbstractContextManager["Source"], Protocol):
         """
 
 
+def total(counters: Iterable[Counters]) -> Counters:
+    """Counters of several lines together."""
+    return Counters(*(sum(column) for column in zip(Counters(), *counters, strict=True)))
+
+
 def open_source(
     *,
     port: str | None = None,
-    baud: int = 115200,
+    baud: int | None = None,
+    can: str | None = None,
+    bitrate: int | None = None,
+    fd: bool = False,
     file: Path | str | None = None,
     realtime: bool = False,
     protocol: str = "auto",
+    sensors: Path | str | None = None,
+    raw: list[tuple[float, Any]] | None = None,
 ) -> Source:
     """The source that the options ask for; nothing is opened before it is entered.
 
     Args:
-        port: serial port.
-        baud: its speed, bit/s.
-        file: recording (.csv, .npz, "-" for CSV on stdin) or raw serial capture (.bin, .raw).
+        port: serial ports, separated by commas.
+        baud: their speed, bit/s; None is the protocol's usual one, or 115200.
+        can: CAN bus, INTERFACE:CHANNEL.
+        bitrate: its speed, bit/s; None is the protocol's usual one, or 500000.
+        fd: take CAN FD frames too.
+        file: recording (.csv, .npz, "-" for CSV on stdin), raw serial capture (.bin, .raw) or log of a CAN
+            bus.
         realtime: deliver a file at its own pace.
-        protocol: what a port or a raw capture speaks; "auto" and "native" are known.
+        protocol: name of a wire format, a TOML file that describes text lines, or "auto".
+        sensors: map of devices to placements; ports and buses that it names need no `port` and `can`.
+        raw: filled with what comes over live lines: Unix time of arrival, s, and bytes or a CAN message.
 
     Raises:
-        EdgeposeError: no input or two, or a protocol or kind of file that is not known.
+        EdgeposeError: no input or two; a protocol, kind of file or entry of the map that means nothing.
     """
-    if protocol not in ("auto", "native"):
-        raise EdgeposeError(f"unknown protocol {protocol!r}; known are auto and native")
-    if (port is None) == (file is None):
-        raise EdgeposeError("give one input: --port or --file")
-    if port is not None:
-        # pyserial is not needed to read files.
-        from edgepose.sources.serial_port import SerialSource
+    if file is not None and (port is not None or can is not None):
+        raise EdgeposeError("give one input: --port or --can, or --file")
+    # What the kinds of input need is imported only for them.
+    from edgepose.sources.sensor_map import read_map
 
-        return SerialSource(port, baud)
-    from edgepose.sources.files import CaptureSource, RecordingSource
+    sensor_map = None if sensors is None else read_map(Path(sensors))
+    if file is not None:
+        from edgepose.sources.files import open_file
 
-    path = Path(str(file))
-    if path.suffix.lower() in (".bin", ".raw"):
-        return CaptureSource(path, realtime)
-    if path.suffix.lower() in (".csv", ".npz") or str(path) == "-":
-        return RecordingSource(path, realtime)
-    raise EdgeposeError(
-        f"{path}: unknown kind of file; recordings end in .csv or .npz, raw serial captures in .bin or .raw"
-    )
+        return open_file(Path(file), realtime, protocol, sensor_map)
+    from edgepose.sources.links import links
+    from edgepose.sources.live import LiveSource
+
+    return LiveSource(links(port, baud, can, bitrate, fd, protocol, sensor_map), raw)

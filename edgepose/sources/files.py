@@ -1,22 +1,33 @@
-"""Samples from recordings and from raw captures of a serial port."""
+"""Samples from recordings, raw captures of a serial port, and logs of CAN buses."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from math import inf
+from collections.abc import Callable, Iterator, Sequence
+from math import inf, isnan, nan
 from pathlib import Path
 from types import TracebackType
 
-from edgepose.clock import CaptureClock
+from edgepose.capture import read_capture
+from edgepose.clock import CaptureClock, HostClocks
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.recording import Recording, read_recording, samples
-from edgepose.sources import Batch, Counters
-from edgepose.sources.native_stream import NativeStream
+from edgepose.sources import Batch, Counters, Source, total
+from edgepose.sources.detection import Chunk, candidates, protocol_named
+from edgepose.sources.sensor_map import SensorMap, default_places
+from edgepose.sources.stream import Clock, Places, Stream
+from firmware_protocols.registry import Protocol
+
+CAPTURES = (".bin", ".raw")
+"""Endings of raw captures of a serial port."""
+
+CAN_LOGS = (".asc", ".blf", ".log", ".mf4", ".trc", ".db")
+"""Endings of logs that python-can reads, besides .csv."""
+
+Chunks = Callable[[Path], Iterator[tuple[str, float, Chunk]]]
 
 _SLICE_S = 0.01
-_CHUNK = 1 << 16
 
 
 class RecordingSource:
@@ -66,31 +77,35 @@ class RecordingSource:
             yield batch
 
 
-class CaptureSource:
-    """The bytes of a serial port in a file; device time is the clock."""
+class LogSource:
+    """What came over a serial port or CAN buses, in a file."""
 
-    def __init__(self, path: Path, realtime: bool) -> None:
+    def __init__(self, path: Path, realtime: bool, chunks: Chunks, stream: Callable[[str], Stream]) -> None:
         """Nothing is opened yet.
 
         Args:
             path: the file.
             realtime: deliver it at its own pace.
+            chunks: reads the file: name of a line, time in seconds, and what came over it.
+            stream: makes the stream of a line.
         """
         self._path = path
         self._realtime = realtime
-        self._stream = NativeStream(str(path))
+        self._chunks = chunks
+        self._stream = stream
+        self._streams: dict[str, Stream] = {}
 
     @property
     def counters(self) -> Counters:
         """What has come in so far."""
-        return self._stream.counters
+        return total(stream.counters for stream in self._streams.values())
 
     @property
     def damage(self) -> str | None:
-        """Always None: a capture may start and end anywhere."""
+        """Always None: a log may start and end anywhere."""
         return None
 
-    def __enter__(self) -> CaptureSource:
+    def __enter__(self) -> LogSource:
         """Check that the file can be read.
 
         Raises:
@@ -115,19 +130,127 @@ class CaptureSource:
         """
         yield from _batches(self._samples(), self._realtime)
         if not self.counters.packets:
-            raise EdgeposeError(
-                f"{self._path}: not one native packet of sensor ids 0 to 5 in {self._stream.byte_count} "
-                "bytes; is it a raw serial capture?"
-            )
+            raise EdgeposeError(f"{self._path}: {self._problem()}")
 
     def _samples(self) -> Iterator[ImuSample]:
-        clock = CaptureClock()
-        try:
-            with self._path.open("rb") as file:
-                while data := file.read(_CHUNK):
-                    yield from self._stream.feed(data, clock.time)
-        except OSError as error:
-            raise EdgeposeError(f"{self._path}: cannot read it: {error.strerror}") from None
+        for name, time_s, chunk in self._chunks(self._path):
+            stream = self._streams.get(name)
+            if stream is None:
+                stream = self._streams[name] = self._stream(name)
+            yield from stream.feed(chunk, time_s)
+        for stream in self._streams.values():
+            yield from stream.finish()
+
+    def _problem(self) -> str:
+        streams = self._streams.values()
+        unknown = sorted({sensor for stream in streams for sensor in stream.unknown_ids})
+        if unknown:
+            expected = next(stream.ids for stream in streams if stream.unknown_ids)
+            return (
+                f"packets only of sensor ids {', '.join(map(str, unknown))}, and known are {expected}; "
+                "say with --sensors which is where"
+            )
+        protocols = {stream.protocol.name for stream in streams if stream.protocol is not None}
+        what = " or ".join(sorted(protocols)) or "known"
+        amount = sum(stream.amount for stream in streams)
+        return (
+            f"not one {what} packet in {amount} bytes or frames; is it a raw capture? if so, check --protocol"
+        )
+
+
+def open_file(path: Path, realtime: bool, protocol: str, sensor_map: SensorMap | None) -> Source:
+    """The source that a file is.
+
+    Raises:
+        EdgeposeError: its kind, or the protocol, is not known.
+    """
+    if is_recording(path):
+        if protocol != "auto":
+            protocol_named(protocol)  # a wrong name is told although it would not be needed
+        return RecordingSource(path, realtime)
+    named = None if protocol == "auto" else protocol_named(protocol)
+    if is_can_log(path) and (named is None or named.transport == "can"):
+        from edgepose.sources.can_bus import read_log
+
+        protocols = candidates(protocol, "can", live=False)
+        return LogSource(path, realtime, read_log, _streams(path, protocols, sensor_map, _log_clock))
+    if path.suffix.lower() in CAPTURES or (named is not None and named.transport == "bytes"):
+        protocols = candidates(protocol, "bytes", live=False)
+        return LogSource(path, realtime, _read_capture, _streams(path, protocols, sensor_map, _capture_clock))
+    raise EdgeposeError(
+        f"{path}: unknown kind of file; recordings end in .csv or .npz, logs of CAN buses in "
+        f"{', '.join(CAN_LOGS)}, raw serial captures in {' or '.join(CAPTURES)} (with --protocol in anything)"
+    )
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a file is a recording, by its ending; a .csv may be a log of a CAN bus, by its first line."""
+    return str(path) == "-" or (path.suffix.lower() in (".csv", ".npz") and not is_can_log(path))
+
+
+def is_can_log(path: Path) -> bool:
+    """Whether a file is a log of a CAN bus, by its ending; a .csv by its first line."""
+    endings = [ending.lower() for ending in path.suffixes if ending.lower() != ".gz"]
+    if endings[-1:] != [".csv"] or path.suffix.lower() == ".gz":
+        return endings[-1:] != [] and endings[-1] in (*CAN_LOGS, ".csv")
+    try:
+        with path.open("rb") as file:
+            return file.readline(1000).startswith(b"timestamp,arbitration_id,")
+    except OSError:  # told where it is read
+        return False
+
+
+def _streams(
+    path: Path,
+    protocols: Sequence[Protocol],
+    sensor_map: SensorMap | None,
+    clock: Callable[[str], Callable[[int], Clock]],
+) -> Callable[[str], Stream]:
+    """Makes the streams of a file's lines."""
+    claimed: dict[int, str] = {}
+
+    def make(name: str) -> Stream:
+        whole = f"{path}: channel {name}" if name else str(path)
+
+        def places(protocol: Protocol) -> Places:
+            if sensor_map is None:
+                return default_places(whole, protocol, 0, 1)
+            # A capture does not say of which port it is.
+            return sensor_map.places(name) if name else sensor_map.all_places()
+
+        return Stream(whole, protocols, places, clock(whole), claimed)
+
+    return make
+
+
+def _log_clock(name: str) -> Callable[[int], Clock]:
+    return lambda wrap_us: HostClocks(wrap_us).time
+
+
+def _capture_clock(name: str) -> Callable[[int], Clock]:
+    """Where nobody noted when the bytes came, device time is the clock."""
+
+    def make(wrap_us: int) -> Clock:
+        capture, host = CaptureClock(wrap_us), HostClocks(wrap_us)
+
+        def time_of(sensor: int, t_us: int | None, arrival_s: float) -> float:
+            if not isnan(arrival_s):
+                return host.time(sensor, t_us, arrival_s)
+            if t_us is None:
+                raise EdgeposeError(
+                    f"{name}: its packets carry no time, and nobody noted when they came; "
+                    "make captures with edgepose record, or switch the device's time on"
+                )
+            return capture.time(sensor, t_us)
+
+        return time_of
+
+    return make
+
+
+def _read_capture(path: Path) -> Iterator[tuple[str, float, bytes]]:
+    for arrival_s, data in read_capture(path):
+        yield "", nan if arrival_s is None else arrival_s, data
 
 
 def _batches(rows: Iterator[ImuSample], realtime: bool) -> Iterator[Batch]:

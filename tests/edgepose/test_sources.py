@@ -1,6 +1,7 @@
 import contextlib
 import os
 import pty
+import re
 import threading
 import time
 import tty
@@ -15,7 +16,6 @@ from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 from edgepose.recording import csv_header, csv_row, read_recording, samples, write_csv
 from edgepose.sources import open_source
-from edgepose.sources.serial_port import SerialSource
 from edgepose.sync import FrameClock
 from firmware_protocols.native import Info, Packet, encode, encode_info
 
@@ -125,12 +125,12 @@ def test_unknown_ids_are_counted_and_told_once(port, caplog):
     ]
 
 
-def drain(name, monkeypatch, seconds=0.3):
+def drain(name, monkeypatch, seconds=0.3, **options):
     """The error in which a port ends, with the time-outs made short."""
-    monkeypatch.setattr("edgepose.sources.serial_port.SILENCE_S", seconds)
-    monkeypatch.setattr("edgepose.sources.serial_port.NOISE_S", seconds)
+    monkeypatch.setattr("edgepose.sources.live.SILENCE_S", seconds)
+    monkeypatch.setattr("edgepose.sources.live.NOISE_S", seconds)
     got = []
-    with open_source(port=name, baud=9600) as source, pytest.raises(EdgeposeError) as info:
+    with open_source(port=name, baud=9600, **options) as source, pytest.raises(EdgeposeError) as info:
         got.extend(sample for _, batch in source for sample in batch)
     assert str(info.value).startswith(f"{name}: ")
     assert "\n" not in str(info.value)
@@ -160,19 +160,62 @@ def test_only_unknown_ids(port, monkeypatch):
 
 def test_frame_with_z_down_is_refused(port, monkeypatch):
     with Device(port[0], [encode_info(Info(3, "x", frame="NED"))] * 100):
-        message, _ = drain(port[1], monkeypatch)
+        message, _ = drain(port[1], monkeypatch, protocol="native")
     assert "NED" in message
 
 
-def test_unplugged_port(port, monkeypatch):
-    master, name = port
-    with Device(master, chunks(30)) as device:
-        threading.Thread(
-            target=lambda: (device.join(), time.sleep(0.2), os.close(master)), daemon=True
-        ).start()
-        message, got = drain(name, monkeypatch, 5.0)
-    assert f"disappeared after {len(got)} packets" in message
-    assert len(got) > 100
+@pytest.fixture
+def link(tmp_path):
+    """A name for a port that can be plugged in and out: a symbolic link to a pty."""
+    open_fds = []
+
+    class Link:
+        path = tmp_path / "port"
+
+        def plug(self):
+            master, slave = pty.openpty()
+            tty.setraw(slave)
+            self.path.unlink(missing_ok=True)
+            self.path.symlink_to(os.ttyname(slave))
+            self.master = master
+            open_fds[:] = [master, slave]
+            return master
+
+        def unplug(self):
+            self.path.unlink()
+            while open_fds:
+                os.close(open_fds.pop())
+
+    result = Link()
+    yield result
+    for fd in open_fds:
+        os.close(fd)
+
+
+def test_a_port_that_goes_and_comes_back(link, caplog):
+    """Batches never stop; samples go on, later than all before, when the port is back."""
+    before, gap, after = [], [], []
+    link.plug()
+    with open_source(port=str(link.path)) as source:
+        batches = iter(source)
+        with Device(link.master, chunks(300)):
+            while len(before) < 200:
+                before += next(batches)[1]
+        link.unplug()
+        while "gone" not in caplog.text or len(gap) < 10:
+            now_s, batch = next(batches)
+            before += batch
+            gap.append(now_s)
+        assert all(b > a for a, b in pairwise(gap))
+        with Device(link.plug(), chunks(1000, start_us=5_000_000)):
+            while len(after) < 200:
+                after += next(batches)[1]
+    assert max(s.time_s for s in before) < min(s.time_s for s in after)
+    assert {s.sensor for s in after} == set(range(6))
+    told = [r.getMessage() for r in caplog.records]
+    assert len(told) == 2
+    assert told[0] == f"{link.path}: gone; the run goes on and waits for it"
+    assert re.fullmatch(rf"{link.path}: back after \d+\.\d s", told[1])
 
 
 def test_unknown_port():
@@ -206,7 +249,7 @@ def test_not_a_port(tmp_path):
 
 def test_impossible_speed(port):
     with pytest.raises(EdgeposeError, match="cannot open"):
-        SerialSource(port[1], -1).__enter__()
+        open_source(port=port[1], baud=-1).__enter__()
 
 
 # --- files --------------------------------------------------------------------------------------------------
@@ -282,11 +325,24 @@ def test_realtime_takes_its_time(tmp_path):
 
 
 def test_options():
-    for options in ({}, {"port": "a", "file": "b.csv"}):
-        with pytest.raises(EdgeposeError, match="--port or --file"):
+    for options in ({"port": "a", "file": "b.csv"}, {"can": "a:b", "file": "b.csv"}):
+        with pytest.raises(EdgeposeError, match="--port or --can, or --file"):
             open_source(**options)
-    with pytest.raises(EdgeposeError, match="unknown protocol"):
-        open_source(port="a", protocol="x")
+    with pytest.raises(EdgeposeError, match="--port, --can or --file"):
+        open_source()
+    for options in ({"port": "a"}, {"can": "virtual:a"}, {"file": "a.csv"}):
+        with pytest.raises(EdgeposeError, match="unknown protocol 'x'; known are auto, native, "):
+            open_source(**options, protocol="x")
     with pytest.raises(EdgeposeError, match="unknown kind"):
         open_source(file="a.txt")
+    with pytest.raises(EdgeposeError, match="a is there twice"):
+        open_source(port="a,b,a")
+    with pytest.raises(EdgeposeError, match="empty name"):
+        open_source(port="a,,b")
+    with pytest.raises(EdgeposeError, match="INTERFACE:CHANNEL"):
+        open_source(can="can0")
+    with pytest.raises(EdgeposeError, match="protocol native is one of serial lines; use it with --port"):
+        open_source(can="virtual:a", protocol="native")
+    with pytest.raises(EdgeposeError, match="protocol native-can is one of CAN; use it with --can"):
+        open_source(port="a", protocol="native-can")
     assert len(PLACEMENTS) == 6

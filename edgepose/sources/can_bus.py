@@ -1,0 +1,100 @@
+"""Frames of a CAN bus and of logs of one, through python-can."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+
+from edgepose.errors import EdgeposeError
+from edgepose.sources import POLL_S
+from edgepose.sources.live import Gone
+
+_MOST = 256
+"""Messages read at a time."""
+
+
+class CanBus:
+    """An open bus."""
+
+    def __init__(self, name: str, bitrate: int, fd: bool) -> None:
+        """Open it.
+
+        Args:
+            name: INTERFACE:CHANNEL, as python-can names them.
+            bitrate: speed, bit/s, for interfaces that are set up here; the system sets that of SocketCAN.
+            fd: take CAN FD frames too.
+
+        Raises:
+            EdgeposeError: no such interface or channel, or it cannot be opened.
+        """
+        interface, _, channel = name.partition(":")
+        if interface not in can.VALID_INTERFACES:
+            known = ", ".join(sorted(can.VALID_INTERFACES))
+            raise EdgeposeError(f"{name}: no CAN interface {interface!r}; python-can has {known}")
+        flags: dict[str, Any] = {"fd": True} if fd else {}
+        try:
+            self._bus = can.Bus(channel or None, interface, bitrate=bitrate, **flags)
+        # Every maker's library fails in its own way.
+        except Exception as error:
+            raise EdgeposeError(f"{name}: {_opening_problem(interface, channel, error)}") from None
+
+    def read(self) -> tuple[list[can.Message], bool]:
+        """See `live.Handle`."""
+        messages: list[can.Message] = []
+        timeout = POLL_S
+        try:
+            while len(messages) < _MOST:
+                try:
+                    message = self._bus.recv(timeout)
+                except ValueError:  # slcan's line was damaged
+                    continue
+                if message is None:
+                    return messages, False
+                timeout = 0.0
+                if not message.is_error_frame and not message.is_remote_frame:
+                    messages.append(message)
+        except (can.CanError, OSError):
+            if not messages:
+                raise Gone from None
+        return messages, True
+
+    def close(self) -> None:
+        """See `live.Handle`."""
+        with contextlib.suppress(can.CanError, OSError):  # it may have gone already
+            self._bus.shutdown()
+
+
+def _opening_problem(interface: str, channel: str, error: Exception) -> str:
+    text = (str(error).splitlines() or [""])[0] or type(error).__name__
+    if interface == "socketcan":
+        return (
+            f"cannot open it: {text}; bring it up with  "
+            f"sudo ip link set {channel or 'can0'} up type can bitrate 500000"
+        )
+    if isinstance(error, can.CanInterfaceNotImplementedError | ImportError):
+        return f"python-can cannot use this interface here: {text}; install the maker's driver and library"
+    return f"cannot open it: {text}; see python-can's page on {interface} for how its channels are named"
+
+
+def read_log(path: Path) -> Iterator[tuple[str, float, list[can.Message]]]:
+    """Channel, time in seconds, and message, of a log, in its order.
+
+    Raises:
+        EdgeposeError: it cannot be read, at once or up to its end.
+    """
+    try:
+        with can.LogReader(path) as messages:
+            for message in messages:
+                if not message.is_error_frame and not message.is_remote_frame:
+                    channel = "" if message.channel is None else str(message.channel)
+                    yield channel, message.timestamp, [message]
+    except OSError as error:
+        raise EdgeposeError(f"{path}: cannot read it: {error.strerror or error}") from None
+    # The readers of the formats fail in many ways.
+    except Exception as error:
+        text = (str(error).splitlines() or [""])[0] or type(error).__name__
+        raise EdgeposeError(f"{path}: cannot read it as a log of a CAN bus: {text}") from None

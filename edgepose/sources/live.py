@@ -1,0 +1,276 @@
+"""Live samples of any number of serial ports and CAN buses."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from queue import Empty, SimpleQueue
+from types import TracebackType
+from typing import Any, NamedTuple, Protocol
+
+from edgepose.clock import HostClocks
+from edgepose.errors import EdgeposeError
+from edgepose.imu import ImuSample
+from edgepose.placements import PLACEMENTS
+from edgepose.sources import POLL_S, Batch, Counters, total
+from edgepose.sources.detection import Chunk
+from edgepose.sources.stream import Clock, Places, Stream
+from firmware_protocols import registry
+
+_log = logging.getLogger(__name__)
+
+SILENCE_S = 5.0
+"""How long a line may say nothing at the start."""
+
+BACKLOG_S = 0.5
+"""Longest time to throw away what has waited, seconds; a line that is never empty is read from then on."""
+
+NOISE_S = 3.0
+"""How long there may be data at the start without one usable packet in them."""
+
+REOPEN_S = 0.5
+"""Time between two attempts to open a line that has gone, seconds."""
+
+_TWINS = 20  # jumps of a clock within a second that one device does not make
+
+
+class Gone(Exception):
+    """The port or bus has disappeared."""
+
+
+class Handle(Protocol):
+    """An open port or bus."""
+
+    def read(self) -> tuple[Chunk, bool]:
+        """What is there, waiting up to POLL_S for the first of it, and whether more waits already.
+
+        Raises:
+            Gone: there is nothing to read from any more.
+        """
+
+    def close(self) -> None:
+        """Give it free."""
+
+
+class Link(NamedTuple):
+    """One line to listen to.
+
+    Attributes:
+        name: port or bus, for messages.
+        open: opens it.
+        protocols: what it may speak.
+        places: its map of ids, once the protocol is known.
+        unit: what it carries, "bytes" or "frames".
+        check: what to check when nothing comes, and when nothing can be understood.
+    """
+
+    name: str
+    open: Callable[[], Handle]
+    protocols: Sequence[registry.Protocol]
+    places: Callable[[registry.Protocol], Places]
+    unit: str
+    check: tuple[str, str]
+
+
+class _Line:
+    """Reads one line in a thread, and opens it again when it was gone."""
+
+    def __init__(
+        self,
+        link: Link,
+        handle: Handle,
+        claimed: dict[int, str],
+        queue: SimpleQueue,
+        now: Callable[[], float],
+    ) -> None:
+        self.link = link
+        self.handle: Handle | None = handle
+        self.clocks: HostClocks | None = None
+        self.stream = Stream(link.name, link.protocols, link.places, self._clock, claimed)
+        self.jumps: dict[int, int] = {}  # of the devices' clocks, a second ago
+        self.twins = False
+        self._queue = queue
+        self._now = now
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True, name=link.name)
+
+    def _clock(self, wrap_us: int) -> Clock:
+        self.clocks = HostClocks(wrap_us)
+        return self.clocks.time
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self._drain()
+            while not self._stop.is_set():
+                try:
+                    assert self.handle is not None
+                    chunk, _ = self.handle.read()
+                    if chunk:
+                        self._queue.put((self, self._now(), chunk))
+                except Gone:
+                    self._reopen()
+        except BaseException as error:  # for the thread that can tell the user
+            self._queue.put((self, self._now(), error))
+
+    def _drain(self) -> None:
+        # What has waited since the line was opened is of unknown age, and full buffers have lost parts of it.
+        end_s = self._now() + BACKLOG_S
+        while self.handle is not None and self._now() < end_s:
+            try:
+                if not self.handle.read()[1]:
+                    return
+            except Gone:  # the next read tells
+                return
+
+    def _reopen(self) -> None:
+        gone_s = self._now()
+        assert self.handle is not None
+        self.handle.close()
+        self.handle = None
+        _log.warning("%s: gone; the run goes on and waits for it", self.link.name)
+        while not self._stop.wait(REOPEN_S):
+            try:
+                self.handle = self.link.open()
+            except EdgeposeError:
+                continue
+            _log.warning("%s: back after %.1f s", self.link.name, self._now() - gone_s)
+            self._drain()
+            return
+
+    def close(self) -> None:
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        if self.handle is not None:
+            self.handle.close()
+
+
+class LiveSource:
+    """Samples from serial ports and CAN buses. A line that disappears is opened again when it is back."""
+
+    def __init__(self, links: Sequence[Link], raw: list[tuple[float, Any]] | None = None) -> None:
+        """Nothing is opened yet.
+
+        Args:
+            links: what to listen to.
+            raw: filled with what comes: arrival in Unix time, seconds, and bytes or a CAN message.
+        """
+        self._links = links
+        self._raw = raw
+        self._lines: list[_Line] = []
+        self._queue: SimpleQueue = SimpleQueue()
+        self._unix_s = 0.0  # Unix time at 0 of the monotonic clock
+        self._open = ExitStack()
+
+    @property
+    def counters(self) -> Counters:
+        """What has come in so far."""
+        return total(line.stream.counters for line in self._lines)
+
+    @property
+    def damage(self) -> str | None:
+        """Always None: trouble is told when it happens."""
+        return None
+
+    def __enter__(self) -> LiveSource:
+        """Open all lines.
+
+        Raises:
+            EdgeposeError: one is not there, in use, or not allowed.
+        """
+        claimed: dict[int, str] = {}
+        with ExitStack() as stack:
+            for link in self._links:
+                handle = link.open()
+                stack.callback(handle.close)
+                line = _Line(link, handle, claimed, self._queue, self._now)
+                self._lines.append(line)
+            stack.pop_all()
+        for line in self._lines:
+            self._open.callback(line.close)
+        self._unix_s = time.time() - time.monotonic()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close all lines."""
+        self._open.close()
+
+    def __iter__(self) -> Iterator[Batch]:
+        """Batches as they come, without end.
+
+        Raises:
+            EdgeposeError: nothing usable comes at the start.
+        """
+        start_s = checked_s = self._now()
+        for line in self._lines:
+            line.start()
+        while True:
+            samples: list[ImuSample] = []
+            for line, arrival_s, chunk in self._waiting():
+                if isinstance(chunk, BaseException):
+                    raise chunk
+                if self._raw is not None:
+                    pieces = [chunk] if isinstance(chunk, bytes) else chunk
+                    self._raw += [(arrival_s, piece) for piece in pieces]
+                samples += line.stream.feed(chunk, arrival_s)
+            now_s = self._now()
+            yield now_s, samples
+            for line in self._lines:
+                _check_start(line, now_s, start_s)
+            if now_s - checked_s > 1.0:
+                checked_s = now_s
+                for line in self._lines:
+                    _warn_of_twins(line)
+
+    def _waiting(self) -> Iterator[tuple[_Line, float, Chunk | BaseException]]:
+        """What the lines have read, waiting a little for the first of it."""
+        try:
+            yield self._queue.get(timeout=POLL_S)
+            while True:
+                yield self._queue.get_nowait()
+        except Empty:
+            return
+
+    def _now(self) -> float:
+        return self._unix_s + time.monotonic()
+
+
+def _check_start(line: _Line, now_s: float, start_s: float) -> None:
+    stream, link = line.stream, line.link
+    if stream.first_s is None:
+        if now_s - start_s > SILENCE_S and line.handle is not None:
+            raise EdgeposeError(f"{link.name}: nothing came for {SILENCE_S:g} s; check {link.check[0]}")
+    elif now_s - stream.first_s > NOISE_S and not stream.counters.packets:
+        if stream.unknown_ids:
+            ids = ", ".join(map(str, stream.unknown_ids))
+            raise EdgeposeError(
+                f"{link.name}: packets come only of sensor ids {ids}; give the sensors the ids {stream.ids}, "
+                "or say with --sensors which is where"
+            )
+        what = "" if stream.protocol is None else f"{stream.protocol.name} "
+        raise EdgeposeError(
+            f"{link.name}: {stream.amount} {link.unit} in {NOISE_S:g} s and not one valid {what}packet; "
+            f"check {link.check[1]}"
+        )
+
+
+def _warn_of_twins(line: _Line) -> None:
+    """Two devices with one id look like a clock that jumps to and fro."""
+    devices = {} if line.clocks is None else line.clocks.devices
+    for place, clock in devices.items():
+        if clock.resets - line.jumps.get(place, 0) >= _TWINS and not line.twins:
+            line.twins = True
+            _log.warning(
+                "%s: the clock of the sensor for %s jumps to and fro; are there two devices with its id?",
+                line.link.name,
+                PLACEMENTS[place],
+            )
+        line.jumps[place] = clock.resets

@@ -1,0 +1,223 @@
+"""The file that says which device sits where (`--sensors`), and what is assumed without one."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Mapping
+from itertools import combinations
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from edgepose.errors import EdgeposeError
+from edgepose.placements import PLACEMENTS
+from edgepose.sources.stream import Places
+from firmware_protocols.registry import Protocol
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+_DIRECTION = "(left|right|up|down|forward|back)"
+_MOUNTING = re.compile(f"x {_DIRECTION}, z {_DIRECTION}")
+_AXIS = {"left": 0, "right": 0, "up": 1, "down": 1, "forward": 2, "back": 2}
+
+
+class Device(NamedTuple):
+    """Where the samples of a placement come from.
+
+    Attributes:
+        port: its serial port; None is any line.
+        can: its bus, INTERFACE:CHANNEL or the channel alone; None is any line.
+        id: its id on the line; None where it is the only device there.
+        mounting: how it is worn, in the words of `edgepose calibrate`.
+    """
+
+    port: str | None = None
+    can: str | None = None
+    id: int | None = None
+    mounting: str | None = None
+
+    @property
+    def line(self) -> str | None:
+        """Port or channel; None is any."""
+        return self.port or (None if self.can is None else channel(self.can))
+
+
+class PortSettings(NamedTuple):
+    """How a line is read, where that differs from the flags.
+
+    Attributes:
+        protocol: what it speaks.
+        baud: its speed, bit/s.
+    """
+
+    protocol: str | None = None
+    baud: int | None = None
+
+
+class SensorMap(NamedTuple):
+    """What a map file says.
+
+    Attributes:
+        path: the file, for messages.
+        devices: by placement, in the order of PLACEMENTS.
+        ports: settings by port or bus.
+    """
+
+    path: str
+    devices: Mapping[str, Device]
+    ports: Mapping[str, PortSettings]
+
+    def lines(self, key: str) -> list[str]:
+        """The ports ("port") or buses ("can") that the devices name, each once."""
+        named = [getattr(device, key) for device in self.devices.values()]
+        return [name for name in dict.fromkeys(named) if name is not None]
+
+    def settings(self, line: str) -> PortSettings:
+        """How a line is read."""
+        return self.ports.get(line, PortSettings())
+
+    def places(self, line: str) -> Places:
+        """Placements by id on one line."""
+        return {
+            device.id: i
+            for i, device in enumerate(self.devices.values())
+            if (device.port is None or device.port == line)
+            and (device.can is None or channel(device.can) == channel(line))
+        }
+
+    def all_places(self) -> Places:
+        """Placements by id, of a line whose name is not known."""
+        return {device.id: i for i, device in enumerate(self.devices.values())}
+
+    def mounting_warnings(self, found: list[str]) -> list[str]:
+        """One line for each sensor that is worn otherwise than the map says.
+
+        Args:
+            found: how they are worn, `calibration.mounting`.
+        """
+        return [
+            f"{name} sits {sits}, and {self.path} says {device.mounting}; "
+            "check that no two sensors are swapped and that it is the right way round"
+            for (name, device), sits in zip(self.devices.items(), found, strict=True)
+            if device.mounting not in (None, sits)
+        ]
+
+
+def channel(bus: str) -> str:
+    """The channel of a bus named INTERFACE:CHANNEL, or named by its channel alone."""
+    return bus.split(":", 1)[-1]
+
+
+def default_places(line: str, protocol: Protocol, index: int, count: int) -> Places:
+    """Placements by id on one line, without a map.
+
+    Args:
+        line: its name, for the message.
+        protocol: what it speaks.
+        index: number of the line, from 0.
+        count: how many lines there are.
+
+    Raises:
+        EdgeposeError: nothing can be assumed.
+    """
+    if protocol.alone and count == len(PLACEMENTS):
+        return {None: index}
+    if protocol.ids:
+        return {sensor: i for i, sensor in enumerate(protocol.ids)}
+    raise EdgeposeError(
+        f"{line}: which sensor is where? {protocol.name} has one sensor on a line: give six ports in the "
+        f"order {', '.join(PLACEMENTS)},\nor --sensors MAP.toml with a row for each, such as  "
+        f'{PLACEMENTS[0]} = {{ port = "{line}" }}'
+    )
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Content of a TOML file.
+
+    Raises:
+        EdgeposeError: it cannot be read or is none.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise EdgeposeError(f"{path}: cannot read it: {error.strerror}") from None
+    except ValueError as error:  # also not UTF-8
+        raise EdgeposeError(f"{path}: not valid TOML: {error}") from None
+
+
+def read_map(path: Path) -> SensorMap:
+    """The map in a file.
+
+    Raises:
+        EdgeposeError: it cannot be read, or an entry means nothing.
+    """
+    content = read_toml(path)
+    tables = content.pop("ports", {})
+    if not isinstance(tables, dict):
+        raise EdgeposeError(f'{path}: ports must be tables, such as  [ports."/dev/ttyUSB0"]')
+    unknown = [name for name in content if name not in PLACEMENTS]
+    if unknown:
+        raise EdgeposeError(
+            f"{path}: unknown placement {unknown[0]!r}; placements are {', '.join(PLACEMENTS)}"
+        )
+    missing = [name for name in PLACEMENTS if name not in content]
+    if missing:
+        raise EdgeposeError(f"{path}: no entry for {', '.join(missing)}; all six sensors need one")
+    devices = {name: _device(f"{path}: {name}", content[name]) for name in PLACEMENTS}
+    for (other, before), (name, device) in combinations(devices.items(), 2):
+        lines = {device.line, before.line}
+        same_line = len(lines) == 1 or None in lines
+        if same_line and (device.id == before.id or (len(lines) == 1 and None in (device.id, before.id))):
+            raise EdgeposeError(
+                f"{path}: {name} and {other} are the same device; give each a port or id of its own"
+            )
+    return SensorMap(str(path), devices, {n: _port(f"{path}: ports.{n}", t) for n, t in tables.items()})
+
+
+def _device(where: str, entry: object) -> Device:
+    table = _table(where, entry, Device._fields)
+    device = Device(**table)
+    for key in ("port", "can", "mounting"):
+        _check_type(where, table, key, str, "text in quotes")
+    _check_type(where, table, "id", int, "a whole number")
+    if device.id is not None and device.id < 0:
+        raise EdgeposeError(f"{where}: id must be 0 or more, not {device.id}")
+    if device.port is not None and device.can is not None:
+        raise EdgeposeError(f"{where}: give port or can, not both")
+    if device.port is None and device.can is None and device.id is None:
+        raise EdgeposeError(f"{where}: say where its samples come from: port, can or id")
+    if device.mounting is not None:
+        words = _MOUNTING.fullmatch(device.mounting)
+        if words is None or _AXIS[words[1]] == _AXIS[words[2]]:
+            raise EdgeposeError(
+                f'{where}: mounting must be as calibrate prints it, such as "x up, z back", '
+                f"not {device.mounting!r}"
+            )
+    return device
+
+
+def _port(where: str, entry: object) -> PortSettings:
+    table = _table(where, entry, PortSettings._fields)
+    _check_type(where, table, "protocol", str, "text in quotes")
+    _check_type(where, table, "baud", int, "a whole number")
+    if table.get("baud", 1) < 1:
+        raise EdgeposeError(f"{where}: baud must be 1 or more, not {table['baud']}")
+    return PortSettings(**table)
+
+
+def _table(where: str, entry: object, keys: tuple[str, ...]) -> dict[str, Any]:
+    if not isinstance(entry, dict):
+        raise EdgeposeError(f'{where}: must be a table, such as  {{ port = "/dev/ttyUSB0" }}')
+    for key in entry:
+        if key not in keys:
+            raise EdgeposeError(f"{where}: unknown key {key!r}; keys are {', '.join(keys)}")
+    return entry
+
+
+def _check_type(where: str, table: Mapping[str, Any], key: str, kind: type, what: str) -> None:
+    # A bool is an int to isinstance.
+    if key in table and type(table[key]) is not kind:
+        raise EdgeposeError(f"{where}: {key} must be {what}, not {table[key]!r}")
