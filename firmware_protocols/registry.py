@@ -42,8 +42,8 @@ class Protocol:
             a device has an id on its line, `sample.sensor` is it.
         ids: ids of six devices on one line when nothing else is said; empty where nothing is usual.
         alone: a device usually has a line to itself.
-        request: what has to be sent to the device with an id for one sample, where devices speak only when
-            asked.
+        request: what has to be sent to the device with an id for one sample, and the length of its answer,
+            where devices speak only when asked.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Protocol:
     encoder: Callable[[], Encode]
     ids: Sequence[int] = ()
     alone: bool = False
-    request: Callable[[int], bytes] | None = None
+    request: Callable[[int], tuple[bytes, int]] | None = None
 
     @property
     def wrap_us(self) -> int:
@@ -171,8 +171,9 @@ def _text(pattern: str) -> Callable[[], Encode]:
     return make
 
 
-def _wit_request(sensor: int) -> bytes:
-    return _module("witmotion").poll(sensor)
+def _wit_request(sensor: int) -> tuple[bytes, int]:
+    module = _module("witmotion")
+    return module.poll(sensor), 5 + 2 * module.ANGLE_REGISTERS
 
 
 # --- table ----------------------------------------------------------------------------------------
