@@ -85,7 +85,7 @@ def _read_times(path: Path) -> Iterator[tuple[float, int]]:
                 first, second = line.split(",")
                 row = float(first), int(second)
             except ValueError:
-                row = (0.0, 0)
+                row = (-1.0, -1)
             if not (arrival_s <= row[0] < 1e11 and end <= row[1]):
                 raise EdgeposeError(
                     f"{path}: row {number} is damaged; delete the file to read the capture without its times"

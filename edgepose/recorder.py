@@ -19,14 +19,12 @@ from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
 from edgepose.recording import csv_header, csv_row, salvage_recording, write_npz
 from edgepose.sources import Source
+from edgepose.sources.files import CAPTURES
 
-CAN_LOGS = (".asc", ".blf", ".log", ".trc")
-"""Endings of the CAN logs that are written."""
+CAN_LOGS = (".asc", ".blf", ".log")
+"""Endings of the CAN logs that are written. More are read; python-can's writer of .trc drops CAN FD frames."""
 
-CAPTURES = (".bin", ".raw")
-"""Endings of raw captures of a serial port."""
-
-_JOURNALS = {".npz": ".part.csv", ".asc": ".part.log", ".blf": ".part.log", ".trc": ".part.log"}
+_JOURNALS = {".npz": ".part.csv", ".asc": ".part.log", ".blf": ".part.log"}
 
 
 class Output(NamedTuple):
@@ -229,12 +227,20 @@ def _can_log(path: Path) -> Output:
     writer = can.CanutilsLogWriter(cast(TextIO, _TextFile(file)))
 
     def take(arrival_s: float, message: can.Message) -> None:
+        # The adapter's own clock may start anywhere; decoding it again has to give the same times.
+        message.timestamp = arrival_s
         writer.on_message_received(message)
 
     def convert(part: Path) -> None:
-        with can.CanutilsLogReader(journal) as reader, can.Logger(part) as log:
-            for message in reader:
-                log.on_message_received(message)
+        try:
+            with can.CanutilsLogReader(journal) as reader, can.Logger(part) as log:
+                for message in reader:
+                    log.on_message_received(message)
+        except OSError:
+            raise
+        # The writers of the formats fail in many ways.
+        except Exception as error:
+            raise EdgeposeError(f"{path}: python-can cannot write it: {error}") from None
 
     def finish() -> None:
         if journal != path:

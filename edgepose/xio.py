@@ -29,6 +29,11 @@ _METADATA = {
 }
 
 
+def is_sensor(folder: Path) -> bool:
+    """Whether a folder is one of an x-io sensor."""
+    return (folder / MAIN_FILE).exists()
+
+
 def is_session(folder: Path) -> bool:
     """Whether a folder holds folders of x-io sensors."""
     return any(folder.glob(f"*/{MAIN_FILE}"))

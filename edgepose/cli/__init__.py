@@ -14,7 +14,7 @@ import click
 from edgepose import __version__
 from edgepose.errors import EdgeposeError
 
-COMMANDS = ("calibrate", "devices", "models", "run")
+COMMANDS = ("calibrate", "convert", "devices", "models", "record", "run")
 """Commands of the runtime; others are found through the entry-point group `edgepose.commands`."""
 
 

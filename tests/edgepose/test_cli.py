@@ -73,7 +73,18 @@ def test_every_flag_is_explained(name):
 
 def test_all_commands_are_listed():
     output, _ = imported("--help")
-    for name in ("calibrate", "devices", "models", "run", "synthesize", "train", "evaluate", "export"):
+    for name in (
+        "calibrate",
+        "convert",
+        "devices",
+        "models",
+        "record",
+        "run",
+        "synthesize",
+        "train",
+        "evaluate",
+        "export",
+    ):
         assert re.search(rf"^  {name} ", output, re.MULTILINE)
 
 

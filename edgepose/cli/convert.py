@@ -1,0 +1,105 @@
+"""`edgepose convert`: recordings of any kind to CSV or NPZ, many at once."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from edgepose.cli.options import protocol_option, sensors_option
+from edgepose.errors import EdgeposeError
+
+if TYPE_CHECKING:
+    from edgepose.converter import Result
+
+
+@click.command()
+@click.argument(
+    "inputs", nargs=-1, required=True, metavar="IN...", type=click.Path(path_type=Path, allow_dash=True)
+)
+@click.option("--to", required=True, type=click.Choice(["csv", "npz"]), help="Kind of recording to write.")
+@click.option(
+    "--out",
+    required=True,
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Folder to write to; made if it is not there.",
+)
+@protocol_option
+@sensors_option
+@click.option(
+    "--jobs",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="Recordings converted at a time, each by a process of its own.",
+)
+@click.option("--skip-existing", is_flag=True, help="Leave out recordings whose output is there already.")
+def convert(
+    inputs: tuple[Path, ...],
+    to: str,
+    out: Path,
+    protocol: str,
+    sensors: Path | None,
+    jobs: int,
+    skip_existing: bool,
+) -> None:
+    """Convert recordings: CSV, NPZ, raw captures of a port, logs of a CAN bus, sessions of x-io's software.
+
+    IN are files, patterns and folders. A folder stands for the recordings in it, at any depth; one that holds
+    a folder for each x-io sensor is one recording, whose sensors' folders have placements in their names (or,
+    with --sensors, their serial numbers as ids: id = 0x64F61CB3). Of a damaged recording what is good is
+    written, and the exit code is 1.
+
+    \b
+    Examples:
+      edgepose convert walk.npz --to csv --out .
+      edgepose convert sessions/ "more/*.bin" --to npz --out recordings --jobs 4
+      edgepose convert walk.part.csv --to npz --out saved
+    """
+    from edgepose.converter import Result, convert_all, plan
+    from edgepose.sources.sensor_map import read_map
+
+    if sensors is not None:
+        read_map(sensors)  # a mistake in it is told once
+    planned = plan(inputs, to, out)
+    done = {job: Result(job, skipped=True) for job in planned if skip_existing and job.target.exists()}
+    todo = [job for job in planned if job not in done]
+    try:
+        for result in _with_progress(convert_all(todo, protocol, sensors, jobs), len(todo)):
+            done[result.job] = result
+    finally:
+        click.echo(_table([done[job] for job in planned if job in done]))
+    failed = sum(result.problem is not None for result in done.values())
+    if failed:
+        raise EdgeposeError(
+            f"{failed} of {len(planned)} recordings not or not wholly converted; see the table"
+        )
+
+
+def _with_progress(results: Iterable[Result], count: int) -> Iterator[Result]:
+    """The results, with a bar on a terminal and a line for each elsewhere."""
+    from edgepose.converter import describe
+
+    if sys.stderr.isatty():
+        with click.progressbar(length=count, label="Converting", file=sys.stderr, show_pos=True) as bar:
+            for result in results:
+                bar.update(1)
+                yield result
+        return
+    for number, result in enumerate(results, start=1):
+        click.echo(f"{number} of {count}  {result.job.source}: {describe(result)}", err=True)
+        yield result
+
+
+def _table(results: Sequence[Result]) -> str:
+    from edgepose.converter import describe
+
+    width = max([len("file"), *(len(str(result.job.source)) for result in results)])
+    lines = [f"{'file':{width}}  {'samples':>9}  {'seconds':>9}  result"]
+    for result in results:
+        counts = f"{result.samples:9d}  {result.seconds:9.1f}" if result.samples else f"{'-':>9}  {'-':>9}"
+        lines.append(f"{result.job.source!s:{width}}  {counts}  {describe(result)}")
+    return "\n".join(lines)
