@@ -22,7 +22,7 @@ from edgepose.sources import Source
 from edgepose.sources.files import CAPTURES
 
 CAN_LOGS = (".asc", ".blf", ".log")
-"""Endings of the CAN logs that are written. More are read; python-can's writer of .trc drops CAN FD frames."""
+"""Endings of the CAN logs that are written; of .trc, python-can's writer would drop the CAN FD frames."""
 
 _JOURNALS = {".npz": ".part.csv", ".asc": ".part.log", ".blf": ".part.log"}
 
