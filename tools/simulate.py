@@ -40,6 +40,9 @@ from firmware_protocols.rotation import rotate_back
 from firmware_protocols.sample import Sample
 
 CLIP_RATE, CLIP_HEIGHT_M, CLIP_HOLD_S = 100.0, 1.75, 6.0
+ANSWER_BITS_S = 115_200
+"""Speed of a line on which devices are asked; a pty alone has none, and they would answer at once."""
+
 FIELD_UT = (0.0, 20.0, -40.0)
 """Magnetic field in the inertial frame, for formats that cannot do without one."""
 
@@ -371,7 +374,9 @@ class Player:
         for request, sensor in self._requests.items():
             if request in asked:
                 asked = asked.replace(request, b"")
-                self._queue(sensor, line, time.monotonic())
+                if sensor.wire is not None:
+                    bits = 10 * (len(request) + len(sensor.wire))
+                    self._queue(sensor, line, time.monotonic() + bits / ANSWER_BITS_S)
         self._asked[line] = asked[-64:]
 
     def _queue(self, sensor: Sensor, line: int, due: float) -> None:
