@@ -6,12 +6,16 @@ counted from power-up, so every sensor has its own zero.
 
 from __future__ import annotations
 
+import re
 import struct
-from math import cos, degrees, radians, sin
+from math import degrees, radians
 from typing import ClassVar
 
 from firmware_protocols import rotation
-from firmware_protocols.sample import GRAVITY, Counters, Quaternion, Sample
+from firmware_protocols._numbers import int16
+from firmware_protocols._sequence import count_byte
+from firmware_protocols._stream import StreamDecoder
+from firmware_protocols.sample import GRAVITY, Quaternion, Sample
 
 FRAME_BYTES = 19
 """Bytes of a frame, header and checksum included."""
@@ -21,18 +25,17 @@ ORDERS = ("zxy", "zyx", "zyx-swapped")
 
 _HEADER = b"\xaa\xaa"
 _FRAME = struct.Struct("<xxB6h3xx")
-_HALF = radians(0.01) / 2
+_STEP = radians(0.01)
 _MG = GRAVITY / 1000
 _MAX_TEXT = 256
 
 
-class Decoder:
-    """Samples out of a byte stream that may be cut anywhere, start anywhere and contain noise.
-
-    Sensor is 0 and the time None.
-    """
+class Decoder(StreamDecoder):
+    """Samples out of a byte stream; sensor is 0 and the time None."""
 
     WRAP_US: ClassVar[int] = 1 << 64
+
+    _START = re.compile(rb"\xaa(?:\xaa|\Z)")
 
     def __init__(self, order: str = "zxy", clockwise: bool = True) -> None:
         """Start with nothing seen.
@@ -48,75 +51,43 @@ class Decoder:
         Raises:
             ValueError: order is not one of ORDERS.
         """
-        self.counters = Counters()
+        super().__init__()
         self._order = _checked(order)
-        self._yaw_half = -_HALF if clockwise else _HALF
-        self._rest = b""
-        self._bad = False
+        self._yaw_step = -_STEP if clockwise else _STEP
         self._text = b""  # what stood between two frames, as long as it is text
         self._index: int | None = None
 
-    def feed(self, data: bytes) -> list[Sample]:
-        """Samples completed by the next bytes of the stream, in the order they came."""
-        self.counters.bytes += len(data)
-        data = self._rest + data if self._rest else data
-        samples = []
-        at, end = 0, len(data)
-        while True:
-            start = data.find(_HEADER, at)
-            if start < 0:
-                # The last byte may be the first half of a header.
-                start = end - (data[at:].endswith(b"\xaa"))
-                self._skip(data[at:start])
-                break
-            if start > at:
-                self._skip(data[at:start])
-                at = start
-            if end - start < FRAME_BYTES:
-                break
-            sample = self._frame(data[start : start + FRAME_BYTES])
-            if sample is None:
-                # AA AA also occurs inside frames: go on one byte later.
-                self._skip(data[start : start + 1])
-                at = start + 1
-            else:
-                samples.append(sample)
-                at = start + FRAME_BYTES
-        self._rest = data[start:]
-        return samples
+    def _length(self, buffer: bytes, at: int) -> int:
+        return FRAME_BYTES
 
-    def _skip(self, junk: bytes) -> None:
-        if junk:
-            if not self._bad:
-                self._bad = True
-                self.counters.bad += 1
-            self._text = (self._text + junk)[-_MAX_TEXT:]
+    def _intact(self, buffer: bytes, at: int, length: int) -> bool:
+        _, a, b, c, *_ = _FRAME.unpack_from(buffer, at)
+        return (
+            sum(buffer[at + 2 : at + 18]) & 0xFF == buffer[at + 18]
+            and -18000 <= a <= 18000
+            and -18000 <= b <= 18000
+            and -18000 <= c <= 18000
+        )
 
-    def _frame(self, frame: bytes) -> Sample | None:
-        if sum(frame[2:18]) & 0xFF != frame[18]:
-            return None
+    def _message(self, frame: bytes, samples: list[Sample]) -> None:
         index, a, b, c, x, y, z = _FRAME.unpack(frame)
-        if not (-18000 <= a <= 18000 and -18000 <= b <= 18000 and -18000 <= c <= 18000):
-            return None
-        if self._bad:
-            self._bad = False
-            self.counters.resyncs += 1
-        if self._index is not None:
-            # The sensor greets with lines of text when it starts.
-            if b"%" in self._text and self._text.isascii():
-                self.counters.restarts += 1
-            elif index != self._index:
-                # The same index again is a device that does not count.
-                self.counters.lost += (index - self._index - 1) & 0xFF
+        # The sensor greets with lines of text when it starts.
+        if self._index is not None and b"%" in self._text and self._text.isascii():
+            self.counters.restarts += 1
+        else:
+            count_byte(self.counters, self._index, index)
         self._index = index
         self._text = b""
-        self.counters.packets += 1
-        return Sample(
-            0,
-            None,
-            _quaternion(a * self._yaw_half, b * _HALF, c * _HALF, self._order),
-            (x * _MG, y * _MG, z * _MG),
-        )
+        quat = _quaternion(a * self._yaw_step, b * _STEP, c * _STEP, self._order)
+        self._give(Sample(0, None, quat, (x * _MG, y * _MG, z * _MG)), samples)
+
+    def _bad_frame(self, start: int, end: int) -> None:
+        self._text = _HEADER  # no text
+        super()._bad_frame(start, end)
+
+    def _noise(self, data: bytes, start: int) -> None:
+        self._text = (self._text + data)[-_MAX_TEXT:]
+        super()._noise(data, start)
 
 
 def _checked(order: str) -> str:
@@ -126,19 +97,14 @@ def _checked(order: str) -> str:
 
 
 def _quaternion(a: float, b: float, c: float, order: str) -> Quaternion:
-    """Of half angles, radians."""
-    ca, sa = cos(a), sin(a)
+    """Of angles in radians."""
     if order == "zxy":
-        cx, sx, cy, sy = cos(b), sin(b), cos(c), sin(c)
-        return (
-            ca * cx * cy - sa * sx * sy,
-            ca * sx * cy - sa * cx * sy,
-            ca * cx * sy + sa * sx * cy,
-            sa * cx * cy + ca * sx * sy,
-        )
+        # Turned by 90 degrees about Z: Y becomes X, X becomes -Y.
+        w, x, y, z = rotation.from_yaw_pitch_roll(a, -b, c)
+        return (w, -y, x, z)
     if order == "zyx":
         b, c = c, b
-    return rotation.from_yaw_pitch_roll(2 * a, 2 * c, 2 * b)
+    return rotation.from_yaw_pitch_roll(a, c, b)
 
 
 def encode(sample: Sample, index: int, *, order: str = "zxy", clockwise: bool = True) -> bytes:
@@ -159,9 +125,6 @@ def encode(sample: Sample, index: int, *, order: str = "zxy", clockwise: bool = 
         if order == "zyx":
             b, c = c, b
     angles = [round(100 * degrees(angle)) for angle in (-a if clockwise else a, b, c)]
-    try:
-        force = [min(max(round(x / _MG), -32768), 32767) for x in sample.acc]
-    except (ValueError, OverflowError):
-        raise ValueError(f"cannot send {sample}") from None
+    force = [int16(x / _MG) for x in sample.acc]
     body = struct.pack("<B6h3x", index & 0xFF, *angles, *force)
     return _HEADER + body + bytes([sum(body) & 0xFF])

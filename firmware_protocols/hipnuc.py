@@ -9,19 +9,19 @@ import re
 import struct
 from binascii import crc_hqx
 from collections.abc import Iterable
-from math import isfinite, radians
+from math import radians
 
-from firmware_protocols._stream import StreamDecoder
-from firmware_protocols.rotation import from_yaw_pitch_roll
-from firmware_protocols.sample import GRAVITY, Counters, Quaternion, Sample, Vector3, unit_quaternion
+from firmware_protocols._numbers import int16, number, plausible, vector
+from firmware_protocols._sequence import count_byte
+from firmware_protocols._stream import Receiver, StreamDecoder
+from firmware_protocols.pairing import Usual
+from firmware_protocols.rotation import from_angles, from_yaw_pitch_roll
+from firmware_protocols.sample import GRAVITY, CanFrame, Quaternion, Sample, Vector3, unit_quaternion
 
 _SYNC = b"\x5a\xa5"
 
 MAX_NODES = 16
 """Most nodes that one wireless receiver serves."""
-
-CanFrame = tuple[int, bytes, bool]
-"""Identifier, data, whether the identifier is extended."""
 
 _HEADER = 6
 _BLOCK = 76  # bytes of an 0x91 item
@@ -80,17 +80,24 @@ def _unit(w: float, x: float, y: float, z: float) -> Quaternion:
     return quat
 
 
-def _scaled(values: Iterable[float], scale: float) -> Vector3:
-    x, y, z = values
-    if not isfinite(x + y + z):
-        raise ValueError("NaN or infinity")
-    return (x * scale, y * scale, z * scale)
+def _scaled(values: tuple[float, ...], scale: float) -> Vector3:
+    result = vector(values, scale)
+    if result is None:
+        raise ValueError("NaN, infinity, or too large")
+    return result
 
 
-def _field(values: Iterable[float], scale: float) -> Vector3 | None:
+def _temperature(data: bytes, at: int) -> float:
+    value = number(struct.unpack_from("<f", data, at)[0])
+    if value is None:
+        raise ValueError("NaN, infinity, or too large")
+    return value
+
+
+def _field(values: tuple[float, ...], scale: float) -> Vector3 | None:
     """A magnetic field; devices without a magnetometer send zeros."""
-    vector = _scaled(values, scale)
-    return vector if any(vector) else None
+    field = _scaled(values, scale)
+    return field if any(field) else None
 
 
 def _integer_angles(data: bytes, start: int) -> Quaternion:
@@ -102,9 +109,8 @@ def _integer_angles(data: bytes, start: int) -> Quaternion:
 def _block(data: bytes, start: int, sensor: int | None) -> Sample:
     """Sample of an 0x91 item. Without a given sensor its second byte is the node id, and time 0 is none."""
     node, degrees, ms, ax, ay, az, gx, gy, gz, mx, my, mz, w, x, y, z = _HI91.unpack_from(data, start)
-    # Sums of a few binary32 values cannot overflow here, so one is finite only if all its terms are.
-    if not isfinite(ax + ay + az + gx + gy + gz + mx + my + mz):
-        raise ValueError("NaN or infinity")
+    if not plausible((ax, ay, az, gx, gy, gz, mx, my, mz)):
+        raise ValueError("NaN, infinity, or too large")
     return Sample(
         node if sensor is None else sensor,
         None if sensor is None and not ms else ms * 1000,
@@ -141,9 +147,7 @@ def _fields(data: bytes, start: int, mask: int, sensor: int) -> tuple[Sample, in
         elif bit == _TIME_BIT:
             time_us = int.from_bytes(data[at : at + 8], "little") % _WRAP_US
         elif bit == _TEMPERATURE_BIT:
-            (temperature,) = struct.unpack_from("<f", data, at)
-            if not isfinite(temperature):
-                raise ValueError("NaN or infinity")
+            temperature = _temperature(data, at)
         elif bit == _NODE_BIT:
             sensor = data[at]
         at += size
@@ -270,7 +274,9 @@ def _single_items(data: bytes, at: dict[int, int]) -> Sample:
         quat = _unit(*_QUAT_F.unpack_from(data, at[0xD1]))
     elif 0xD9 in at:
         pitch, roll, yaw = _scaled(_VECTOR_F.unpack_from(data, at[0xD9]), _DEG)
-        quat = from_yaw_pitch_roll(yaw, pitch, roll)
+        quat = from_angles(yaw, pitch, roll)
+        if quat is None:
+            raise ValueError("angles beyond a turn")
     elif 0xD0 in at:
         quat = _integer_angles(data, at[0xD0])
     for tag in (0xA0, 0xA1):
@@ -282,9 +288,7 @@ def _single_items(data: bytes, at: dict[int, int]) -> Sample:
     if 0xC0 in at:
         mag = _field(_VECTOR_I.unpack_from(data, at[0xC0]), 0.1)
     if 0xE0 in at:
-        (temperature,) = struct.unpack_from("<f", data, at[0xE0])
-        if not isfinite(temperature):
-            raise ValueError("NaN or infinity")
+        temperature = _temperature(data, at[0xE0])
     return Sample(data[at[0x90]] if 0x90 in at else 0, None, quat, acc, gyr, mag, temperature)
 
 
@@ -340,7 +344,7 @@ def _tables(payload: bytes, at: int, n: int) -> dict[int, int]:
 # --- CAN ------------------------------------------------------------------------------------------
 
 
-class _Pairing:
+class _CanDecoder(Receiver):
     """Samples out of frames that hold one quantity each, by the order in which a node's frames come.
 
     A node sends its quantities in a fixed order with the quaternion last. A sample is what came since the
@@ -350,20 +354,9 @@ class _Pairing:
     """
 
     def __init__(self) -> None:
-        self.counters = Counters()
+        super().__init__()
         self._parts: dict[int, dict[str, Vector3 | float]] = {}
-        self._usual: dict[int, tuple[set[str], set[str]]] = {}  # quantities in the last two cycles
-        self._in_sync = True
-
-    def _bad(self) -> list[Sample]:
-        self.counters.bad += 1
-        self._in_sync = False
-        return []
-
-    def _good(self) -> None:
-        if not self._in_sync:
-            self._in_sync = True
-            self.counters.resyncs += 1
+        self._usual: dict[int, Usual] = {}
 
     def _add(self, node: int, kind: str, value: Vector3 | float) -> list[Sample]:
         self._good()
@@ -377,20 +370,19 @@ class _Pairing:
     def _close(self, node: int, values: tuple[int, ...]) -> list[Sample]:
         parts = self._parts.pop(node, {})
         known = node in self._usual
-        before, last = self._usual.get(node, (set(), set()))
-        self._usual[node] = (last, set(parts))
+        whole = self._usual.setdefault(node, Usual()).whole(parts)
         quat = unit_quaternion(*(value / 10000 for value in values))
         if quat is None:
             return self._bad()
         self._good()
-        if "acc" not in parts or not before & last <= parts.keys():
+        if "acc" not in parts or not whole:
             self.counters.lost += known
             return []
         self.counters.packets += 1
         return [Sample(node, None, quat, **parts)]  # type: ignore[arg-type]
 
 
-class HipnucCanopenDecoder(_Pairing):
+class HipnucCanopenDecoder(_CanDecoder):
     """Samples out of the CANopen process data of any number of nodes; `sensor` is the node id (1..64).
 
     All nodes must send acceleration and quaternion (TPDO1 and TPDO4) at one rate, and nothing faster. The
@@ -415,10 +407,10 @@ class HipnucCanopenDecoder(_Pairing):
             return self._close(node, _QUAT_I.unpack(data)) if len(data) == 8 else self._bad()
         if not 6 <= len(data) <= 8:
             return self._bad()
-        vector = _VECTOR_I.unpack_from(data)
+        values = _VECTOR_I.unpack_from(data)
         if kind == 0x180:
-            return self._add(node, "acc", _scaled(vector, GRAVITY / 1000))
-        return self._add(node, "gyr", _scaled(vector, _DEG / 10))
+            return self._add(node, "acc", _scaled(values, GRAVITY / 1000))
+        return self._add(node, "gyr", _scaled(values, _DEG / 10))
 
 
 _J1939_VECTORS = {
@@ -432,7 +424,7 @@ _J1939_QUATS = (0xFF46, 0xFF42)
 _J1939_FD = 0xFF5B
 
 
-class HipnucJ1939Decoder(_Pairing):
+class HipnucJ1939Decoder(_CanDecoder):
     """Samples out of the J1939 groups of any number of devices; `sensor` is the source address.
 
     All must send acceleration and quaternion (FF34 and FF46) at one rate, and nothing faster; see
@@ -485,12 +477,8 @@ class HipnucJ1939Decoder(_Pairing):
         except ValueError:
             return self._bad()
         self._good()
-        step = (data[7] - self._counts.get(node, data[7] - 1)) & 0xFF
+        count_byte(self.counters, self._counts.get(node), data[7])
         self._counts[node] = data[7]
-        if step >= 128:
-            self.counters.restarts += 1
-        else:
-            self.counters.lost += max(step - 1, 0)
         if sample.quat is None and sample.acc is None:
             self.counters.skipped += 1
             return []
@@ -501,7 +489,7 @@ class HipnucJ1939Decoder(_Pairing):
 # --- encoders -------------------------------------------------------------------------------------
 
 
-def frame(payload: bytes) -> bytes:
+def encode_frame(payload: bytes) -> bytes:
     """The bytes that go over the line for a payload."""
     head = _SYNC + len(payload).to_bytes(2, "little")
     return head + crc_hqx(payload, crc_hqx(head, 0)).to_bytes(2, "little") + payload
@@ -517,13 +505,13 @@ def encode(sample: Sample, *, node_ids: bool = False) -> bytes:
     Raises:
         ValueError: a needed quantity is missing.
     """
-    return frame(_write_block(sample, node_ids))
+    return encode_frame(_write_block(sample, node_ids))
 
 
 def encode_nodes(samples: Iterable[Sample], *, gateway: int = 0) -> bytes:
     """Serial frame of a wireless receiver with one block (0x62) for each sample; see `encode`."""
     blocks = [_write_block(sample, True) for sample in samples]
-    return frame(bytes([0x62, gateway, len(blocks), 0, 0, 0, 0, 0]) + b"".join(blocks))
+    return encode_frame(bytes([0x62, gateway, len(blocks), 0, 0, 0, 0, 0]) + b"".join(blocks))
 
 
 def encode_fields(sample: Sample, *, node_ids: bool = False) -> bytes:
@@ -532,7 +520,7 @@ def encode_fields(sample: Sample, *, node_ids: bool = False) -> bytes:
     if node_ids:
         mask |= 1 << _NODE_BIT
         fields += bytes([sample.sensor, 0, 0, 0])
-    return frame(_HI83.pack(0x83, 0, 0, mask) + fields)
+    return encode_frame(_HI83.pack(0x83, 0, 0, mask) + fields)
 
 
 def encode_items(sample: Sample) -> bytes:
@@ -548,7 +536,7 @@ def encode_items(sample: Sample) -> bytes:
         out += b"\xd1" + _QUAT_F.pack(*sample.quat)
     if sample.temperature is not None:
         out += b"\xe0" + struct.pack("<f", sample.temperature)
-    return frame(out)
+    return encode_frame(out)
 
 
 def encode_tables(samples: Iterable[Sample], *, gateway: int = 0) -> bytes:
@@ -556,7 +544,7 @@ def encode_tables(samples: Iterable[Sample], *, gateway: int = 0) -> bytes:
     by_id = {sample.sensor: sample for sample in samples}
     nodes = [by_id.get(sensor, Sample(sensor)) for sensor in range(max(by_id) + 1)]
     zero = (0.0, 0.0, 0.0)
-    return frame(
+    return encode_frame(
         bytes([0x61, 0, gateway, len(nodes), 0x71])
         + b"".join(_QUAT_F.pack(*(node.quat or (0.0, *zero))) for node in nodes)
         + b"\x75"
@@ -582,9 +570,9 @@ def encode_j1939(sample: Sample) -> list[CanFrame]:
     """CAN frames of one cycle of a J1939 device: acceleration, rate, field, temperature, quaternion."""
     parts: list[tuple[int, bytes]] = []
     for group, (kind, scale) in _J1939_VECTORS.items():
-        vector = getattr(sample, kind)
-        if vector is not None:
-            parts.append((group, _vector_i(vector, 1 / scale) + b"\0\0"))
+        values = getattr(sample, kind)
+        if values is not None:
+            parts.append((group, _vector_i(values, 1 / scale) + b"\0\0"))
     if sample.temperature is not None:
         parts.append((_J1939_TEMPERATURE, struct.pack("<h6x", round(sample.temperature * 100))))
     if sample.quat is not None:
@@ -643,13 +631,9 @@ def _write_fields(sample: Sample) -> tuple[int, bytes]:
     return mask, out
 
 
-def _vector_i(vector: Vector3, scale: float) -> bytes:
-    return _VECTOR_I.pack(*(_int16(value * scale) for value in vector))
+def _vector_i(values: Vector3, scale: float) -> bytes:
+    return _VECTOR_I.pack(*(int16(value * scale) for value in values))
 
 
 def _quat_i(quat: Quaternion) -> bytes:
-    return _QUAT_I.pack(*(_int16(value * 10000) for value in quat))
-
-
-def _int16(value: float) -> int:
-    return max(-32768, min(32767, round(value)))
+    return _QUAT_I.pack(*(int16(value * 10000) for value in quat))

@@ -6,14 +6,19 @@ encoder is made. Layouts are in docs/mavlink.md.
 
 from __future__ import annotations
 
+import re
+from collections.abc import Container
 from importlib import import_module
-from math import isfinite
 from typing import Any, ClassVar
 
-from firmware_protocols.pairing import MAX_SENSORS, Pairing
-from firmware_protocols.sample import GRAVITY, Counters, Sample, Vector3, unit_quaternion, z_up
+from firmware_protocols._numbers import number, vector
+from firmware_protocols._recent import Recent
+from firmware_protocols._sequence import count_byte
+from firmware_protocols._stream import StreamDecoder
+from firmware_protocols.pairing import Pairing
+from firmware_protocols.sample import GRAVITY, Sample, Vector3, unit_quaternion, z_up
 
-_V1, _V2 = 0xFE, 0xFD
+_V1 = 0xFE
 _SIGNED = 0x01
 _SIGNATURE_BYTES = 13
 _ATTITUDE, _SCALED, _HIGHRES = 31, 26, 105
@@ -31,8 +36,8 @@ def _dialect() -> Any:
         ) from None
 
 
-class Decoder:
-    """Samples out of a byte stream that may be cut anywhere, start anywhere and contain noise.
+class Decoder(StreamDecoder):
+    """Samples out of a byte stream.
 
     Sensor is sysid << 8 | compid. An orientation and a reading of one component whose times are no more than
     the tolerance apart become one sample with the orientation's time; either comes out alone if the other is
@@ -40,6 +45,8 @@ class Decoder:
     """
 
     WRAP_US: ClassVar[int] = _WRAP_US
+
+    _START = re.compile(rb"[\xfd\xfe]")
 
     def __init__(self, tolerance_us: int = 5000, imu: int | None = None) -> None:
         """Start with nothing seen.
@@ -51,73 +58,55 @@ class Decoder:
         Raises:
             RuntimeError: pymavlink is not installed.
         """
+        super().__init__()
         dialect = _dialect()
-        self._unknown: type = dialect.MAVLink_unknown
+        self._known: Container[int] = dialect.mavlink_map
         self._decode = dialect.MAVLink(None).decode
-        self.counters = Counters()
+        self._decoded: Any = None
         self._imu = imu
         self._pairing = Pairing(self.counters, tolerance_us, _WRAP_US)
-        self._rest = b""
-        self._bad = False
-        self._sequence: dict[int, int] = {}
-
-    def feed(self, data: bytes) -> list[Sample]:
-        """Samples completed by the next bytes of the stream."""
-        self.counters.bytes += len(data)
-        data = self._rest + data if self._rest else data
-        samples: list[Sample] = []
-        at, end = 0, len(data)
-        while at < end:
-            size = _size(data, at)
-            if size > end - at:
-                break
-            message = self._message(data[at : at + size]) if size else None
-            if message is None:
-                # A false length must not swallow the good messages behind it: go on one byte later.
-                if not self._bad:
-                    self._bad = True
-                    self.counters.bad += 1
-                at = self._next_start(data, at + 1)
-                continue
-            at += size
-            if self._bad:
-                self._bad = False
-                self.counters.resyncs += 1
-            samples += self._take(message)
-        self._rest = data[at:]
-        return samples
+        self._sequence: Recent[int, int] = Recent()
 
     def flush(self) -> list[Sample]:
         """What still waits for its partner, at the end of a recording."""
         return self._pairing.flush()
 
-    @staticmethod
-    def _next_start(data: bytes, at: int) -> int:
-        starts = [place for place in (data.find(b"\xfd", at), data.find(b"\xfe", at)) if place >= 0]
-        return min(starts, default=len(data))
-
-    def _message(self, frame: bytes) -> Any:
-        try:
-            message = self._decode(bytearray(frame))
-        except Exception:  # its own error, and whatever else a parser of others finds in noise
-            return None
+    def _length(self, buffer: bytes, at: int) -> int:
+        head = buffer[at : at + 10]
+        if head[0] == _V1:
+            if len(head) < 6:
+                return 0
+            kind, size = head[5], head[1] + 8
+        else:
+            if len(head) > 2 and head[2] & ~_SIGNED:
+                return -1
+            if len(head) < 10:
+                return 0
+            kind = int.from_bytes(head[7:10], "little")
+            size = head[1] + 12 + (_SIGNATURE_BYTES if head[2] else 0)
         # The checksum of a kind that is not known cannot be known either.
-        return None if isinstance(message, self._unknown) else message
+        return size if kind in self._known else -1
+
+    def _intact(self, buffer: bytes, at: int, length: int) -> bool:
+        try:
+            self._decoded = self._decode(bytearray(buffer[at : at + length]))
+        except Exception:  # its own error, and whatever else a parser of others finds in noise
+            return False
+        return True
+
+    def _message(self, frame: bytes, samples: list[Sample]) -> None:
+        samples += self._take(self._decoded)
 
     def _take(self, message: Any) -> list[Sample]:
         sensor = message.get_srcSystem() << 8 | message.get_srcComponent()
         count = message.get_seq()
-        last = self._sequence.get(sensor)
-        if last is None and len(self._sequence) >= MAX_SENSORS:
-            self._sequence.clear()
-        elif last is not None and count != last:
-            self.counters.lost += (count - last - 1) & 0xFF
+        count_byte(self.counters, self._sequence.get(sensor), count)
         self._sequence[sensor] = count
 
         kind = message.get_msgId()
         if kind == _ATTITUDE:
             quat = unit_quaternion(message.q1, message.q2, message.q3, message.q4)
-            gyr = _vector(message.rollspeed, message.pitchspeed, message.yawspeed)
+            gyr = vector((message.rollspeed, message.pitchspeed, message.yawspeed))
             if quat is not None:
                 time_us = message.time_boot_ms * 1000
                 return self._pairing.add(Sample(sensor, time_us, z_up(quat), None, gyr), True)
@@ -130,7 +119,7 @@ class Decoder:
                     (message.xacc * _MG, message.yacc * _MG, message.zacc * _MG),
                     (message.xgyro / 1000, message.ygyro / 1000, message.zgyro / 1000),
                     # Without a magnetometer it says 0, which no place on earth has.
-                    _vector(message.xmag, message.ymag, message.zmag, _UT_OF_MGAUSS)
+                    vector((message.xmag, message.ymag, message.zmag), _UT_OF_MGAUSS)
                     if message.xmag or message.ymag or message.zmag
                     else None,
                     # degC of 0 stands for none, 1 for 0.
@@ -141,47 +130,26 @@ class Decoder:
         elif kind == _HIGHRES and self._imu in (None, message.id):
             has = message.fields_updated or _HIGHRES_ACC | _HIGHRES_GYR | _HIGHRES_MAG
             acc = (
-                _vector(message.xacc, message.yacc, message.zacc)
+                vector((message.xacc, message.yacc, message.zacc))
                 if has & _HIGHRES_ACC == _HIGHRES_ACC
                 else None
             )
             gyr = (
-                _vector(message.xgyro, message.ygyro, message.zgyro)
+                vector((message.xgyro, message.ygyro, message.zgyro))
                 if has & _HIGHRES_GYR == _HIGHRES_GYR
                 else None
             )
             mag = (
-                _vector(message.xmag, message.ymag, message.zmag, _UT_OF_GAUSS)
+                vector((message.xmag, message.ymag, message.zmag), _UT_OF_GAUSS)
                 if has & _HIGHRES_MAG == _HIGHRES_MAG
                 else None
             )
-            temperature = message.temperature if has & _HIGHRES_TEMPERATURE else None
-            if temperature is not None and not isfinite(temperature):
-                temperature = None
+            temperature = number(message.temperature) if has & _HIGHRES_TEMPERATURE else None
             if acc is not None or gyr is not None:
                 time_us = message.time_usec % _WRAP_US
                 return self._pairing.add(Sample(sensor, time_us, None, acc, gyr, mag, temperature), False)
         self.counters.skipped += 1
         return []
-
-
-def _vector(x: float, y: float, z: float, scale: float = 1.0) -> Vector3 | None:
-    return (x * scale, y * scale, z * scale) if isfinite(x + y + z) else None
-
-
-def _size(data: bytes, at: int) -> int:
-    """Bytes of the message at a place, as far as they are known; 0 if none starts there."""
-    end = len(data)
-    if data[at] == _V2:
-        if end - at < 3:
-            return 12
-        flags = data[at + 2]
-        if flags & ~_SIGNED:
-            return 0
-        return data[at + 1] + 12 + (_SIGNATURE_BYTES if flags else 0)
-    if data[at] == _V1:
-        return data[at + 1] + 8 if end - at > 1 else 8
-    return 0
 
 
 class Encoder:

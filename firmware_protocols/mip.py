@@ -9,9 +9,11 @@ import re
 import struct
 from collections.abc import Iterable, Iterator
 from itertools import accumulate
-from math import isfinite
 
-from firmware_protocols._stream import StreamDecoder, finite, from_euler, matrix_quaternion, to_euler
+from firmware_protocols._numbers import number, vector
+from firmware_protocols._sequence import MAX_PAUSE_US
+from firmware_protocols._stream import StreamDecoder
+from firmware_protocols.rotation import from_angles, from_matrix, to_yaw_pitch_roll
 from firmware_protocols.sample import GRAVITY, Sample, unit_quaternion, z_up
 
 SENSOR_SET = 0x80
@@ -22,6 +24,7 @@ FILTER_SET = 0x82
 
 _GAUSS_UT = 100.0
 _WEEK_US = 604_800_000_000
+_MIN_PERIOD_NS = 100_000  # nothing measures more often
 
 _VECTOR = struct.Struct(">3f")
 _QUATERNION = struct.Struct(">4f")
@@ -147,20 +150,20 @@ class MipDecoder(StreamDecoder):
                     continue
                 values = values[:-1]
             if name == "acc g":
-                acc = finite(values, GRAVITY)
+                acc = vector(values, GRAVITY)
             elif name == "acc":
-                acc = finite(values)
+                acc = vector(values)
             elif name == "gyr":
-                gyr = finite(values)
+                gyr = vector(values)
             elif name == "mag":
-                mag = finite(values, _GAUSS_UT)
+                mag = vector(values, _GAUSS_UT)
             elif name == "quat":
                 quat = unit_quaternion(*values)
             elif name == "euler":
-                euler = from_euler(*values)
+                euler = from_angles(*values[::-1])
             elif name == "matrix":
                 # The wire has NED -> device by rows.
-                matrix = matrix_quaternion(values[0::3] + values[1::3] + values[2::3])
+                matrix = from_matrix(values[0::3] + values[1::3] + values[2::3])
             elif name == "time":
                 time_ns = values[0]
             elif name == "period":
@@ -169,8 +172,8 @@ class MipDecoder(StreamDecoder):
                 # Wrong before the receiver has time, but it runs on.
                 if 0 <= values[0] <= 1e6:
                     gps_us = values[1] * _WEEK_US + round(values[0] * 1e6)
-            elif isfinite(values[2]):
-                temperature = values[2]  # least, largest and mean
+            else:
+                temperature = number(values[2])  # least, largest and mean
         if time_ns is not None:
             self._count(descriptor, time_ns, period_ns)
         quat = quat or matrix or euler
@@ -191,9 +194,9 @@ class MipDecoder(StreamDecoder):
         # There is no counter, but a packet says how long ago the device sent the one before.
         pause = time_ns - self._last_ns.get(descriptor, time_ns)
         self._last_ns[descriptor] = time_ns
-        if pause < 0:
+        if not 0 <= pause <= MAX_PAUSE_US * 1000:
             self.counters.restarts += 1
-        elif period_ns and pause > 1.5 * period_ns:
+        elif period_ns is not None and period_ns >= _MIN_PERIOD_NS and pause > 1.5 * period_ns:
             self.counters.lost += round(pause / period_ns) - 1
 
 
@@ -251,7 +254,7 @@ def encode(
             field = _VECTOR.pack(*(m / _GAUSS_UT for m in sample.mag))
             parts.append((0x27 if filtered else 0x06, field + valid))
         if ned is not None and euler:
-            parts.append((0x05 if filtered else 0x0C, _VECTOR.pack(*to_euler(ned)) + valid))
+            parts.append((0x05 if filtered else 0x0C, _VECTOR.pack(*to_yaw_pitch_roll(ned)[::-1]) + valid))
         elif ned is not None:
             parts.append((0x03 if filtered else 0x0A, _QUATERNION.pack(*ned) + valid))
         if sample.temperature is not None and not filtered:

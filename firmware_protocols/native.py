@@ -12,7 +12,10 @@ from collections.abc import Iterable
 from math import floor, isfinite
 from typing import NamedTuple
 
-from firmware_protocols.sample import Counters, Quaternion, Sample, Vector3, unit_quaternion
+from firmware_protocols import _stream
+from firmware_protocols._numbers import LARGEST, plausible
+from firmware_protocols._sequence import Sequence
+from firmware_protocols.sample import Quaternion, Sample, Vector3, unit_quaternion
 
 DATA_TYPE = 0x11
 """First body byte of a measurement: version 1 in the high half, type 1 in the low half."""
@@ -319,9 +322,8 @@ def _decode_packet(body: bytes) -> Packet:
         temperature = v[i] / TEMPERATURE_SCALE
         i += 1
     if mask & (_QUAT_F | _ACC_F | _GYR_F | _MAG_F):
-        # Sums of a few binary32 values cannot overflow here, so one is finite only if all its terms are.
-        if not isfinite(sum(v[i:])):
-            raise ValueError("NaN or infinity")
+        if not plausible(v[i:]):
+            raise ValueError(f"NaN, infinity, or more than {LARGEST:.0f}")
         if mask & _QUAT_F:
             quat = _unit(v[i], v[i + 1], v[i + 2], v[i + 3])
             i += 4
@@ -373,75 +375,34 @@ def _is_text(text: bytes) -> bool:
 
 # --- the stream -----------------------------------------------------------------------------------
 
-# A sequence counter can be believed if the pause between two packets is too short for it to go around at the
-# highest rate (2 kHz: 33 s) and the step is no larger than that rate allows, plus some for a coarse clock.
-_MAX_PAUSE_US = 30_000_000
-_MIN_PERIOD_US = 500
-_SLACK = 64
-_LATE_US = 1_000_000
 
-_NOTHING = (None,) * 5
-
-
-class Receiver:
+class Receiver(_stream.Receiver):
     """What the serial and the CAN decoder do alike: count, keep INFO and battery, drop late messages.
 
     Attributes:
         infos: the last INFO packet of each sensor id.
         batteries: the last charge in percent and status bits of each sensor id that sends them.
-        counters: what has been seen so far.
     """
 
     def __init__(self) -> None:
         """Start with nothing seen."""
+        super().__init__()
         self.infos: dict[int, Info] = {}
         self.batteries: dict[int, tuple[int, int]] = {}
-        self.counters = Counters()
-        self._in_sync = True
-        self._last: dict[int, tuple[int, int]] = {}  # seq, t_us by sensor id
+        self._sequence = Sequence(self.counters, 1 << 32)
 
-    def _bad(self) -> None:
-        self.counters.bad += 1
-        self._in_sync = False
-
-    def _good(self) -> None:
-        if not self._in_sync:
-            self._in_sync = True
-            self.counters.resyncs += 1
-
-    def _take(self, message: Packet | Info) -> Sample | None:
+    def _take(self, message: Packet | Info) -> list[Sample]:
         """The sample in an intact message, if it holds a new one."""
+        samples: list[Sample] = []
         self._good()
         if isinstance(message, Info):
             self.infos[message.sensor_id] = message
             self.counters.skipped += 1
-            return None
-        if not self._is_new(message):
-            return None
-        if message.battery is not None:
-            self.batteries[message.sensor_id] = message.battery
-        quantities = message[3:8]
-        if quantities == _NOTHING:
-            self.counters.skipped += 1
-            return None
-        self.counters.packets += 1
-        return Sample(message.sensor_id, message.t_us, *quantities)
-
-    def _is_new(self, packet: Packet) -> bool:
-        seq, t_us = packet.seq, packet.t_us
-        last_seq, last_t = self._last.get(packet.sensor_id, (seq - 1, t_us))
-        step = (seq - last_seq) & 0xFFFF
-        pause = ((t_us - last_t + 0x80000000) & 0xFFFFFFFF) - 0x80000000
-        if -_LATE_US <= pause <= 0 and (-step) & 0xFFFF <= _SLACK:
-            self.counters.late += 1
-            return False
-        self._last[packet.sensor_id] = (seq, t_us)
-        if -_LATE_US <= pause <= _MAX_PAUSE_US and step <= _SLACK + max(pause, 0) // _MIN_PERIOD_US:
-            # A step of 0 with a new time is a sensor that does not count.
-            self.counters.lost += max(step - 1, 0)
-        else:
-            self.counters.restarts += 1
-        return True
+        elif self._sequence.is_new(message.sensor_id, message.seq, message.t_us):
+            if message.battery is not None:
+                self.batteries[message.sensor_id] = message.battery
+            self._give(Sample(message.sensor_id, message.t_us, *message[3:8]), samples)
+        return samples
 
 
 class Decoder(Receiver):
@@ -462,13 +423,12 @@ class Decoder(Receiver):
         self.counters.bytes += len(data)
         *frames, rest = (self._rest + data).split(b"\0")
         self._rest = rest[-MAX_FRAME - 1 :]
-        samples = []
+        samples: list[Sample] = []
         for frame in frames:
             # Nothing between two 00 is legal: senders may open with a 00 to end any noise.
             message = self._message(frame) if frame else None
-            sample = None if message is None else self._take(message)
-            if sample is not None:
-                samples.append(sample)
+            if message is not None:
+                samples += self._take(message)
         return samples
 
     def _message(self, frame: bytes) -> Packet | Info | None:

@@ -192,13 +192,11 @@ class NativeCanDecoder(Receiver):
             return []
         message, sensor = offset >> 5, offset & SENSORS - 1
         if len(data) > 8:
-            sample = self._fd(message, sensor, bytes(data))
-        elif message == QUAT:
-            sample = self._close(sensor, data, time_s)
-        else:
-            self._vector(message, sensor, data, time_s)
-            return []
-        return [] if sample is None else [sample]
+            return self._fd(message, sensor, bytes(data))
+        if message == QUAT:
+            return self._close(sensor, data, time_s)
+        self._vector(message, sensor, data, time_s)
+        return []
 
     def _vector(self, message: int, sensor: int, data: bytes, time_s: float | None) -> None:
         if len(data) != _VECTOR.size:
@@ -228,43 +226,40 @@ class NativeCanDecoder(Receiver):
         else:
             open_.mag = (x / MAG_SCALE, y / MAG_SCALE, z / MAG_SCALE)
 
-    def _close(self, sensor: int, data: bytes, time_s: float | None) -> Sample | None:
+    def _close(self, sensor: int, data: bytes, time_s: float | None) -> list[Sample]:
         open_ = self._open.pop(sensor, None)
         if open_ is None:
             # Its ACC is lost, unless the sensor has only just come into sight.
             self.counters.lost += sensor in self._acc
-            return None
+            return []
         quat = None
         if data:
             if len(data) == _QUATERNION.size:
                 w, x, y, z = _QUATERNION.unpack(data)
                 quat = unit_quaternion(w / QUAT_SCALE, x / QUAT_SCALE, y / QUAT_SCALE, z / QUAT_SCALE)
             if quat is None:
-                self._bad()
-                return None
+                return self._bad()
         if time_s is not None and open_.arrival_s is not None:
             half_us = self._acc[sensor][1] * TICK_US / 2
             if (time_s - open_.arrival_s) * 1e6 > half_us > 0:
                 self.counters.lost += 2  # a QUAT and an ACC
-                return None
+                return []
         self._good()
         self.counters.packets += 1
-        return Sample(sensor, open_.ticks * TICK_US, quat, open_.acc, open_.gyr, open_.mag)
+        return [Sample(sensor, open_.ticks * TICK_US, quat, open_.acc, open_.gyr, open_.mag)]
 
-    def _fd(self, message: int, sensor: int, data: bytes) -> Sample | None:
+    def _fd(self, message: int, sensor: int, data: bytes) -> list[Sample]:
         try:
             size = body_size(data)
             body = decode_body(data[:size])
         except ValueError:
-            self._bad()
-            return None
+            return self._bad()
         if message or body.sensor_id != sensor or any(data[size:]):
-            self._bad()
-            return None
-        sample = self._take(body)
-        if sample is None or sample.time_us is None:
-            return None
-        last = self._fd_us.get(sensor, sample.time_us)
-        now = last + ((sample.time_us - last + 0x80000000) & 0xFFFFFFFF) - 0x80000000
+            return self._bad()
+        samples = self._take(body)
+        if not samples or isinstance(body, Info):
+            return []
+        last = self._fd_us.get(sensor, body.t_us)
+        now = last + ((body.t_us - last + 0x80000000) & 0xFFFFFFFF) - 0x80000000
         self._fd_us[sensor] = now
-        return sample._replace(time_us=now % self.WRAP_US)
+        return [samples[0]._replace(time_us=now % self.WRAP_US)]

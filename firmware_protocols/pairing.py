@@ -1,11 +1,31 @@
-"""One Sample of messages that a device sends apart: orientation in one, force and rate in another."""
+"""One Sample of messages that a device sends apart.
+
+By their times: `Pairing`. By the order in which they come, where they have none: `hipnuc` and `witmotion`,
+with `Usual`. The MTi-600 (time or group counter) and the native packet on CAN have rules of their own.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
+from firmware_protocols._recent import Recent
 from firmware_protocols.sample import Counters, Sample
 
-MAX_SENSORS = 256
-"""Sensors remembered at a time; noise on a line without a checksum can invent sensor ids."""
+
+class Usual:
+    """What a device sends in every cycle, as far as two cycles show it."""
+
+    def __init__(self) -> None:
+        """Nothing is usual yet."""
+        self._before: frozenset[str] = frozenset()
+        self._last: frozenset[str] = frozenset()
+
+    def whole(self, quantities: Iterable[str]) -> bool:
+        """If a cycle has all that both before it had; it is then the last one."""
+        now = frozenset(quantities)
+        usual = self._before & self._last
+        self._before, self._last = self._last, now
+        return usual <= now
 
 
 class Pairing:
@@ -27,8 +47,8 @@ class Pairing:
         self.counters = counters
         self.tolerance_us = tolerance_us
         self._wrap_us = wrap_us
-        self._held: dict[int, tuple[bool, Sample]] = {}
-        self._done: dict[int, int] = {}
+        self._held: Recent[int, tuple[bool, Sample]] = Recent()
+        self._done: Recent[int, int] = Recent()
 
     def add(self, sample: Sample, oriented: bool) -> list[Sample]:
         """The samples that this message completes; oriented says if it is the orientation of its instant."""
@@ -40,9 +60,6 @@ class Pairing:
                 # A second form of an orientation that has gone out already.
                 self.counters.skipped += 1
                 return []
-            if len(self._held) + len(self._done) >= 2 * MAX_SENSORS:
-                self._held.clear()
-                self._done.clear()
             self._held[sensor] = (oriented, sample)
             return []
         held_oriented, other = held

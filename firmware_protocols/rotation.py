@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from math import atan2, cos, hypot, pi, remainder, sin, sqrt, tau
 
-from firmware_protocols.sample import Quaternion, Vector3
+from firmware_protocols.sample import Quaternion, Vector3, unit_quaternion
+
+_MAX_ANGLE = 7.0  # a turn and some, radians
 
 
 def from_yaw_pitch_roll(yaw: float, pitch: float, roll: float) -> Quaternion:
@@ -20,6 +22,13 @@ def from_yaw_pitch_roll(yaw: float, pitch: float, roll: float) -> Quaternion:
     )
 
 
+def from_angles(yaw: float, pitch: float, roll: float) -> Quaternion | None:
+    """As `from_yaw_pitch_roll`; None if the angles are no numbers, or larger than any device sends."""
+    if not abs(yaw) <= _MAX_ANGLE or not abs(pitch) <= _MAX_ANGLE or not abs(roll) <= _MAX_ANGLE:
+        return None
+    return from_yaw_pitch_roll(yaw, pitch, roll)
+
+
 def to_yaw_pitch_roll(quat: Quaternion) -> Vector3:
     """Inverse of `from_yaw_pitch_roll`: pitch from -pi/2 to pi/2, the others from -pi to pi."""
     w, x, y, z = quat
@@ -32,22 +41,36 @@ def to_yaw_pitch_roll(quat: Quaternion) -> Vector3:
     )
 
 
-def from_matrix(m: tuple[float, ...]) -> Quaternion:
-    """Quaternion of a rotation matrix, row after row; of unit norm only if the matrix is a rotation."""
+def from_matrix(m: tuple[float, ...], tolerance: float = 0.1) -> Quaternion | None:
+    """Quaternion of a rotation matrix, row after row; None if it is none.
+
+    Its rows have to be of length 1, upright on each other and right-handed, each to the tolerance.
+    """
     xx, xy, xz, yx, yy, yz, zx, zy, zz = m
+    off = (
+        xx * xx + xy * xy + xz * xz - 1,
+        yx * yx + yy * yy + yz * yz - 1,
+        zx * zx + zy * zy + zz * zz - 1,
+        xx * yx + xy * yy + xz * yz,
+        yx * zx + yy * zy + yz * zz,
+        zx * xx + zy * xy + zz * xz,
+    )
+    det = xx * (yy * zz - yz * zy) - xy * (yx * zz - yz * zx) + xz * (yx * zy - yy * zx)
+    if not all(-tolerance <= value <= tolerance for value in off) or not det > 0:  # NaN is not either
+        return None
     # The largest of the four squares is at least 1 (times 4), so that nothing small is divided by.
     squares = (1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz)
     largest = max(squares)
-    if not largest > 0.5:
-        return (0.0, 0.0, 0.0, 0.0)
     s = 2 * sqrt(largest)
     if largest == squares[0]:
-        return (s / 4, (zy - yz) / s, (xz - zx) / s, (yx - xy) / s)
-    if largest == squares[1]:
-        return ((zy - yz) / s, s / 4, (xy + yx) / s, (xz + zx) / s)
-    if largest == squares[2]:
-        return ((xz - zx) / s, (xy + yx) / s, s / 4, (yz + zy) / s)
-    return ((yx - xy) / s, (xz + zx) / s, (yz + zy) / s, s / 4)
+        quat = (s / 4, (zy - yz) / s, (xz - zx) / s, (yx - xy) / s)
+    elif largest == squares[1]:
+        quat = ((zy - yz) / s, s / 4, (xy + yx) / s, (xz + zx) / s)
+    elif largest == squares[2]:
+        quat = ((xz - zx) / s, (xy + yx) / s, s / 4, (yz + zy) / s)
+    else:
+        quat = ((yx - xy) / s, (xz + zx) / s, (yz + zy) / s, s / 4)
+    return unit_quaternion(*quat)
 
 
 def rotate(quat: Quaternion, v: Vector3) -> Vector3:

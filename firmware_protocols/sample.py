@@ -14,6 +14,9 @@ from typing import NamedTuple
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
+CanFrame = tuple[int, bytes, bool]
+"""Identifier, data, whether the identifier has 29 bits."""
+
 GRAVITY = 9.80665
 """One g of devices that send accelerations in g, m/s^2."""
 

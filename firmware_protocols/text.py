@@ -12,7 +12,9 @@ from dataclasses import dataclass, field, fields
 from math import degrees, isfinite, radians, sqrt
 
 from firmware_protocols import rotation
-from firmware_protocols.sample import GRAVITY, Counters, Quaternion, Sample, Vector3, unit_quaternion, z_up
+from firmware_protocols._numbers import number, vector
+from firmware_protocols._stream import Receiver
+from firmware_protocols.sample import GRAVITY, Quaternion, Sample, Vector3, unit_quaternion, z_up
 
 MAX_LINE = 512
 """Longest line that is read, bytes."""
@@ -232,7 +234,7 @@ def _indices(pattern: Pattern, columns: list[str]) -> tuple[int, dict[str, int]]
     return len(columns), places
 
 
-class Decoder:
+class Decoder(Receiver):
     """Samples out of a byte stream of lines that may be cut anywhere, start anywhere and contain noise.
 
     Lines that the pattern says nothing about are skipped. Text has no checksum: a wrong digit stays unseen.
@@ -253,7 +255,7 @@ class Decoder:
             if pattern not in PATTERNS:
                 raise ValueError(f"pattern must be one of {', '.join(PATTERNS)}, not {pattern!r}")
             pattern = PATTERNS[pattern]
-        self.counters = Counters()
+        super().__init__()
         self.pattern = pattern
         self.WRAP_US = pattern.wraps_at_us
         self._regex = re.compile(pattern.regex, re.ASCII) if pattern.regex is not None else None
@@ -272,7 +274,6 @@ class Decoder:
         self._ned = pattern.frame == "NED"
         self._rest = b""
         self._too_long = False
-        self._in_sync = True
 
     def feed(self, data: bytes) -> list[Sample]:
         """Samples completed by the next bytes of the stream, in the order they came."""
@@ -328,15 +329,9 @@ class Decoder:
         if sample is None:
             self._bad()
             return None
-        if not self._in_sync:
-            self._in_sync = True
-            self.counters.resyncs += 1
+        self._good()
         self.counters.packets += 1
         return sample
-
-    def _bad(self) -> None:
-        self.counters.bad += 1
-        self._in_sync = False
 
     def _sample(self, values: Mapping[str, str | None]) -> Sample | None:
         sensor, time_us, temperature = 0, None, None
@@ -352,10 +347,10 @@ class Decoder:
             elif name == "time":
                 time_us = self._time(text)
             else:
-                number = float(text)
-                if not isfinite(number) or "_" in text:
+                value = float(text)
+                if not isfinite(value) or "_" in text:
                     return None
-                numbers[name] = number
+                numbers[name] = value
         if "x" in numbers:
             x, y, z = numbers["x"], numbers["y"], numbers["z"]
             w = numbers.get("w")
@@ -370,13 +365,13 @@ class Decoder:
         elif "yaw" in numbers:
             scale = self._scales["angle"]
             yaw, pitch, roll = (numbers[name] * scale for name in _ANGLES)
-            if max(abs(yaw), abs(pitch), abs(roll)) > 7:
+            quat = rotation.from_angles(yaw, pitch, roll)
+            if quat is None:
                 return None
-            quat = rotation.from_yaw_pitch_roll(yaw, pitch, roll)
         if quat is not None and self._ned:
             quat = z_up(quat)
         if "temperature" in numbers:
-            temperature = numbers["temperature"] * self._scales["temperature"]
+            temperature = number(numbers["temperature"] * self._scales["temperature"])
         acc, gyr, mag = (
             self._vector(numbers, names, quantity)
             for names, quantity in ((_ACC, "acc"), (_GYR, "gyr"), (_MAG, "mag"))
@@ -389,11 +384,10 @@ class Decoder:
         a, b, c = names
         if a not in numbers or b not in numbers or c not in numbers:
             return None
-        scale = self._scales[quantity]
-        vector = (numbers[a] * scale, numbers[b] * scale, numbers[c] * scale)
-        if not isfinite(sum(vector)):
-            raise OverflowError
-        return vector
+        result = vector((numbers[a], numbers[b], numbers[c]), self._scales[quantity])
+        if result is None:
+            raise ValueError("no quantity is this large")
+        return result
 
     def _time(self, text: str) -> int:
         if "_" in text:

@@ -9,12 +9,13 @@ import re
 import struct
 from binascii import crc_hqx
 from functools import reduce
-from math import degrees, isfinite, radians
+from math import degrees, radians
 from operator import xor
 from typing import NamedTuple
 
-from firmware_protocols._stream import StreamDecoder, finite, from_euler
-from firmware_protocols.rotation import to_yaw_pitch_roll
+from firmware_protocols._numbers import number, vector
+from firmware_protocols._stream import StreamDecoder
+from firmware_protocols.rotation import from_angles, to_yaw_pitch_roll
 from firmware_protocols.sample import Quaternion, Sample, Vector3, unit_quaternion, z_up
 
 _GAUSS_UT = 100.0
@@ -145,14 +146,11 @@ class VectorNavDecoder(StreamDecoder):
             x, y, z, w = values["quat"]
             quat = unit_quaternion(w, x, y, z)
         if quat is None and "ypr" in values:
-            yaw, pitch, roll = values["ypr"]
-            quat = from_euler(radians(roll), radians(pitch), radians(yaw))
-        acc = finite(values["acc"]) if "acc" in values else None
-        gyr = finite(values["gyr"]) if "gyr" in values else None
-        mag = finite(values["mag"], _GAUSS_UT) if "mag" in values else None
-        (temperature,) = values.get("temperature", (None,))
-        if temperature is not None and not isfinite(temperature):
-            temperature = None
+            quat = from_angles(*map(radians, values["ypr"]))
+        acc = vector(values["acc"]) if "acc" in values else None
+        gyr = vector(values["gyr"]) if "gyr" in values else None
+        mag = vector(values["mag"], _GAUSS_UT) if "mag" in values else None
+        temperature = number(*values["temperature"]) if "temperature" in values else None
         time_us = values["time"][0] // 1000 if "time" in values else None
         self._give(
             Sample(0, time_us, None if quat is None else z_up(quat), acc, gyr, mag, temperature), samples
@@ -216,8 +214,8 @@ def _make_plan(header: bytes) -> _Plan | None:
     at = 1 + len(groups)
     place = len(header)
     places: dict[tuple[int, int], int] = {}
-    for number in numbers:
-        sizes = _SIZES.get(number)
+    for group in numbers:
+        sizes = _SIZES.get(group)
         if sizes is None:
             return None
         first = 0
@@ -233,7 +231,7 @@ def _make_plan(header: bytes) -> _Plan | None:
                     field = first + bit
                     if field >= len(sizes) or not sizes[field]:
                         return None
-                    places[number, field] = place
+                    places[group, field] = place
                     place += sizes[field]
             first += 16
     if place == len(header) or place - len(header) > _MAX_PAYLOAD:

@@ -10,15 +10,20 @@ import struct
 from math import pi, radians
 from typing import Any
 
-from firmware_protocols._stream import StreamDecoder
-from firmware_protocols.rotation import from_yaw_pitch_roll, to_yaw_pitch_roll
-from firmware_protocols.sample import GRAVITY, Counters, Quaternion, Sample, Vector3, unit_quaternion
-
-CanFrame = tuple[int, bytes, bool]
-"""Identifier, data, whether the identifier is extended."""
-
-MAX_SENSORS = 128
-"""Most CAN identifiers that a decoder follows."""
+from firmware_protocols._numbers import int16
+from firmware_protocols._recent import Recent
+from firmware_protocols._stream import Receiver, StreamDecoder
+from firmware_protocols.pairing import Usual
+from firmware_protocols.rotation import from_angles, from_yaw_pitch_roll, to_yaw_pitch_roll
+from firmware_protocols.sample import (
+    GRAVITY,
+    CanFrame,
+    Counters,
+    Quaternion,
+    Sample,
+    Vector3,
+    unit_quaternion,
+)
 
 FIRST_REGISTER, ANGLE_REGISTERS, ALL_REGISTERS = 0x34, 12, 33
 """Modbus registers: acceleration, rate, field and angles; with temperature and quaternion in addition."""
@@ -56,7 +61,7 @@ class _Cycle:
         self._top = -1  # type of the packet before
         self._end: int | None = None  # the last type of a cycle
         self._other_end = -1  # where the cycle before ended, if not there
-        self._usual: tuple[set[str], set[str]] = (set(), set())  # quantities in the last two cycles
+        self._usual = Usual()
         self._counted = True  # a stream that begins in the middle of a cycle has lost nothing
 
     def add(self, order: int, values: dict[str, Any]) -> list[Sample]:
@@ -103,11 +108,12 @@ class _Cycle:
         self._open = False
         roll, pitch, yaw = (values.pop(name, None) for name in _ANGLE_NAMES)
         if "quat" not in values and roll is not None and pitch is not None and yaw is not None:
-            values["quat"] = from_yaw_pitch_roll(yaw, pitch, roll)
+            quat = from_angles(yaw, pitch, roll)
+            if quat is not None:
+                values["quat"] = quat
         counted, self._counted = self._counted, True
-        before, last = self._usual
-        self._usual = (last, set(values))
-        if "quat" not in values or "acc" not in values or not before & last <= values.keys():
+        whole = self._usual.whole(values)
+        if "quat" not in values or "acc" not in values or not whole:
             self._counters.lost += not counted
             return []
         self._counters.packets += 1
@@ -194,9 +200,9 @@ class WitDecoder(StreamDecoder):
             values = {}
         samples += self._cycle.add(kind, values)
 
-    def _bad(self, start: int, end: int) -> None:
+    def _bad_frame(self, start: int, end: int) -> None:
         self._cut()
-        super()._bad(start, end)
+        super()._bad_frame(start, end)
 
     def _noise(self, data: bytes, start: int) -> None:
         self._cut()
@@ -334,7 +340,7 @@ class WitModbusDecoder(StreamDecoder):
 # --- CAN ------------------------------------------------------------------------------------------
 
 
-class WitCanDecoder:
+class WitCanDecoder(Receiver):
     """Samples out of CAN frames; `sensor` is the identifier of the device.
 
     The orientation is that of the angles: a quaternion does not fit into a frame and comes without its last
@@ -355,11 +361,10 @@ class WitCanDecoder:
             mag_ut: microtesla of one step of the magnetic field, which differs between models. With 1 the
                 field comes in steps.
         """
-        self.counters = Counters()
+        super().__init__()
         self._fine = fine_angles
         self._mag_ut = mag_ut
-        self._cycles: dict[tuple[int, bool], _Cycle] = {}
-        self._in_sync = True
+        self._cycles: Recent[tuple[int, bool], _Cycle] = Recent()
 
     def feed(self, can_id: int, data: bytes, extended: bool = False) -> list[Sample]:
         """The samples that this frame completes."""
@@ -367,12 +372,8 @@ class WitCanDecoder:
         if len(data) != 8 or data[0] != 0x55 or not (_TIME <= data[1] <= 0x5A):
             self.counters.skipped += 1
             return []
-        cycle = self._cycles.get((can_id, extended))
-        if cycle is None:
-            if len(self._cycles) >= MAX_SENSORS:
-                self.counters.skipped += 1
-                return []
-            cycle = self._cycles[can_id, extended] = _Cycle(can_id, self.counters)
+        cycle = self._cycles.get((can_id, extended)) or _Cycle(can_id, self.counters)
+        self._cycles[can_id, extended] = cycle
         _, kind, x, y, z = _CAN.unpack(data)
         order = kind * 4
         values: dict[str, Any]
@@ -389,14 +390,10 @@ class WitCanDecoder:
         else:
             _, _, axis, angle = _CAN_ANGLE.unpack(data)
             if not 1 <= axis <= 3:
-                self.counters.bad += 1
-                self._in_sync = False
-                return []
+                return self._bad()
             order += axis
             values = {_ANGLE_NAMES[axis - 1]: radians(angle / 1000)}
-        if not self._in_sync:
-            self._in_sync = True
-            self.counters.resyncs += 1
+        self._good()
         return cycle.add(order, values)
 
 
@@ -416,7 +413,7 @@ def encode(sample: Sample, *, angles: bool = False, mag_ut: float = 1.0) -> byte
         seconds, us = divmod(sample.time_us % _DAY_US, 1_000_000)
         hours, minutes = seconds // 3600, seconds // 60 % 60
         out += _packet(_TIME, struct.pack("<6BH", 26, 1, 1, hours, minutes, seconds % 60, us // 1000))
-    temperature = _int16((sample.temperature or 0) * 100)
+    temperature = int16((sample.temperature or 0) * 100)
     for kind, values, step in _vectors(sample, mag_ut, angles):
         out += _packet(kind, _WORDS.pack(*_steps(values, step), temperature if kind == _ACC else 0))
     if sample.quat is not None and not angles:
@@ -436,7 +433,7 @@ def encode_modbus(sample: Sample, *, count: int = ANGLE_REGISTERS, mag_ut: float
     words += _steps(sample.mag or (0.0, 0.0, 0.0), mag_ut) + _steps(
         to_yaw_pitch_roll(sample.quat)[::-1], _ANGLE_STEP
     )
-    words += [_int16((sample.temperature or 0) * 100), *[0] * 16, *_steps(sample.quat, _QUAT_STEP)]
+    words += [int16((sample.temperature or 0) * 100), *[0] * 16, *_steps(sample.quat, _QUAT_STEP)]
     return _with_crc(struct.pack(f">BBB{count}h", sample.sensor, 3, 2 * count, *words[:count]))
 
 
@@ -473,8 +470,4 @@ def _packet(kind: int, data: bytes) -> bytes:
 
 
 def _steps(values: tuple[float, ...], step: float) -> list[int]:
-    return [_int16(value / step) for value in values]
-
-
-def _int16(value: float) -> int:
-    return max(-32768, min(32767, round(value)))
+    return [int16(value / step) for value in values]

@@ -12,8 +12,11 @@ from math import degrees, isfinite, radians
 from typing import ClassVar
 
 from firmware_protocols import rotation
-from firmware_protocols.pairing import MAX_SENSORS, Pairing
-from firmware_protocols.sample import GRAVITY, Counters, Quaternion, Sample, Vector3, unit_quaternion, z_up
+from firmware_protocols._numbers import plausible
+from firmware_protocols._recent import Recent
+from firmware_protocols._stream import Receiver
+from firmware_protocols.pairing import Pairing
+from firmware_protocols.sample import GRAVITY, Quaternion, Sample, Vector3, unit_quaternion, z_up
 
 FRAMES = ("NWU", "ENU", "NED")
 """Inertial frames that the device can be set to; NWU is its default."""
@@ -46,7 +49,7 @@ _DEG = radians(1.0)
 _Message = tuple[int, str, int, tuple[float, ...]]  # sensor, letter, time, values
 
 
-class Decoder:
+class Decoder(Receiver):
     """Samples out of a byte stream that may be cut anywhere, start anywhere and contain noise.
 
     A Sample has the time of its orientation and inertial messages. One whose partner is lost (or is not
@@ -67,16 +70,15 @@ class Decoder:
         """
         if frame not in FRAMES:
             raise ValueError(f"frame must be one of {', '.join(FRAMES)}, not {frame!r}")
-        self.counters = Counters()
+        super().__init__()
         self._ned = frame == "NED"
         self._pairing = Pairing(self.counters)
         self._rest = b""
-        self._in_sync = True
         self._has_channels = False
-        self._time: dict[int, int] = {}
-        self._suspect: dict[int, int] = {}
-        self._mag: dict[int, tuple[int, Vector3]] = {}
-        self._temperature: dict[int, tuple[int, float]] = {}
+        self._time: Recent[int, int] = Recent()
+        self._suspect: Recent[int, int] = Recent()
+        self._mag: Recent[int, tuple[int, Vector3]] = Recent()
+        self._temperature: Recent[int, tuple[int, float]] = Recent()
 
     def feed(self, data: bytes) -> list[Sample]:
         """Samples completed by the next bytes of the stream."""
@@ -97,12 +99,9 @@ class Decoder:
         message = _parse(line) if len(line) <= MAX_MESSAGE else None
         samples = self._take(message) if message is not None else None
         if samples is None:
-            self.counters.bad += 1
-            self._in_sync = False
+            self._bad()
             return self._at_end(line[-_MAX_TAIL:])
-        if not self._in_sync:
-            self._in_sync = True
-            self.counters.resyncs += 1
+        self._good()
         if message is not None and not message[1] and message[0] not in self._time:
             # Any length fits these letters: where the time says nothing either, it may be noise.
             return self._at_end(line[-_MAX_TAIL:])
@@ -125,8 +124,7 @@ class Decoder:
                 continue
             samples = self._take(message)
             if samples is not None:
-                self.counters.resyncs += not self._in_sync
-                self._in_sync = True
+                self._good()
                 return samples
         return []
 
@@ -147,7 +145,7 @@ class Decoder:
         elif letter == "Q":
             quat = unit_quaternion(v[0], v[1], v[2], v[3])
         elif letter == "R":
-            quat = unit_quaternion(*rotation.from_matrix(v)) if max(map(abs, v)) < 1.1 else None
+            quat = rotation.from_matrix(v)
         elif letter == "A":
             roll, pitch, yaw = v
             if abs(roll) <= 180.1 and abs(pitch) <= 90.1 and abs(yaw) <= 360.1:
@@ -160,6 +158,8 @@ class Decoder:
                 self.counters.skipped += 1
                 return []
             quat = unit_quaternion(v[0], v[1], v[2], v[3])
+        elif not plausible(v):
+            return None
         if letter in "QRALE" and quat is None:
             return None
         if not self._fits(sensor, time_us):
@@ -207,11 +207,7 @@ class Decoder:
     def _fits(self, sensor: int, time_us: int) -> bool:
         """If a time can follow the last one; a jump is a restart when a second message confirms it."""
         last = self._time.get(sensor)
-        if last is None:
-            if len(self._time) >= MAX_SENSORS:
-                for known in (self._time, self._suspect, self._mag, self._temperature):
-                    known.clear()
-        elif not -_MAX_STEP_US <= time_us - last <= _MAX_STEP_US:
+        if last is not None and not -_MAX_STEP_US <= time_us - last <= _MAX_STEP_US:
             suspect = self._suspect.get(sensor)
             if suspect is None or not 0 <= time_us - suspect <= _MAX_STEP_US:
                 self._suspect[sensor] = time_us

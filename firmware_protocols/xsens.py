@@ -11,16 +11,11 @@ from collections.abc import Callable, Iterator, Mapping
 from math import degrees, floor, radians
 from typing import Any
 
-from firmware_protocols._stream import (
-    Sequence,
-    StreamDecoder,
-    finite,
-    from_euler,
-    matrix_quaternion,
-    to_euler,
-)
-from firmware_protocols.rotation import rotate
-from firmware_protocols.sample import Counters, Quaternion, Sample, unit_quaternion, z_up
+from firmware_protocols._numbers import int16, number, vector
+from firmware_protocols._sequence import Sequence
+from firmware_protocols._stream import Receiver, StreamDecoder
+from firmware_protocols.rotation import from_angles, from_matrix, rotate, to_yaw_pitch_roll
+from firmware_protocols.sample import Quaternion, Sample, unit_quaternion, z_up
 
 MTDATA2 = 0x36
 """Message id of measurements."""
@@ -213,17 +208,17 @@ class XbusDecoder(StreamDecoder):
                 quat = _z_up(unit_quaternion(*values), item)
             elif kind == 0x2020:
                 # The wire has columns.
-                matrix = _z_up(matrix_quaternion(values[0::3] + values[1::3] + values[2::3]), item)
+                matrix = _z_up(from_matrix(values[0::3] + values[1::3] + values[2::3]), item)
             elif kind == 0x2030:
-                euler = _z_up(from_euler(*map(radians, values)), item)
+                euler = _z_up(from_angles(*map(radians, values[::-1])), item)
             elif kind == 0x4020 or (kind == 0x4040 and acc is None):
-                acc = finite(values)
+                acc = vector(values)
             elif kind == 0x8020 or (kind == 0x8040 and gyr is None):
-                gyr = finite(values)
+                gyr = vector(values)
             elif kind == 0xC020:
-                mag = finite(values)
-            elif kind == 0x0810 and values[0] - values[0] == 0:  # neither NaN nor infinite
-                temperature = values[0]
+                mag = vector(values)
+            elif kind == 0x0810:
+                temperature = number(values[0])
         sensor = 0 if frame[1] == _BROADCAST else frame[1]
         if count is not None and not self._sequence.is_new(sensor, count, time_us):
             return
@@ -290,12 +285,12 @@ def encode_mtdata2(
             columns = [rotate(quat, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]
             payload += _item(0x2020 | code, columns[0] + columns[1] + columns[2])
         elif orientation == "euler":
-            payload += _item(0x2030 | code, tuple(map(degrees, to_euler(quat))))
+            payload += _item(0x2030 | code, tuple(map(degrees, to_yaw_pitch_roll(quat)[::-1])))
         else:
             raise ValueError(f"no orientation {orientation!r}")
-    for kind, vector in ((0x4020, sample.acc), (0x8020, sample.gyr), (0xC020, sample.mag)):
-        if vector is not None:
-            payload += _item(kind | low, vector)
+    for kind, values in ((0x4020, sample.acc), (0x8020, sample.gyr), (0xC020, sample.mag)):
+        if values is not None:
+            payload += _item(kind | low, values)
     return encode_xbus(MTDATA2, payload, sample.sensor or _BROADCAST)
 
 
@@ -382,15 +377,12 @@ class _Group:
         )
 
 
-class Mti600CanDecoder:
+class Mti600CanDecoder(Receiver):
     """Samples out of the CAN messages of MTi-600 sensors on one bus. Experimental: no capture was at hand.
 
     The messages of a sample are put together from one sample time or group counter to the next, and given as
     soon as all are there that the samples before had. Without time and counter, the quaternion (or the lowest
     id that is sent) opens a sample.
-
-    Attributes:
-        counters: what has been seen so far.
     """
 
     WRAP_US = (1 << 32) * _TICK_US
@@ -420,12 +412,11 @@ class Mti600CanDecoder:
             raise ValueError(f"no byte order {byte_order!r} or no frame {frame!r}")
         sign = ">" if byte_order == "big" else "<"
         layouts = {kind: (struct.Struct(sign + f), scale) for kind, (f, scale) in _CAN_LAYOUTS.items()}
-        self.counters = Counters()
+        super().__init__()
         self.WRAP_US = (1 << 32) * time_unit_us
         self._tick_us = time_unit_us
         self._ned = frame == "NED"
         self._sequence = Sequence(self.counters, self.WRAP_US)
-        self._in_sync = True
         self._groups: dict[int, _Group] = {}
         self._ids: dict[tuple[int, bool], tuple[int, str, struct.Struct, float]] = {}
         for sensor, kinds in ({0: MTI600_IDS} if ids is None else ids).items():
@@ -439,19 +430,20 @@ class Mti600CanDecoder:
                 self._ids[key] = (sensor, kind, *layouts[kind])
 
     def feed(self, can_id: int, data: bytes, extended: bool = False) -> list[Sample]:
-        """Samples completed by one CAN message; messages with other ids are left alone."""
+        """Samples completed by one CAN message; messages with other ids are skipped."""
+        self.counters.bytes += len(data)
         entry = self._ids.get((can_id, extended))
         if entry is None:
+            self.counters.skipped += 1
             return []
         sensor, kind, layout, scale = entry
-        self.counters.bytes += len(data)
         value: Any = None
         if len(data) == layout.size:
             raw = layout.unpack(data)
             if kind == "quat":
                 value = unit_quaternion(*[x * scale for x in raw])
             elif kind == "euler":
-                value = from_euler(*[x * scale for x in raw])
+                value = from_angles(*[x * scale for x in raw[::-1]])
             elif kind == "time":
                 value = raw[0] * self._tick_us
             elif kind == "counter":
@@ -461,17 +453,13 @@ class Mti600CanDecoder:
             else:
                 value = (raw[0] * scale, raw[1] * scale, raw[2] * scale)
         if value is None:
-            self.counters.bad += 1
-            self._in_sync = False
-            return []
-        if not self._in_sync:
-            self._in_sync = True
-            self.counters.resyncs += 1
+            return self._bad()
+        self._good()
         group = self._groups[sensor]
         samples: list[Sample] = []
         if group.opens(kind):
             if not group.given:
-                self._give(sensor, group, samples)
+                self._close(sensor, group, samples)
             group.items = {}
             group.given = False
             group.number += 1
@@ -483,11 +471,11 @@ class Mti600CanDecoder:
             return samples
         group.items[kind] = value
         if group.complete():
-            self._give(sensor, group, samples)
+            self._close(sensor, group, samples)
             group.given = True
         return samples
 
-    def _give(self, sensor: int, group: _Group, samples: list[Sample]) -> None:
+    def _close(self, sensor: int, group: _Group, samples: list[Sample]) -> None:
         items = group.late | group.items
         group.late = {}
         quat = items.get("quat") or items.get("euler")
@@ -499,11 +487,7 @@ class Mti600CanDecoder:
         sample = Sample(
             sensor, time_us, quat, *(items.get(kind) for kind in ("acc", "gyr", "mag", "temperature"))
         )
-        if sample[2:] == (None,) * 5:
-            self.counters.skipped += 1
-        else:
-            self.counters.packets += 1
-            samples.append(sample)
+        self._give(sample, samples)
 
 
 def encode_mti600(
@@ -538,7 +522,7 @@ def encode_mti600(
         "time": None if sample.time_us is None else (sample.time_us // time_unit_us & 0xFFFFFFFF,),
         "counter": None if counter is None else (counter & 0xFFFF,),
         "quat": None if euler else quat,
-        "euler": to_euler(quat) if euler and quat is not None else None,
+        "euler": to_yaw_pitch_roll(quat)[::-1] if euler and quat is not None else None,
         "gyr": sample.gyr,
         "acc": sample.acc,
         "mag": sample.mag,
@@ -549,11 +533,6 @@ def encode_mti600(
         if numbers is None or kind not in ids:
             continue
         layout, scale = _CAN_LAYOUTS[kind]
-        try:
-            raw = [floor(number / scale + 0.5) for number in numbers]
-        except (ValueError, OverflowError):
-            raise ValueError(f"cannot send {numbers}") from None
-        if kind not in ("time", "counter"):
-            raw = [max(-32768, min(32767, number)) for number in raw]
+        raw = numbers if kind in ("time", "counter") else [int16(value / scale) for value in numbers]
         messages.append((ids[kind], struct.pack(sign + layout, *raw)))
     return messages

@@ -375,14 +375,6 @@ def test_other_frames_on_the_bus_are_skipped():
     assert decoder.feed(0x50, b"\x55\x59" + bytes(6)) == []  # three of four components are of no use
 
 
-def test_number_of_can_devices_is_bounded():
-    decoder = WitCanDecoder()
-    for can_id in range(1000):
-        decoder.feed(can_id, b"\x55\x51" + bytes(6))
-    assert len(decoder._cycles) == witmotion.MAX_SENSORS
-    assert decoder.counters.skipped == 1000 - witmotion.MAX_SENSORS
-
-
 def test_fine_angle_of_no_axis():
     decoder = WitCanDecoder(fine_angles=True)
     assert decoder.feed(0x50, b"\x55\x53\x04" + bytes(5)) == []
