@@ -46,7 +46,7 @@ def _body_frame(ctx: click.Context, param: click.Parameter, value: str) -> str:
         raise click.BadParameter(str(error)) from None
 
 
-@click.command()
+@click.command(short_help="Find out how the sensors sit on the wearer.")
 @source_options
 @click.option(
     "--out",

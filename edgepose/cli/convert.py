@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from edgepose.converter import Result
 
 
-@click.command()
+@click.command(short_help="Convert recordings and captures.")
 @click.argument(
     "inputs", nargs=-1, required=True, metavar="IN...", type=click.Path(path_type=Path, allow_dash=True)
 )

@@ -10,7 +10,7 @@ import click
 from edgepose import archive
 
 
-@click.command()
+@click.command(short_help="List model archives, show their cards.")
 @click.argument("names", nargs=-1, metavar="[NAME|PATH]...")
 @click.option(
     "--trust", is_flag=True, help="Put the archives' SHA-256 sums on your own list, so that `run` loads them."

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from edgepose.sources import Source
 
 
-@click.command()
+@click.command(short_help="Record what the sensors send.")
 @click.argument("out")
 @source_options
 @click.option(

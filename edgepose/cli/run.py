@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from edgepose.sources import Source
 
 
-@click.command()
+@click.command(short_help="Turn sensor data into poses.")
 @source_options
 @click.option(
     "--calibration",

@@ -9,7 +9,7 @@ import click
 MODES = click.Choice(["window", "stream", "offline"])
 
 
-@click.command()
+@click.command(short_help="Measure a model against true poses.")
 @click.option(
     "--model", "name", default="birnn", show_default=True, help="Shipped model or an archive's path."
 )

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 
-@click.command()
+@click.command(short_help="Make an archive of a trained network.")
 @click.argument("checkpoint", type=click.Path(path_type=Path))
 @click.option(
     "--out",

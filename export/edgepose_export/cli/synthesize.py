@@ -33,7 +33,7 @@ class Job(NamedTuple):
     mounting_seed: int | None
 
 
-@click.command()
+@click.command(short_help="Make recordings from motion capture.")
 @click.argument("inputs", nargs=-1, required=True, type=click.Path(path_type=Path, exists=True))
 @click.option(
     "--out",

@@ -18,7 +18,7 @@ def _config_path(name: str) -> Path:
     return shipped if shipped.is_file() else Path(name)
 
 
-@click.command()
+@click.command(short_help="Train a network.")
 @click.option(
     "--config",
     required=True,
