@@ -15,6 +15,8 @@ from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 from edgepose.recording import read_recording
+from edgepose.skeleton import default_body, forward_kinematics
+from edgepose_export.dataset import read_take
 from edgepose_export.training import read_checkpoint
 
 DATA = Path(__file__).parents[1] / "data" / "mocap"
@@ -255,6 +257,20 @@ def test_synthesize_options(tmp_path):
     still = recording.sensors["left_forearm"].acc[:190]
     np.testing.assert_allclose(still, np.broadcast_to(still[0], still.shape), atol=1e-5)
     assert np.linalg.norm(still[0]) == pytest.approx(9.81, abs=1e-4)
+
+
+def test_synthesize_on_an_own_body(tmp_path):
+    """A model file of SMPL's layout: another body gives other accelerations and the same orientations."""
+    body = default_body(1.5, "female")
+    joints = forward_kinematics(np.tile(np.eye(3), (24, 1, 1)), body.offsets)[1]
+    np.savez(tmp_path / "model.npz", J=joints)
+    edgepose("synthesize", WALK, "--out", tmp_path / "own", "--body", tmp_path / "model.npz")
+    edgepose("synthesize", WALK, "--out", tmp_path / "default")
+    own, default = (read_take(tmp_path / name / f"{WALK.stem}.npz") for name in ("own", "default"))
+    np.testing.assert_array_equal(own.orientation, default.orientation)
+    assert 0.1 < np.abs(own.acceleration - default.acceleration).max() < 20.0
+    (tmp_path / "model.pkl").write_bytes(b"no pickle")
+    assert "model.pkl" in fails("synthesize", WALK, "--out", tmp_path, "--body", tmp_path / "model.pkl")
 
 
 def test_synthesize_faults(tmp_path):

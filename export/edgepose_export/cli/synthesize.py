@@ -12,6 +12,7 @@ from typing import NamedTuple
 import click
 
 from edgepose.errors import EdgeposeError
+from edgepose.skeleton import Body
 
 KINDS = (".bvh", ".amc", ".npz")
 
@@ -28,7 +29,7 @@ class Job(NamedTuple):
     out: Path
     root: Path
     rate: float
-    height_m: float
+    body: Body
     hold_s: float
     mounting_seed: int | None
 
@@ -47,9 +48,13 @@ class Job(NamedTuple):
 @click.option(
     "--height",
     type=click.FloatRange(0.8, 2.5),
-    default=1.75,
-    show_default=True,
-    help="Wearer's height, metres.",
+    help="Height of the default body, metres  [default: 1.75]",
+)
+@click.option(
+    "--body",
+    "body_path",
+    type=click.Path(path_type=Path),
+    help="Your own SMPL model file (.npz or .pkl) instead of the default body; a .pkl's code is not run.",
 )
 @click.option(
     "--hold",
@@ -72,7 +77,8 @@ def synthesize(
     inputs: tuple[Path, ...],
     out: Path,
     rate: float,
-    height: float,
+    height: float | None,
+    body_path: Path | None,
     hold: float,
     mounting_seed: int | None,
     jobs: int,
@@ -87,13 +93,18 @@ def synthesize(
       edgepose synthesize mocap/ --out recordings/ --jobs 2
       edgepose synthesize walk.bvh --out . --hold 6 --mounting 1 --rate 100
     """
+    from edgepose.skeleton import default_body
+    from edgepose_export.body import read_smpl
     from edgepose_export.cli.progress import progress
 
+    if body_path and height:
+        raise click.UsageError("--body has a height of its own: leave --height out")
+    body = read_smpl(body_path) if body_path else default_body(height or 1.75)
     files = [(root, path) for root in inputs for path in _motion_files(root)]
     if not files:
         raise EdgeposeError(f"no motion files ({', '.join(KINDS)}) in {', '.join(map(str, inputs))}")
     tasks = [
-        (path, Job(out, root if root.is_dir() else root.parent, rate, height, hold, mounting_seed))
+        (path, Job(out, root if root.is_dir() else root.parent, rate, body, hold, mounting_seed))
         for root, path in files
     ]
     _check_targets(tasks)
@@ -138,7 +149,6 @@ def convert(path: Path, job: Job) -> str | None:
     import numpy as np
 
     from edgepose.rotations import rotvec_to_matrix
-    from edgepose.skeleton import default_body
     from edgepose_export.mocap import pieces, read_motion, resample
     from edgepose_export.synthesis import recording_arrays, virtual_imus, with_hold
 
@@ -155,7 +165,7 @@ def convert(path: Path, job: Job) -> str | None:
             motion = resample(take, job.rate)
             if job.hold_s:
                 motion = with_hold(motion, job.hold_s)
-            imus = virtual_imus(motion, default_body(job.height_m), mounting)
+            imus = virtual_imus(motion, job.body, mounting)
             name = f"{path.stem}.part{i + 1}.npz" if len(takes) > 1 else f"{path.stem}.npz"
             target = job.out / path.relative_to(job.root).with_name(name)
             target.parent.mkdir(parents=True, exist_ok=True)
