@@ -48,7 +48,8 @@ class Pattern:
 
     Attributes:
         regex: searched in every line; its named groups are FIELDS. It should begin with fixed text and end in
-            `$`, so that no piece of a line, and no two pieces run together, can match.
+            `$`, so that no piece of a line, and no two pieces run together, can match. A group should not be
+            able to hold what separates it from the next, or bad lines take long to be refused.
         columns: name of the column for each of the FIELDS, or a list of names of which the first that is
             there counts; names are in a header line. Those that the header does not have are absent.
         header: the header line, for devices that send none or sent it before the port was open.

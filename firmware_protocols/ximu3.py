@@ -292,7 +292,7 @@ def _parse(line: bytes) -> _Message | None:
 # --- for simulation -------------------------------------------------------------------------------
 
 
-def message(
+def encode_message(
     letter: str, time_us: int, values: tuple[float, ...], *, sensor: int = 0, ascii: bool = False
 ) -> bytes:
     """The bytes of one message, line feed included.
@@ -351,5 +351,5 @@ def encode(sample: Sample, *, ascii: bool = False, frame: str = "NWU") -> bytes:
         # A half turn of the inertial frame is its own inverse.
         parts.append(("Q", z_up(sample.quat) if frame == "NED" else sample.quat))
     return b"".join(
-        message(letter, time_us, values, sensor=sample.sensor, ascii=ascii) for letter, values in parts
+        encode_message(letter, time_us, values, sensor=sample.sensor, ascii=ascii) for letter, values in parts
     )

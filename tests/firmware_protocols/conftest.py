@@ -1,4 +1,4 @@
-"""Compilers for the tests of the C header and the example firmware."""
+"""Compilers for the tests of the C header and the example firmware; feeding in pieces."""
 
 import os
 import shlex
@@ -37,3 +37,21 @@ def cc():
 @pytest.fixture(scope="session")
 def cxx():
     return Compiler("CXX", "c++")
+
+
+@pytest.fixture(scope="session")
+def in_pieces():
+    """Feeds a stream whole and in pieces of these sizes, and gives its samples and counters if they agree."""
+
+    def feed(make, data, sizes):
+        whole, pieces = make(), make()
+        expected = whole.feed(data)
+        got, at = [], 0
+        for size in [*sizes, len(data)]:
+            got += pieces.feed(data[at : at + size])
+            at += size
+        assert got == expected
+        assert pieces.counters == whole.counters
+        return got, whole.counters
+
+    return feed
