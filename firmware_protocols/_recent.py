@@ -15,8 +15,9 @@ class Recent(dict[K, V]):
     """A dict of the MAX_SENSORS keys set last; more push out those not set for longest."""
 
     def __setitem__(self, key: K, value: V) -> None:
-        """Set, as the latest."""
-        self.pop(key, None)
+        """Set, as the latest if there are many."""
+        if len(self) > MAX_SENSORS // 2:
+            self.pop(key, None)
         super().__setitem__(key, value)
         if len(self) > MAX_SENSORS:
             del self[next(iter(self))]
