@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import logging
 import signal
 import sys
 from importlib.metadata import entry_points
@@ -61,6 +62,8 @@ def main() -> NoReturn:
     """
     signal.signal(signal.SIGTERM, _terminate)  # ends a run as Ctrl-C does: files complete, counts printed
     debug = "--debug" in sys.argv[1:]
+    # On a terminal a warning takes the place of the line that shows how far a command is.
+    logging.basicConfig(format="\r\033[K%(message)s" if sys.stderr.isatty() else "%(message)s")
     try:
         sys.exit(cli.main(standalone_mode=False) or 0)
     except EdgeposeError as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import sys
 from typing import TYPE_CHECKING
 
@@ -14,7 +13,7 @@ if TYPE_CHECKING:
     from edgepose.sources.probe import Finding
 
 
-@click.command()
+@click.command(short_help="List serial ports and CAN interfaces.")
 @click.argument("names", nargs=-1, metavar="[PORT|INTERFACE:CHANNEL]...")
 @click.option(
     "--probe",
@@ -76,11 +75,9 @@ def _ports() -> dict[str, str]:
 
 def _buses() -> list[str]:
     """CAN interfaces found."""
-    # No CAN backend is configured here; importing python-can costs more than the rest of this command.
-    import can
+    # Importing python-can costs more than the rest of this command.
+    from edgepose.sources.can_bus import can
 
-    # It tells of every vendor's library that is not installed.
-    logging.getLogger("can").setLevel(logging.CRITICAL)
     found = can.detect_available_configs(
         interfaces=["socketcan", "pcan", "vector", "kvaser", "ixxat", "usb2can"]
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,9 @@ import can
 from edgepose.errors import EdgeposeError
 from edgepose.sources import POLL_S
 from edgepose.sources.live import Gone
+
+# It tells of every maker's library that is not installed, and of every clock that is not.
+logging.getLogger("can").setLevel(logging.CRITICAL)
 
 _MOST = 256
 """Messages read at a time."""

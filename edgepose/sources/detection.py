@@ -121,27 +121,31 @@ class Detector:
         Raises:
             EdgeposeError: two fit equally well.
         """
-        found = [
-            (decoder.counters.packets, i)
-            for i, decoder in enumerate(self.decoders)
-            if decoder.counters.packets
-        ]
-        found.sort(reverse=True)
-        if not found:
+        heard = [i for i, samples in enumerate(self._heard) if samples]
+        most = max((self.decoders[i].counters.packets for i in heard), default=0)
+        # Decoders of text lines can understand some columns of another format, as many times.
+        close = [i for i in heard if 2 * self.decoders[i].counters.packets >= most]
+        close.sort(key=self._quantities, reverse=True)
+        if not close:
             return None
-        packets, best = found[0]
-        bad = self.decoders[best].counters.bad
+        best = close[0]
+        packets, bad = self.decoders[best].counters.packets, self.decoders[best].counters.bad
         # A line that is heard from the middle of a packet begins with a bad one.
-        sure = len(found) == 1 and packets >= SURE_PACKETS and bad <= 1
+        sure = len(heard) == 1 and packets >= SURE_PACKETS and bad <= 1
         if not sure and not (now and packets >= LEAST_PACKETS and packets > bad):
             return None
-        if len(found) > 1 and 2 * found[1][0] >= packets:
-            other = self._protocols[found[1][1]].name
-            raise EdgeposeError(
-                f"{self._name}: it could be {self._protocols[best].name} ({packets} good packets) or "
-                f"{other} ({found[1][0]}); say which with --protocol"
-            )
+        for other in close[1:]:
+            if self._quantities(other) == self._quantities(best):
+                raise EdgeposeError(
+                    f"{self._name}: it could be {self._protocols[best].name} ({packets} good packets) or "
+                    f"{self._protocols[other].name} ({self.decoders[other].counters.packets}); "
+                    "say which with --protocol"
+                )
         return self._protocols[best], self.decoders[best], self._heard[best]
+
+    def _quantities(self, i: int) -> int:
+        """How much there is in the last good packet of a decoder."""
+        return sum(value is not None for value in self._heard[i][-1][1][-1][2:])
 
 
 def _text_lines(path: Path) -> Protocol:

@@ -89,8 +89,18 @@ class SensorMap(NamedTuple):
         }
 
     def all_places(self) -> Places:
-        """Placements by id, of a line whose name is not known."""
-        return {device.id: i for i, device in enumerate(self.devices.values())}
+        """Placements by id, of a line whose name is not known.
+
+        Raises:
+            EdgeposeError: two devices can only be told apart by their lines.
+        """
+        result = {device.id: i for i, device in enumerate(self.devices.values())}
+        if len(result) < len(self.devices):
+            raise EdgeposeError(
+                f"{self.path}: it tells sensors apart by their ports, and a capture holds one port; "
+                "record samples instead (edgepose record walk.csv)"
+            )
+        return result
 
     def mounting_warnings(self, found: list[str]) -> list[str]:
         """One line for each sensor that is worn otherwise than the map says.
@@ -140,12 +150,18 @@ def read_toml(path: Path) -> dict[str, Any]:
     Raises:
         EdgeposeError: it cannot be read or is none.
     """
+    text = ""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        return tomllib.loads(text)
     except OSError as error:
         raise EdgeposeError(f"{path}: cannot read it: {error.strerror}") from None
     except ValueError as error:  # also not UTF-8
-        raise EdgeposeError(f"{path}: not valid TOML: {error}") from None
+        # The parser does not name what is there twice.
+        keys = re.findall(r"^\s*(?:\[\s*)?(\w+)\s*[=\]]", text, re.MULTILINE)
+        twice = [key for key in PLACEMENTS if keys.count(key) > 1]
+        why = f"{twice[0]} is there twice" if twice else f"not valid TOML: {error}"
+        raise EdgeposeError(f"{path}: {why}") from None
 
 
 def read_map(path: Path) -> SensorMap:
