@@ -18,6 +18,7 @@ import os
 import random
 import re
 import select
+import signal
 import sys
 import time
 import tty
@@ -486,6 +487,8 @@ def main(
         raise click.UsageError("a CAN controller passes no wrong bits on; use --loss")
     if duplicate_id and spoken.alone:
         raise click.UsageError(f"{protocol} has one sensor on a line, whatever its id")
+    # A shell starts what runs in the background deaf to Ctrl-C.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         simulate(recording, spoken, bus, stand, Faults(loss, corrupt, jitter, drift, kill, duplicate_id))
     except EdgeposeError as error:
