@@ -1,7 +1,8 @@
 """The main job from end to end: six simulated IMUs on a serial port, calibration, poses, and their error.
 
 A motion-capture clip that no shipped model has seen moves a body; six virtual sensors, strapped on at random
-angles, send native packets over a pty in real time. The commands that are run are those a wearer would run.
+angles, send native packets over a pty in real time, or another wire format over one pty, six ptys, or a CAN
+adapter on a pty. The commands that are run are those a wearer would run.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from edgepose.figures import skeleton_strip
 from edgepose.metrics import format_table, summary
 from edgepose.poses import read_poses_csv
 from edgepose.skeleton import default_body
+from firmware_protocols.registry import PROTOCOLS
 
 CLIP = Path(__file__).parent / "data" / "09_12.bvh"
 HOLD_S = 6.0
@@ -57,12 +59,14 @@ def edgepose(*words: object) -> list[str]:
 
 
 @contextmanager
-def simulator(recording: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """The simulated sensors, standing still, and the port they send to."""
+def simulator(recording: Path, protocol: str) -> Iterator[tuple[subprocess.Popen[str], list[str]]]:
+    """The simulated sensors, standing still, and the flags that name the lines they send to."""
     words = [sys.executable, str(Path(__file__).parent / "simulate.py"), str(recording), "--stand"]
+    words += ["--protocol", protocol]
     process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    kind = "can" if PROTOCOLS[protocol].transport == "can" else "port"
     try:
-        yield process, said(process, "port")
+        yield process, [f"--{kind}", said(process, kind)]
     finally:
         assert process.stdin
         process.stdin.close()
@@ -98,13 +102,18 @@ class Listener(threading.Thread):
             self.first.set()
 
 
-def follow(process: subprocess.Popen[str], port: str, out: Path) -> tuple[float, float, Listener]:
+def follow(process: subprocess.Popen[str], source: list[str], out: Path) -> tuple[float, float, Listener]:
     """Calibrates, starts a run, lets the clip play.
+
+    Args:
+        process: the simulated sensors.
+        source: flags that name their lines.
+        out: folder for results.
 
     Returns:
         When the clip began and ended, Unix time, and what came by UDP.
     """
-    source, calibration = ("--port", port), out / "calibration.json"
+    calibration = out / "calibration.json"
     hold = ("--body-frame", "heading:0", "--hold", 3, "--countdown", 1)
     subprocess.run(edgepose("calibrate", *source, *hold, "--out", calibration), check=True)
     listener = Listener()
@@ -160,7 +169,14 @@ def report(begin: float, end: float, listener: Listener, truth: Truth, out: Path
 @click.option(
     "--out", type=click.Path(path_type=Path), default=Path("demo-output"), help="Folder for results."
 )
-def main(out: Path) -> None:
+@click.option(
+    "--protocol",
+    type=click.Choice(list(PROTOCOLS)),
+    default="native",
+    show_default=True,
+    help="Wire format of the sensors.",
+)
+def main(out: Path, protocol: str) -> None:
     """The command line."""
     out.mkdir(parents=True, exist_ok=True)
     recording = out / CLIP.with_suffix(".npz").name
@@ -168,9 +184,13 @@ def main(out: Path) -> None:
     subprocess.run(edgepose("synthesize", CLIP, "--out", out, *rig), check=True)
     with np.load(recording) as data:
         truth = Truth(data["t"], rot.rotvec_to_matrix(data["poses"].reshape(-1, 24, 3)))
-    with simulator(recording) as (process, port):
-        click.echo(f"\nsix simulated IMUs stand still and send {RATE:g} times a second to {port}", err=True)
-        results = follow(process, port, out)
+    with simulator(recording, protocol) as (process, source):
+        click.echo(
+            f"\nsix simulated IMUs stand still and send {RATE:g} times a second to {source[1]}", err=True
+        )
+        if protocol != "native":
+            source += ["--protocol", protocol]
+        results = follow(process, source, out)
     report(*results, truth, out)
 
 
