@@ -21,6 +21,44 @@ _MOST = 256
 """Messages read at a time."""
 
 
+class Buffered:
+    """A serial port whose bytes are fetched all at once, however few of them are asked for.
+
+    python-can reads slcan adapters byte by byte. At two system calls each, the frames of six sensors take it
+    4 ms, and where devices send no time these would be an error of their times.
+    """
+
+    def __init__(self, port: Any) -> None:
+        """Nothing fetched yet."""
+        self._port = port
+        self._data = b""
+        self._at = 0
+
+    @property
+    def in_waiting(self) -> int:
+        """Bytes that can be read without waiting; those fetched already, if there are any."""
+        return len(self._data) - self._at or self._port.in_waiting
+
+    def read(self, size: int = 1) -> bytes:
+        """Up to so many bytes; waits for the first one for as long as the port does."""
+        if self._at == len(self._data):
+            self._data = self._port.read(1)
+            self._data += self._port.read(self._port.in_waiting)
+            self._at = 0
+        data = self._data[self._at : self._at + size]
+        self._at += len(data)
+        return data
+
+    def reset_input_buffer(self) -> None:
+        """Throws away what came."""
+        self._data, self._at = b"", 0
+        self._port.reset_input_buffer()
+
+    def __getattr__(self, name: str) -> Any:
+        """All else is the port's."""
+        return getattr(self._port, name)
+
+
 class CanBus:
     """An open bus."""
 
@@ -45,6 +83,10 @@ class CanBus:
         # Every maker's library fails in its own way.
         except Exception as error:
             raise EdgeposeError(f"{name}: {_opening_problem(interface, channel, error)}") from None
+        self._port: Buffered | None = None
+        if interface == "slcan":
+            bus: Any = self._bus
+            self._port = bus.serialPortOrig = Buffered(bus.serialPortOrig)
 
     def read(self) -> tuple[list[can.Message], bool]:
         """See `live.Handle`."""
@@ -61,6 +103,9 @@ class CanBus:
                 timeout = 0.0
                 if not message.is_error_frame and not message.is_remote_frame:
                     messages.append(message)
+                # To ask slcan for what is not there takes a millisecond.
+                if self._port is not None and not self._port.in_waiting:
+                    return messages, False
         except (can.CanError, OSError):
             if not messages:
                 raise Gone from None

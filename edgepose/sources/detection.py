@@ -132,7 +132,7 @@ class Detector:
         packets, bad = self.decoders[best].counters.packets, self.decoders[best].counters.bad
         # A line that is heard from the middle of a packet begins with a bad one.
         sure = len(heard) == 1 and packets >= SURE_PACKETS and bad <= 1
-        if not sure and not (now and packets >= LEAST_PACKETS and packets > bad):
+        if not sure and not (now and packets >= LEAST_PACKETS and 2 * packets >= bad):
             return None
         for other in close[1:]:
             if self._quantities(other) == self._quantities(best):

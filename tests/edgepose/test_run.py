@@ -17,6 +17,7 @@ import threading
 import time
 import tty
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ from edgepose.recording import read_recording, samples, write_csv
 from edgepose.sinks.udp import decode_binary
 from edgepose.skeleton import JOINTS, PARENTS
 from edgepose.sync import FrameClock
+from firmware_protocols import native_can
 from firmware_protocols.native import Packet, encode
 
 SIMULATOR = Path(__file__).parents[2] / "tools" / "simulate.py"
@@ -329,8 +331,9 @@ class Rig(threading.Thread):
         noise: sent once, between two packets.
     """
 
-    def __init__(self, recording: Path) -> None:
+    def __init__(self, recording: Path, wire: Callable[[Packet], bytes] = encode) -> None:
         super().__init__(daemon=True)
+        self._wire = wire
         self.master, self.slave = pty.openpty()
         tty.setraw(self.slave)
         os.set_blocking(self.master, False)
@@ -351,7 +354,7 @@ class Rig(threading.Thread):
             for i, rows in enumerate(self._rows):
                 if i in self.silent:
                     continue
-                data = encode(Packet(i, counts[i], t_us, *map(tuple, rows[counts[i] % len(rows)])))
+                data = self._wire(Packet(i, counts[i], t_us, *map(tuple, rows[counts[i] % len(rows)])))
                 counts[i] += 1
                 packets += 1
                 if self.corrupt and packets % 7 == 0:
@@ -387,7 +390,14 @@ class Rig(threading.Thread):
 def live(wearer, port: str, listener: Listener, file: Path):
     """A run on a port that has given its first pose."""
     process = start(
-        *("--port", port, "--calibration", wearer.calibration, "--model", "rnn"),
+        *(
+            "--can" if port.startswith("slcan:") else "--port",
+            port,
+            "--calibration",
+            wearer.calibration,
+            "--model",
+            "rnn",
+        ),
         *("--csv", file, "--udp", listener.address),
     )
     try:
@@ -461,21 +471,30 @@ def test_live_from_the_simulator_until_sigterm(wearer, tmp_path):
     assert ((time_s > started) & (time_s < ended)).any()
 
 
-def test_a_port_that_is_unplugged_and_comes_back(wearer, tmp_path):
-    """The port is reached through a symbolic link, as those under /dev/serial/by-id are."""
-    file, name = tmp_path / "poses.csv", tmp_path / "hub"
-    with Listener() as listener, Rig(wearer.recording) as first:
-        name.symlink_to(first.port)
-        with live(wearer, str(name), listener, file) as run:
+def slcan(packet: Packet) -> bytes:
+    """A packet's CAN frames as an adapter writes them on its serial port."""
+    frames = native_can.encode(packet)
+    return b"".join(b"t%03X%d%s\r" % (can_id, len(data), data.hex().encode()) for can_id, data in frames)
+
+
+@pytest.mark.parametrize(("prefix", "wire"), [("", encode), ("slcan:", slcan)], ids=["port", "bus"])
+def test_a_line_that_is_unplugged_and_comes_back(wearer, tmp_path, monkeypatch, prefix, wire):
+    """It is reached through a symbolic link, as the ports under /dev/serial/by-id are."""
+    monkeypatch.setenv("CAN_CONFIG", '{"sleep_after_open": 0.01}')  # python-can's own way to set this
+    file, link = tmp_path / "poses.csv", tmp_path / "hub"
+    name = f"{prefix}{link}"
+    with Listener() as listener, Rig(wearer.recording, wire) as first:
+        link.symlink_to(first.port)
+        with live(wearer, name, listener, file) as run:
             time.sleep(0.5)
-            name.unlink()
+            link.unlink()
             first.unplug()
             os.close(first.slave)
             assert run.stderr.readline().startswith("running rnn")
             assert run.stderr.readline() == f"{name}: gone; the run goes on and waits for it\n"
             time.sleep(1.0)
-            with Rig(wearer.recording) as second:
-                name.symlink_to(second.port)
+            with Rig(wearer.recording, wire) as second:
+                link.symlink_to(second.port)
                 assert re.fullmatch(rf"{name}: back after \d+\.\d s\n", run.stderr.readline())
                 time.sleep(1.0)
                 run.send_signal(signal.SIGINT)

@@ -2,22 +2,27 @@ import contextlib
 import os
 import pty
 import re
+import select
 import threading
 import time
 import tty
-from itertools import pairwise
+from collections import Counter
+from itertools import count, pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 import serial
 
+from edgepose.capture import times_header, times_path, times_row
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 from edgepose.recording import csv_header, csv_row, read_recording, samples, write_csv
 from edgepose.sources import open_source
 from edgepose.sync import FrameClock
 from firmware_protocols.native import Info, Packet, encode, encode_info
+from firmware_protocols.registry import PROTOCOLS
+from firmware_protocols.sample import Sample
 
 REAL = Path(__file__).parents[1] / "data" / "imu" / "six-sites-3s.npz"
 
@@ -250,6 +255,222 @@ def test_not_a_port(tmp_path):
 def test_impossible_speed(port):
     with pytest.raises(EdgeposeError, match="cannot open"):
         open_source(port=port[1], baud=-1).__enter__()
+
+
+# --- every wire format --------------------------------------------------------------------------------------
+
+BYTES = [name for name, protocol in PROTOCOLS.items() if protocol.transport == "bytes"]
+QUAT = (0.6, 0.0, 0.8, 0.0)
+
+
+class Rig(threading.Thread):
+    """Six devices of one wire format, on six ptys or one, 100 samples a second each until it is left."""
+
+    def __init__(self, name, lines=None, ids=None):
+        super().__init__(daemon=True)
+        self.protocol = PROTOCOLS[name]
+        self.alone = self.protocol.alone and lines != 1
+        self.ptys = [pty.openpty() for _ in range(6 if self.alone else 1)]
+        for master, slave in self.ptys:
+            tty.setraw(slave)
+            os.set_blocking(master, False)  # bytes that nobody reads are lost
+        self.ids = [0] * 6 if self.alone else list(ids or self.protocol.ids)
+        self.names = ",".join(os.ttyname(slave) for _, slave in self.ptys)
+        self.encoders = [self.protocol.encoder() for _ in self.ptys]
+        self.left = threading.Event()
+
+    def wire(self, i, k, start_us=7_000_000):
+        sample = Sample(
+            *(self.ids[i], start_us + 10_000 * k, QUAT, (0.1, 0.2, 9.81), (0.1, 0.0, 0.0)),
+            *((10.0, 20.0, 30.0), 25.0),
+        )
+        # Text lines have their header again from time to time.
+        return self.encoders[i % len(self.encoders)](sample, k % 20 if "openlog" in self.protocol.name else k)
+
+    def run(self):
+        for k in count():
+            if self.left.wait(0.01):
+                return
+            if self.protocol.request:
+                self.answer(k)
+            else:
+                for i in range(6):
+                    with contextlib.suppress(BlockingIOError):
+                        os.write(self.ptys[i % len(self.ptys)][0], self.wire(i, k))
+
+    def answer(self, k):
+        master = self.ptys[0][0]
+        while select.select([master], [], [], 0.002)[0]:
+            asked = os.read(master, 1000)
+            for i, sensor in enumerate(self.ids):
+                if self.protocol.request(sensor)[0] in asked:
+                    os.write(master, self.wire(i, k))
+
+    def __enter__(self):
+        self.start()
+        return self
+
+    def __exit__(self, *_):
+        self.left.set()
+        self.join()
+        for fds in self.ptys:
+            for fd in fds:
+                os.close(fd)
+
+
+def listen(n, **options):
+    """Source, samples, so many of each sensor, and frames."""
+    got, frames, clock = [], [], FrameClock()
+    missing = Counter(dict.fromkeys(range(6), n))
+    with open_source(**options) as source:
+        for now_s, batch in source:
+            got += batch
+            if batch and all(sample.acc and sample.quat for sample in batch):
+                clock.push(batch, now_s)
+                frames += clock.frames(now_s)
+            missing -= Counter(sample.sensor for sample in batch)
+            if not missing:
+                return source, got, frames
+    raise AssertionError("a live source does not end")
+
+
+@pytest.mark.parametrize("name", BYTES)
+def test_any_protocol_is_found_and_read(name):
+    """In the order of PLACEMENTS, whether sensors share a line or not; those that must be asked are named."""
+    with Rig(name) as rig:
+        protocol = name if rig.protocol.request else "auto"
+        source, got, frames = listen(30, port=rig.names, protocol=protocol, baud=115200)
+    assert {sample.sensor for sample in got} == set(range(6))
+    for sensor in range(6):
+        times = [sample.time_s for sample in got if sample.sensor == sensor]
+        assert all(b > a for a, b in pairwise(times))
+        assert abs(times[-1] - time.time()) < 5.0
+    assert source.counters.packets == len(got)
+    assert source.counters.bad <= 6  # the first one of a line may have lost its beginning
+    if got[-1].quat is not None:
+        assert abs(np.dot(got[-1].quat, QUAT)) == pytest.approx(1.0, abs=1e-3)
+    if got[-1].acc is not None and name != "openlog":
+        assert got[-1].acc == pytest.approx((0.1, 0.2, 9.81), abs=0.02)
+        assert len(frames) >= 6 or rig.protocol.request  # they are asked as fast as the line is
+
+
+def test_a_map_names_ports_and_protocols(tmp_path):
+    """Two wire formats, a hub and two devices of their own, and nothing but the map says so."""
+    rig_file = tmp_path / "rig.toml"
+    with Rig("native", ids=[40, 41, 42, 43, 44, 45]) as hub, Rig("xsens") as alone:
+        first, second, *_ = alone.names.split(",")
+        rows = [f'{PLACEMENTS[i]} = {{ port = "{hub.names}", id = {45 - i} }}' for i in range(4)]
+        rows += [f'head = {{ port = "{first}" }}', f'pelvis = {{ port = "{second}" }}']
+        rows += [f'[ports."{first}"]', 'protocol = "xsens"', "baud = 460800"]
+        rig_file.write_text("\n".join(rows))
+        source, got, _ = listen(50, sensors=rig_file)
+    assert {sample.sensor for sample in got} == set(range(6))
+    assert source.counters.unknown > 50  # ids 40 and 41
+
+
+def test_two_hubs_with_the_same_ids():
+    with Rig("native") as a, Rig("native") as b, pytest.raises(EdgeposeError) as info:
+        listen(10_000, port=f"{a.names},{b.names}")
+    assert re.search(r"both have a sensor for \w+, id \d; ", str(info.value))
+    assert "--sensors" in str(info.value)
+
+
+def test_one_port_of_a_device_that_is_alone():
+    with Rig("witmotion") as rig, pytest.raises(EdgeposeError, match="which sensor is where"):
+        listen(10_000, port=rig.names.split(",")[0])
+
+
+def test_two_devices_with_one_id_are_told_once(port, caplog):
+    master, name = port
+    both = zip(chunks(250), chunks(250, start_us=900_000_000, ids=[2]), strict=True)
+    with open_source(port=name, protocol="native") as source, Device(master, [a + b for a, b in both]):
+        for _ in source:
+            if "to and fro" in caplog.text:
+                break
+    assert [r.getMessage() for r in caplog.records] == [
+        f"{name}: the clock of the sensor for left_lower_leg jumps to and fro; "
+        "are there two devices with its id?"
+    ]
+
+
+def test_what_two_formats_understand(port):
+    """A line on which two formats are spoken equally often belongs to none of them."""
+    master, name = port
+    hipnuc, xsens = Rig("hipnuc"), Rig("xsens")
+    mixed = [hipnuc.wire(0, k) + xsens.wire(0, k) for k in range(300)]
+    with Device(master, mixed), pytest.raises(EdgeposeError, match=r"it could be .* or .*--protocol"):
+        listen(10_000, port=name)
+
+
+@pytest.mark.parametrize("name", ["native", "xsens", "hipnuc", "ximu3", "mavlink", "openlog"])
+def test_captures_of_other_protocols(tmp_path, name):
+    """Without arrival times; of a device that is alone, the file of --sensors gives its id on the line."""
+    rig = Rig(name, lines=1, ids=range(40, 46) if name != "xsens" else range(11, 17))
+    if name in ("hipnuc", "openlog"):
+        rig.ids = [0] * 6
+    n = 6 if rig.ids[1] else 1
+    data = b"".join(rig.wire(i, k) for k in range(150) for i in range(n))
+    file, sensors = tmp_path / "walk.bin", tmp_path / "rig.toml"
+    file.write_bytes(data)
+    sensors.write_text("\n".join(f"{p} = {{ id = {rig.ids[0] + i} }}" for i, p in enumerate(PLACEMENTS)))
+    source, _, got = everything(file=file, sensors=sensors)
+    assert len(got) >= 148 * n
+    assert {sample.sensor for sample in got} == set(range(n))
+    times = [sample.time_s for sample in got if sample.sensor == 0]
+    assert times[-1] - times[0] == pytest.approx(0.01 * (len(times) - 1), abs=1e-3)
+    assert source.counters.bad == source.counters.lost == 0
+    # With the name of the protocol, the file may have any name.
+    other = file.rename(tmp_path / "walk.dat")
+    assert len(everything(file=other, sensors=sensors, protocol=name)[2]) == len(got)
+
+
+def test_a_capture_without_times(tmp_path):
+    """Of packets without a clock: arrival times, if they were noted, make up for it."""
+    rig = Rig("haritorax")
+    file, end = tmp_path / "walk.bin", 0
+    with file.open("wb") as out, times_path(file).open("w") as noted:
+        noted.write(times_header({}))
+        for k in range(100):
+            wire = b"".join(rig.wire(i, k) for i in range(6))
+            end += out.write(wire)
+            noted.write(times_row(1_700_000_000.0 + 0.01 * k, end))
+    _, _, got = everything(file=file)
+    times = [sample.time_s for sample in got if sample.sensor == 4]
+    assert len(times) >= 98
+    assert np.diff(times) == pytest.approx(0.01, abs=1e-3)
+    times_path(file).unlink()
+    with pytest.raises(EdgeposeError, match=r"walk\.bin: its packets carry no time"):
+        everything(file=file)
+
+
+def test_lines_of_text_as_a_file_describes_them(tmp_path):
+    pattern = tmp_path / "mine.toml"
+    pattern.write_text(
+        "regex = '^P(?P<sensor>\\d) (?P<time>\\d+) (?P<w>\\S+) (?P<x>\\S+) (?P<y>\\S+) (?P<z>\\S+)$'\n"
+        "units = { time = 'ms' }\n"
+    )
+    (tmp_path / "log.txt").write_text(
+        "".join(f"P{s} {10 * k} 1 0 0 0\n" for k in range(50) for s in range(6))
+    )
+    _, _, got = everything(file=tmp_path / "log.txt", protocol=str(pattern))
+    assert len(got) == 300
+    assert got[-1].sensor == 5
+    assert got[-1].time_s - got[0].time_s == pytest.approx(0.49)
+    pattern.write_text("regexp = 'x'\n")
+    with pytest.raises(EdgeposeError, match=r"mine\.toml: unknown key 'regexp'"):
+        open_source(port="a", protocol=str(pattern))
+
+
+def test_raw_data_are_kept_on_demand(port):
+    master, name = port
+    raw = []
+    with open_source(port=name, raw=raw) as source, Device(master, chunks(100)):
+        for _ in source:
+            if source.counters.packets > 100:
+                break
+    decoder = PROTOCOLS["native"].decoder()
+    assert len([s for _, data in raw for s in decoder.feed(data)]) == source.counters.packets
+    assert all(b[0] >= a[0] for a, b in pairwise(raw))
 
 
 # --- files --------------------------------------------------------------------------------------------------
