@@ -35,12 +35,13 @@ import numpy as np
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 from edgepose.recording import Recording, SensorData, read_recording
+from edgepose.skeleton import default_body
 from firmware_protocols.registry import PROTOCOLS, Frame
 from firmware_protocols.registry import Protocol as Format
 from firmware_protocols.rotation import rotate_back
 from firmware_protocols.sample import Sample
 
-CLIP_RATE, CLIP_HEIGHT_M, CLIP_HOLD_S = 100.0, 1.75, 6.0
+CLIP_RATE, CLIP_HOLD_S = 100.0, 6.0
 ANSWER_BITS_S = 115_200
 """Speed of a line on which devices are asked; a pty alone has none, and they would answer at once."""
 
@@ -74,7 +75,7 @@ def read_input(path: Path) -> Recording:
 
     with TemporaryDirectory() as folder:
         out = Path(folder)
-        job = Job(out, path.parent, CLIP_RATE, CLIP_HEIGHT_M, CLIP_HOLD_S, None)
+        job = Job(out, path.parent, CLIP_RATE, default_body(), CLIP_HOLD_S, None)
         problem = convert(path, job)
         if problem is not None:
             raise EdgeposeError(problem)

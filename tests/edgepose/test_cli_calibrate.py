@@ -357,7 +357,7 @@ def test_a_whole_session_on_a_terminal(wearer: Wearer, tmp_path: Path) -> None:
                 wearer.quats_at = lambda t: worn(cal.POSES["straight"])
                 time.sleep(0.3)  # what was measured while lying has to be taken off the line
                 os.write(terminal, b"\n")
-        assert process.wait(timeout=30) == 0, screen.decode()
+        assert process.wait(timeout=120) == 0, screen.decode()
     finally:
         process.kill()
         process.wait()

@@ -89,7 +89,7 @@ def until(process: subprocess.Popen[str], file: Path, size: int) -> None:
 
 
 def end(process: subprocess.Popen[str]) -> tuple[int, str]:
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=120)
     assert "Traceback" not in errors
     return process.returncode, errors
 
@@ -136,7 +136,7 @@ def test_seconds_progress_and_counts(tmp_path):
             while more := os.read(terminal, 4096):
                 text += more
         os.close(terminal)
-        assert process.wait(30) == 0, text
+        assert process.wait(120) == 0, text
     said = text.decode()
     recording = read_recording(file)
     count = good(recording)
@@ -176,7 +176,7 @@ def test_a_stop_leaves_a_whole_file(tmp_path, name, number):
 def test_standard_output(tmp_path):
     with Rig() as rig:
         process = start("-", "--port", rig.port, "--seconds", 0.5, stdout=subprocess.PIPE)
-        text, errors = process.communicate(timeout=30)
+        text, errors = process.communicate(timeout=120)
     assert process.returncode == 0, errors
     (tmp_path / "walk.csv").write_text(text)
     assert good(read_recording(tmp_path / "walk.csv")) > 100
@@ -325,7 +325,7 @@ def test_kill_in_the_middle(command, tmp_path, name):
         until(process, growing, 3000)
         seen = growing.stat().st_size
         process.kill()
-        process.communicate(timeout=30)
+        process.communicate(timeout=120)
         assert growing.stat().st_size >= seen
         if name == "walk.npz":
             assert not file.exists()
