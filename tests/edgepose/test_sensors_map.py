@@ -1,9 +1,13 @@
 """The file of --sensors: what it may say, what it means, and what is told when it means nothing."""
 
 import re
+import shlex
+from pathlib import Path
 
+import click
 import pytest
 
+from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import open_source
@@ -117,6 +121,32 @@ def test_an_unknown_protocol_of_a_port(read):
     rig = read(PORTS + '\n[ports."/dev/ttyUSB2"]\nprotocol = "nonsense"\n')
     with pytest.raises(EdgeposeError, match="unknown protocol 'nonsense'"):
         links(None, None, None, None, False, "auto", rig)
+
+
+# --- the page about it --------------------------------------------------------------------------------------
+
+PAGE = (Path(__file__).parents[2] / "docs" / "sensors.md").read_text()
+
+
+@pytest.mark.parametrize("text", re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL))
+def test_examples_of_maps_are_maps(read, text):
+    rig = read(text)
+    assert list(rig.devices) == list(PLACEMENTS)
+    for settings in rig.ports.values():
+        assert settings.protocol in PROTOCOLS
+
+
+@pytest.mark.parametrize("line", re.findall(r"^edgepose .*$", PAGE, re.MULTILINE))
+def test_examples_of_commands_are_commands(line):
+    _, name, *words = shlex.split(line)
+    command = cli.get_command(click.Context(cli), name)
+    assert command.make_context(name, words).params
+
+
+def test_every_protocol_is_on_the_page():
+    for name, protocol in PROTOCOLS.items():
+        row = next(row for row in PAGE.splitlines() if row.startswith("|") and f"`{name}`" in row)
+        assert str(protocol.speed) in row
 
 
 # --- without a map ------------------------------------------------------------------------------------------
