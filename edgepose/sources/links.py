@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from edgepose.errors import EdgeposeError
 from edgepose.sources.detection import candidates
 from edgepose.sources.live import Handle, Link
-from edgepose.sources.sensor_map import SensorMap, channel, default_places
+from edgepose.sources.sensor_map import PortSettings, SensorMap, channel, default_places
 from edgepose.sources.stream import Places
 from firmware_protocols.registry import Protocol
 
@@ -44,6 +44,11 @@ def links(
                     f"{sensor_map.path}: {name}: {device.port or device.can} is none of "
                     f"{', '.join([*ports, *buses])}, which --port and --can name"
                 )
+        for name in sensor_map.ports:
+            if name not in ports and name not in buses:
+                raise EdgeposeError(
+                    f"{sensor_map.path}: ports.{name}: no such line, only {', '.join([*ports, *buses])}"
+                )
     count = len(ports) + len(buses)
     if not count:
         raise EdgeposeError("give one input: --port, --can or --file")
@@ -57,15 +62,14 @@ def links(
         return lambda spoken: default_places(line, spoken, index, count)
 
     result = []
-    for index, name in enumerate(ports):
-        settings = None if sensor_map is None else sensor_map.settings(name)
-        spoken = (settings and settings.protocol) or protocol
-        speed = (settings and settings.baud) or baud
-        result.append(serial_link(name, spoken, speed, places(name, index)))
-    for index, name in enumerate(buses, len(ports)):
-        settings = None if sensor_map is None else sensor_map.settings(name)
-        spoken = (settings and settings.protocol) or protocol
-        result.append(can_link(name, spoken, bitrate, fd, places(name, index)))
+    for index, name in enumerate([*ports, *buses]):
+        settings = PortSettings() if sensor_map is None else sensor_map.settings(name)
+        spoken = settings.protocol or protocol
+        if index < len(ports):
+            link = serial_link(name, spoken, settings.baud or baud, places(name, index))
+        else:
+            link = can_link(name, spoken, settings.baud or bitrate, fd, places(name, index))
+        result.append(link)
     return result
 
 

@@ -50,7 +50,7 @@ class PortSettings(NamedTuple):
 
     Attributes:
         protocol: what it speaks.
-        baud: its speed, bit/s.
+        baud: its speed, or that of a bus, bit/s.
     """
 
     protocol: str | None = None

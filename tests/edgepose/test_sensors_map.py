@@ -54,6 +54,9 @@ def test_two_hubs_and_a_bus(read):
         'right_lower_leg = { port = "b", id = 1 }',
         'head = { can = "virtual:x", id = 0, mounting = "x left, z up" }',
         'pelvis = { can = "x", id = 1, mounting = "x up, z back" }',
+        '[ports."virtual:x"]',
+        'protocol = "native-can"',
+        "baud = 1000000",
     ]
     rig = read("\n".join(rows))
     assert rig.places("a") == {0: 0, 1: 1}
@@ -65,6 +68,8 @@ def test_two_hubs_and_a_bus(read):
         ("b", "bytes"),
         ("virtual:x", "frames"),
     ]
+    assert "--bitrate (now 1000000)" in found[2].check[0]
+    assert [protocol.name for protocol in found[2].protocols] == ["native-can"]
     with pytest.raises(EdgeposeError, match=r"left_lower_leg: b is none of a, virtual:x"):
         links("a", None, "virtual:x", None, False, "auto", rig)
     sits = ["x up, z left"] * 4 + ["x left, z up", "x down, z back"]
@@ -115,6 +120,14 @@ def test_a_missing_file(tmp_path):
     (tmp_path / "latin.toml").write_bytes(b'head = "\xe4"')
     with pytest.raises(EdgeposeError, match="not valid TOML"):
         open_source(sensors=tmp_path / "latin.toml")
+
+
+def test_settings_of_a_line_that_is_not_there(read):
+    rig = read(PORTS + "\n[ports.COM9]\nbaud = 9600\n")
+    with pytest.raises(
+        EdgeposeError, match=r"rig\.toml: ports\.COM9: no such line, only /dev/ttyUSB0"
+    ):
+        links(None, None, None, None, False, "auto", rig)
 
 
 def test_an_unknown_protocol_of_a_port(read):
