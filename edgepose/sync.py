@@ -152,7 +152,7 @@ class FrameClock:
         if quat is None:
             raise EdgeposeError(
                 f"{PLACEMENTS[sensor]}: the device sends no orientation; "
-                "compute it with --filter kalman or --filter vqf"
+                "set it to send quaternions, raw gyroscopes are not fused here"
             )
         if acc is None:
             raise EdgeposeError(

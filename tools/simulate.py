@@ -1,4 +1,4 @@
-r"""Plays an IMU recording or a motion-capture clip as six devices, in real time, in any wire format.
+"""Plays an IMU recording or a motion-capture clip as six devices, in real time, in any wire format.
 
 \b
     simulate.py recording.npz                         plays native packets, then stands at the last sample

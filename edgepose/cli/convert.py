@@ -86,12 +86,12 @@ def _with_progress(results: Iterable[Result], count: int) -> Iterator[Result]:
     if sys.stderr.isatty():
         with click.progressbar(length=count, label="Converting", file=sys.stderr, show_pos=True) as bar:
             for result in results:
-                bar.update(1)
                 yield result
+                bar.update(1)
         return
     for number, result in enumerate(results, start=1):
+        yield result  # first: what is told must be in the table, whenever Ctrl-C comes
         click.echo(f"{number} of {count}  {result.job.source}: {describe(result)}", err=True)
-        yield result
 
 
 def _table(results: Sequence[Result]) -> str:

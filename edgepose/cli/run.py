@@ -134,12 +134,15 @@ def run(
         summary = run_pipeline(
             opened, clock, calibration, engine, sinks, _progress(), stopped=lambda: stop.asked
         )
+        unsent = sum(sink.unsent for sink in sinks if isinstance(sink, UdpSink))
         for sink in sinks:
             try:
                 sink.close()
             except EdgeposeError as error:
                 summary.error = summary.error or error
     _report(summary, opened, clock.dropped, rate, future, live=source.live)
+    if unsent:
+        _say(f"udp      {unsent} datagrams did not arrive; is anything listening at {udp}?")
     if summary.error:
         raise summary.error
     if opened.damage:

@@ -198,6 +198,20 @@ def test_standard_output_without_past_and_future(command, wearer, tmp_path):
     assert len(numbers(file)[1]) == 3 + 72
 
 
+def test_datagrams_that_nobody_receives_are_told(command, wearer):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as unheard:
+        unheard.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{unheard.getsockname()[1]}"
+    result = command(
+        *("run", "--file", wearer.short, "--calibration", wearer.calibration, "--model", "rnn"),
+        *("--udp", address),
+    )
+    assert result.returncode == 0, result.stderr
+    told = re.search(rf"^udp +(\d+) datagrams did not arrive; .* {address}\?$", result.stderr, re.MULTILINE)
+    assert told is not None, result.stderr
+    assert 0 < int(told[1]) <= 180
+
+
 def start(*words: object, **options: object) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "edgepose", "run", *map(str, words)]
     return subprocess.Popen(command, text=True, **{"stderr": subprocess.PIPE} | options)
