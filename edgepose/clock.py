@@ -23,6 +23,7 @@ _BACK_S = 0.1
 
 _PULL_BACK, _PULL_ON, _PULL_PERIOD = 0.5, 0.05, 0.02
 _FIRST = 16  # arrivals that tell the period
+_CHECK, _WRONG = 50, 0.1  # arrivals after which it is checked, and the error that is corrected at once
 _UNEVEN_S = 0.02  # a USB converter delivers every 16 ms
 _SHORTEST_S = 0.0005  # period
 _PAUSE_S, _PAUSE_PERIODS = 0.25, 4.0
@@ -109,12 +110,15 @@ class ArrivalClock:
 
     A steady rate is assumed, and followed: where a line delivers several samples at once they are a period
     apart. As nothing comes before it is measured, an early arrival corrects the times at once and a late one
-    slowly, unless it is so late that samples must be missing. After a pause the times begin anew.
+    slowly, unless it is so late that samples must be missing. After a pause the times begin anew, and with
+    another rate if the first one was wrong: samples that have waited in a buffer come at none.
     """
 
     def __init__(self) -> None:
         """Start with no packet seen."""
         self._count = 0
+        self._checked = (0, 0.0)  # count and arrival at the last check of the period
+        self._mean_s = 0.0  # interval before it
         self._first_s = 0.0
         self._period_s = 0.0
         self._result = -inf
@@ -124,12 +128,15 @@ class ArrivalClock:
         self._count += 1
         expected_s = self._result + self._period_s
         late = arrival_s - expected_s
-        if self._count == 1:
+        if self._is_wrong(arrival_s):
+            time_s = arrival_s
+        elif self._count == 1:
             self._first_s = time_s = arrival_s
         elif late > max(_PAUSE_S, _PAUSE_PERIODS * self._period_s):
             # The period is as it was, if it is known.
             if self._count <= _FIRST:
                 self._count, self._first_s = 1, arrival_s
+            self._checked = (self._count, arrival_s)
             time_s = arrival_s
         elif self._count <= _FIRST:
             if self._count == _FIRST:
@@ -145,6 +152,21 @@ class ArrivalClock:
             time_s = expected_s + pull
         self._result = max(self._result + STEP_S, time_s)
         return self._result
+
+    def _is_wrong(self, arrival_s: float) -> bool:
+        """If the newest arrivals have shown, and corrected, a period that is far off."""
+        count, checked_s = self._checked
+        if self._count - count < _CHECK:
+            return False
+        before_s, self._mean_s = self._mean_s, (arrival_s - checked_s) / (self._count - count)
+        self._checked = (self._count, arrival_s)
+        # Twice alike: one stretch alone may have a gap or a crowd in it.
+        if abs(self._mean_s - before_s) > _WRONG * before_s:
+            return False
+        if abs(self._mean_s - self._period_s) <= _WRONG * self._period_s or self._mean_s < _SHORTEST_S:
+            return False
+        self._period_s = self._mean_s
+        return True
 
 
 class HostClocks:

@@ -34,6 +34,9 @@ NOISE_S = 3.0
 REOPEN_S = 0.5
 """Time between two attempts to open a line that has gone, seconds."""
 
+_SETTLE_S = 0.1
+"""How long to throw away at least: what has waited in the system comes in several pieces."""
+
 _TWINS = 20  # jumps of a clock within a second that one device does not make
 
 
@@ -120,10 +123,10 @@ class _Line:
 
     def _drain(self) -> None:
         # What has waited since the line was opened is of unknown age, and full buffers have lost parts of it.
-        end_s = self._now() + BACKLOG_S
-        while self.handle is not None and self._now() < end_s:
+        start_s = self._now()
+        while self.handle is not None and (passed_s := self._now() - start_s) < BACKLOG_S:
             try:
-                if not self.handle.read()[1]:
+                if not self.handle.read()[1] and passed_s >= _SETTLE_S:
                     return
             except Gone:  # the next read tells
                 return

@@ -1,3 +1,4 @@
+import math
 import random
 from itertools import pairwise
 
@@ -5,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edgepose.clock import CaptureClock, DeviceClock
+from edgepose.clock import ArrivalClock, CaptureClock, DeviceClock
 
 WRAP = 1 << 32
 
@@ -109,3 +110,39 @@ def test_capture_goes_on_after_a_reboot(reboot_us):
     after = [clock.time(0, reboot_us + 10_000 * i) for i in range(10)]
     assert 0 < after[0] - before < 0.01
     assert after[-1] - after[0] == pytest.approx(0.09, abs=1e-5)
+
+
+def test_arrivals_after_a_backlog():
+    """33 samples that have waited come at once; the rate that they seem to have must not last."""
+    rng = random.Random(3)
+    clock = ArrivalClock()
+    backlog = [clock.host_time(5.0 + 1e-5 * i) for i in range(33)]
+    assert backlog == sorted(set(backlog))
+    late = []
+    for i in range(1000):
+        measured_s = 5.01 + 0.01 * i
+        late.append(clock.host_time(measured_s + rng.uniform(0.0, 0.0005)) - measured_s)
+    # Before, they were up to 19 ms early for 10 s.
+    assert max(map(abs, late[170:])) < 0.001
+
+
+def test_arrivals_with_a_gap_keep_their_rate():
+    """20 samples are lost at once, less than a pause."""
+    clock = ArrivalClock()
+    late = [clock.host_time(5.0 + 0.01 * i) - 5.0 - 0.01 * i for i in range(600) if not 280 <= i < 300]
+    assert max(map(abs, late)) < 1e-6
+
+
+def test_arrivals_in_pairs_and_with_losses():
+    """A converter delivers every 20 ms; later every tenth sample is lost."""
+    rng = random.Random(4)
+    clock = ArrivalClock()
+    late = []
+    for i in range(2000):
+        measured_s = 5.0 + 0.01 * i
+        if i < 1000 or rng.random() < 0.9:
+            late.append(clock.host_time(math.ceil(measured_s * 50.0 - 1e-6) / 50.0) - measured_s)
+    # Half of them come at once and half 10 ms later.
+    assert min(late[100:900]) > -0.001
+    assert max(late[100:900]) < 0.006
+    assert max(map(abs, late[900:])) < 0.035
