@@ -69,8 +69,10 @@ def simulator(recording: Path, protocol: str) -> Iterator[tuple[subprocess.Popen
         yield process, [f"--{kind}", said(process, kind)]
     finally:
         assert process.stdin
+        assert process.stdout
         process.stdin.close()
         process.wait(10)
+        process.stdout.close()
 
 
 def said(process: subprocess.Popen[str], word: str) -> str:
