@@ -124,9 +124,7 @@ def test_a_missing_file(tmp_path):
 
 def test_settings_of_a_line_that_is_not_there(read):
     rig = read(PORTS + "\n[ports.COM9]\nbaud = 9600\n")
-    with pytest.raises(
-        EdgeposeError, match=r"rig\.toml: ports\.COM9: no such line, only /dev/ttyUSB0"
-    ):
+    with pytest.raises(EdgeposeError, match=r"rig\.toml: ports\.COM9: no such line, only /dev/ttyUSB0"):
         links(None, None, None, None, False, "auto", rig)
 
 
