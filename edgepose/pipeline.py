@@ -31,6 +31,7 @@ class RunSummary:
         filling: of these, poses made before the network's past was full.
         held: of these, poses in which a sensor's last values were repeated.
         held_by_sensor: frames in which each sensor was held, in the order of PLACEMENTS.
+        behind_s: how long the newest batch had waited to be taken.
         seconds: wall time from the first samples to the end.
         latencies_s: for the newest frames that gave a pose, seconds from the arrival of their newest packet
             here to the pose's being sent.
@@ -41,6 +42,7 @@ class RunSummary:
     filling: int = 0
     held: int = 0
     held_by_sensor: list[int] = field(default_factory=lambda: [0] * len(PLACEMENTS))
+    behind_s: float = 0.0
     seconds: float = 0.0
     latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=LATENCIES))
     error: EdgeposeError | None = None
@@ -66,6 +68,7 @@ def run(
     sinks: list[Sink],
     on_pose: Callable[[RunSummary], None] = lambda summary: None,
     stopped: Callable[[], bool] = lambda: False,
+    behind_s: Callable[[], float] = lambda: 0.0,
 ) -> RunSummary:
     """Runs a source to its end, or until `stopped`, and writes every pose to every sink.
 
@@ -80,6 +83,7 @@ def run(
         sinks: written in order.
         on_pose: called after each pose was written.
         stopped: asked after each batch whether to end the run. An interrupt would lose the frame under way.
+        behind_s: how long the newest batch had waited for this function, seconds.
     """
     summary = RunSummary()
     started = arrived = time.perf_counter()
@@ -106,7 +110,8 @@ def run(
         nonlocal arrived
         try:
             for now_s, samples in source:
-                arrived = time.perf_counter()
+                summary.behind_s = behind_s()
+                arrived = time.perf_counter() - summary.behind_s
                 if samples:
                     clock.push(samples, now_s)
                 yield from clock.frames(now_s)

@@ -132,7 +132,9 @@ def run(
         way = "stream" if isinstance(engine, StreamEngine) else "window"
         _say(f"running {model} ({kind}, {way}); Ctrl-C ends the run")
         summary = run_pipeline(
-            opened, clock, calibration, engine, sinks, _progress(), stopped=lambda: stop.asked
+            *(opened, clock, calibration, engine, sinks, _progress()),
+            stopped=lambda: stop.asked,
+            behind_s=lambda: opened.behind_s,
         )
         unsent = sum(sink.unsent for sink in sinks if isinstance(sink, UdpSink))
         for sink in sinks:
@@ -147,6 +149,10 @@ def run(
         raise summary.error
     if opened.damage:
         raise EdgeposeError(opened.damage)
+
+
+BEHIND_S = 1.0
+"""A run that is further behind its sensors says so, seconds."""
 
 
 def _is_same_file(output: str | None, given: Path) -> bool:
@@ -164,11 +170,17 @@ def _progress() -> Callable[[RunSummary], None]:
     """A callback that keeps one line on a terminal up to date; elsewhere it writes a line now and then."""
     terminal = sys.stderr.isatty()
     every_s = 1.0 if terminal else 10.0
-    shown_s, poses = time.monotonic(), 0
+    shown_s, poses, told = time.monotonic(), 0, False
 
     def show(summary: RunSummary) -> None:
-        nonlocal shown_s, poses
+        nonlocal shown_s, poses, told
         now_s = time.monotonic()
+        if summary.behind_s > BEHIND_S and not told:
+            told = True
+            _say(
+                f"{'' if not terminal else chr(13)}this machine does not keep up: poses are "
+                f"{summary.behind_s:.1f} s late; use --model rnn, --online stream, or end other programs"
+            )
         if now_s - shown_s >= every_s:
             rate = (summary.poses - poses) / (now_s - shown_s)
             shown_s, poses = now_s, summary.poses

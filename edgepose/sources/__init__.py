@@ -42,7 +42,13 @@ class Counters(NamedTuple):
 
 
 class Source(AbstractContextManager["Source"], Protocol):
-    """See the module's text."""
+    """See the module's text.
+
+    Attributes:
+        behind_s: how long the batch given last had waited to be taken, seconds; 0 for files.
+    """
+
+    behind_s: float
 
     @property
     def counters(self) -> Counters:

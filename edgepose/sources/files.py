@@ -33,6 +33,8 @@ _SLICE_S = 0.01
 class RecordingSource:
     """A CSV or NPZ recording."""
 
+    behind_s = 0.0
+
     def __init__(self, path: Path, realtime: bool) -> None:
         """Nothing is read yet.
 
@@ -79,6 +81,8 @@ class RecordingSource:
 
 class LogSource:
     """What came over a serial port or CAN buses, in a file."""
+
+    behind_s = 0.0
 
     def __init__(self, path: Path, realtime: bool, chunks: Chunks, stream: Callable[[str], Stream]) -> None:
         """Nothing is opened yet.

@@ -164,6 +164,7 @@ class LiveSource:
             links: what to listen to.
             raw: filled with what comes: arrival in Unix time, seconds, and bytes or a CAN message.
         """
+        self.behind_s = 0.0
         self._links = links
         self._raw = raw
         self._lines: list[_Line] = []
@@ -212,19 +213,25 @@ class LiveSource:
         Raises:
             EdgeposeError: nothing usable comes at the start.
         """
-        start_s = checked_s = self._now()
+        start_s = checked_s = now_s = self._now()
         for line in self._lines:
             line.start()
         while True:
             samples: list[ImuSample] = []
-            for line, arrival_s, chunk in self._waiting():
+            try:
+                line, arrival_s, chunk = self._queue.get(timeout=POLL_S)
+            except Empty:
+                now_s = self._now()
+            else:
                 if isinstance(chunk, BaseException):
                     raise chunk
                 if self._raw is not None:
                     pieces = [chunk] if isinstance(chunk, bytes) else chunk
                     self._raw += [(arrival_s, piece) for piece in pieces]
-                samples += line.stream.feed(chunk, arrival_s)
-            now_s = self._now()
+                samples = line.stream.feed(chunk, arrival_s)
+                # On a machine that is behind, what has not been taken from the queue is not missing yet.
+                now_s = max(now_s, arrival_s)
+            self.behind_s = self._now() - now_s
             yield now_s, samples
             for line in self._lines:
                 _check_start(line, now_s, start_s)
@@ -232,15 +239,6 @@ class LiveSource:
                 checked_s = now_s
                 for line in self._lines:
                     _warn_of_twins(line)
-
-    def _waiting(self) -> Iterator[tuple[_Line, float, Chunk | BaseException]]:
-        """What the lines have read, waiting a little for the first of it."""
-        try:
-            yield self._queue.get(timeout=POLL_S)
-            while True:
-                yield self._queue.get_nowait()
-        except Empty:
-            return
 
     def _now(self) -> float:
         return self._unix_s + time.monotonic()
@@ -266,13 +264,20 @@ def _check_start(line: _Line, now_s: float, start_s: float) -> None:
 
 
 def _warn_of_twins(line: _Line) -> None:
-    """Two devices with one id look like a clock that jumps to and fro."""
+    """A clock that began anew is told; two devices with one id look like one that jumps to and fro."""
     devices = {} if line.clocks is None else line.clocks.devices
     for place, clock in devices.items():
         if clock.resets - line.jumps.get(place, 0) >= _TWINS and not line.twins:
             line.twins = True
             _log.warning(
                 "%s: the clock of the sensor for %s jumps to and fro; are there two devices with its id?",
+                line.link.name,
+                PLACEMENTS[place],
+            )
+        elif clock.resets > line.jumps.get(place, 0):
+            _log.warning(
+                "%s: the clock of the sensor for %s began anew; if it was switched off, its heading may be "
+                "another: calibrate again",
                 line.link.name,
                 PLACEMENTS[place],
             )

@@ -13,6 +13,11 @@ from edgepose.errors import EdgeposeError
 from edgepose.sources import POLL_S
 from edgepose.sources.live import Gone
 
+try:
+    from termios import error as _TerminalError  # no OSError, and pyserial lets it through
+except ImportError:  # Windows has none
+    _TerminalError = OSError  # type: ignore[assignment, misc]
+
 _ANSWER_S = 0.02
 """Time a device may take until it answers, seconds."""
 
@@ -34,7 +39,7 @@ class SerialPort:
         """
         try:
             self._serial = serial.Serial(name, baud, timeout=POLL_S, exclusive=True)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, _TerminalError) as error:
             raise EdgeposeError(f"{name}: {_opening_problem(error)}") from None
         self._requests = cycle(requests) if requests else None
         if requests:
@@ -53,7 +58,7 @@ class SerialPort:
                 data = self._serial.read(answer)
             data += self._serial.read(self._serial.in_waiting)
             return data, bool(data) and self._requests is None and self._serial.in_waiting > 0
-        except OSError:
+        except (OSError, _TerminalError):
             if data:
                 return data, False  # the next read tells
             raise Gone from None
@@ -63,7 +68,7 @@ class SerialPort:
         self._serial.close()
 
 
-def _opening_problem(error: OSError | ValueError) -> str:
+def _opening_problem(error: Exception) -> str:
     code = getattr(error, "errno", None)
     if code in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
         ports = ", ".join(sorted(port.device for port in list_ports.comports())) or "none"

@@ -71,6 +71,13 @@ def imu_frame(*held):
     )
 
 
+def test_what_waited_to_be_taken_counts_as_latency(walk):
+    summary = walk(behind_s=lambda: 2.5)
+    assert summary.behind_s == 2.5
+    assert min(summary.latencies_s) >= 2.5
+    assert max(walk().latencies_s) < 2.5
+
+
 @pytest.mark.parametrize(
     ("held", "filling", "text"),
     [

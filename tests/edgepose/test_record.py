@@ -89,7 +89,10 @@ def until(process: subprocess.Popen[str], file: Path, size: int) -> None:
 
 
 def end(process: subprocess.Popen[str]) -> tuple[int, str]:
-    _, errors = process.communicate(timeout=120)
+    try:
+        _, errors = process.communicate(timeout=120)
+    finally:
+        process.kill()  # one that hangs would take the ports of other tests
     assert "Traceback" not in errors
     return process.returncode, errors
 

@@ -244,7 +244,8 @@ def test_ctrl_c_at_a_terminal_in_the_middle_of_a_frame(wearer, tmp_path):
     file = tmp_path / "poses.csv"
     terminal, other = pty.openpty()
     process = start(
-        *("--file", wearer.recording, "--calibration", wearer.calibration, "--past", 60, "--csv", file),
+        *("--file", wearer.recording, "--calibration", wearer.calibration, "--csv", file),
+        *("--online", "window", "--past", 60),
         stderr=other,
     )
     os.close(other)
@@ -431,7 +432,10 @@ def live(wearer, port: str, listener: Listener, file: Path):
 
 
 def end(process: subprocess.Popen[str]) -> tuple[int, str]:
-    _, errors = process.communicate(timeout=60)
+    try:
+        _, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()  # one that hangs would take the ports of other tests
     return process.returncode, errors
 
 
