@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
 from typing import ClassVar
 
 from firmware_protocols.sample import Counters, Sample
@@ -44,7 +45,7 @@ class Receiver:
             samples.append(sample)
 
 
-class StreamDecoder(Receiver):
+class StreamDecoder(Receiver, ABC):
     """Samples out of a byte stream that may be cut anywhere, start anywhere and contain noise.
 
     After a frame that turns out to be none, the search goes on one byte after its start: a start byte can
@@ -102,21 +103,21 @@ class StreamDecoder(Receiver):
         self._at += at
         return samples
 
+    @abstractmethod
     def _length(self, buffer: bytes, at: int) -> int:
         """Length of the whole frame at a place; 0 if more bytes are needed to tell; negative if none."""
-        raise NotImplementedError
 
     def _possible(self, buffer: bytes, at: int, length: int) -> bool:
         """If the end of the buffer can be the beginning of a frame; a length of 0 is not known yet."""
         return True
 
+    @abstractmethod
     def _intact(self, buffer: bytes, at: int, length: int) -> bool | None:
         """If the checksum is good; None if the structure is none, wherever `_possible` may have seen that."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _message(self, frame: bytes, samples: list[Sample]) -> None:
         """Append what an intact frame holds."""
-        raise NotImplementedError
 
     def _bad_frame(self, start: int, end: int) -> None:
         # False frames inside a bad one are part of it.

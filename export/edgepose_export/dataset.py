@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from edgepose import rotations as rot
+from edgepose.calibration import GRAVITY
 from edgepose.errors import EdgeposeError
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import PARENTS, forward_kinematics
-from edgepose_export.synthesis import GRAVITY, INERTIAL_FROM_BODY
+from edgepose_export.synthesis import INERTIAL_FROM_BODY
 
 RATE = 60.0
 """Frames a second that the networks are made for."""

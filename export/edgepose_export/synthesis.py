@@ -8,13 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose import rotations as rot
+from edgepose.calibration import GRAVITY
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import Body, forward_kinematics, local_from_global
 from edgepose_export.mocap import Motion
 
 Array = NDArray[np.float64]
-
-GRAVITY = 9.81
 
 INERTIAL_FROM_BODY = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """R_IT of synthetic recordings: a wearer who faces +Z of T faces +X of I, so `heading:0` is their body

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edgepose.errors import EdgeposeError
 from edgepose.rotations import euler_to_matrix, transpose
 
-from .recording import LARGEST, Recording
+from .recording import Recording, fail, numbers
 
 Array = NDArray[np.float64]
 
@@ -89,21 +89,21 @@ def read_amc(path: str | Path, skeleton: str | Path | None = None, rate: float =
             radian = units.get(key.upper(), radian)
         elif key.isdecimal() and len(key) < 16 and len(words) == 1:
             if missing:
-                _fail(path, number, f"frame {last} lacks {min(missing)}")
+                fail(path, number, f"frame {last} lacks {min(missing)}")
             if frames and int(key) != last + 1:  # excerpts do not start at 1
-                _fail(path, number, f"frame {last + 1} was expected, this is {key}")
+                fail(path, number, f"frame {last + 1} was expected, this is {key}")
             last = int(key)
             frames += 1
             missing = set(moving)
         elif not frames:
-            _fail(path, number, "a frame number was expected")
+            fail(path, number, "a frame number was expected")
         elif key not in moving:
-            _fail(path, number, f"bone {key!r} has no freedom in the skeleton, or is not in it")
+            fail(path, number, f"bone {key!r} has no freedom in the skeleton, or is not in it")
         elif key not in missing:
-            _fail(path, number, f"bone {key!r} twice in a frame")
+            fail(path, number, f"bone {key!r} twice in a frame")
         else:
             missing.remove(key)
-            columns[key].append(_numbers(path, number, words[1:], len(body.freedoms[joint_of[key]])))
+            columns[key].append(numbers(path, number, words[1:], len(body.freedoms[joint_of[key]])))
     if missing or not frames:
         raise EdgeposeError(
             f"{path}: ends within frame {last} (cut short?)" if frames else f"{path}: no frames"
@@ -146,9 +146,9 @@ def read_asf(path: str | Path) -> Skeleton:
             section = key
             closed = False
         elif section == ":units" and key == "length":
-            scale = _numbers(path, number, words[1:], 1)[0]
+            scale = numbers(path, number, words[1:], 1)[0]
             if scale <= 0:
-                _fail(path, number, "the length unit must be positive")
+                fail(path, number, "the length unit must be positive")
             metre = _INCH / scale  # lengths are inches times this number
         elif section == ":units" and key == "angle":
             radian = 1.0 if words[1:2] == ["rad"] else math.pi / 180
@@ -160,11 +160,11 @@ def read_asf(path: str | Path) -> Skeleton:
             elif key == "end" and current is not None:
                 name, bone = _bone(path, number, current, metre, radian)
                 if name in bones or name == "root":
-                    _fail(path, number, f"bone {name!r} is defined twice")
+                    fail(path, number, f"bone {name!r} is defined twice")
                 bones[name] = bone
                 current = None
             elif current is None:
-                _fail(path, number, "a bone must begin with 'begin'")
+                fail(path, number, "a bone must begin with 'begin'")
             else:
                 current.setdefault(key, (number, words[1:]))
         elif section == ":hierarchy":
@@ -173,9 +173,9 @@ def read_asf(path: str | Path) -> Skeleton:
             elif key != "begin":
                 for child in words[1:]:
                     if child not in bones or child in parent_of:
-                        _fail(path, number, f"bone {child!r} is not defined, or has two parents")
+                        fail(path, number, f"bone {child!r} is not defined, or has two parents")
                     if words[0] != "root" and words[0] not in parent_of:
-                        _fail(path, number, f"bone {words[0]!r} has no parent before this line")
+                        fail(path, number, f"bone {words[0]!r} has no parent before this line")
                     parent_of[child] = words[0]
     if not closed or section != ":hierarchy":
         raise EdgeposeError(f"{path}: ends before its hierarchy is closed")
@@ -185,12 +185,12 @@ def read_asf(path: str | Path) -> Skeleton:
     number, order = root.get("order", (0, []))
     freedoms = tuple(word.lower() for word in order)
     if sorted(freedoms) != sorted(_FREEDOMS):
-        _fail(path, number, "the root's order must name TX TY TZ RX RY RZ")
+        fail(path, number, "the root's order must name TX TY TZ RX RY RZ")
     number, axis = root.get("axis", (0, ["XYZ"]))
     at, angles = root.get("orientation", (0, ["0", "0", "0"]))
     root_axis = _axis(path, number, [*angles, *axis], radian)
     at, place = root.get("position", (0, ["0", "0", "0"]))
-    start = np.array(_numbers(path, at, place, 3)) * metre
+    start = np.array(numbers(path, at, place, 3)) * metre
     vectors = [np.zeros(3) if parent == "root" else bones[parent].vector for parent in parent_of.values()]
     return Skeleton(
         names,
@@ -209,14 +209,14 @@ def _bone(
     """Name and shape of a bone from the lines between its begin and its end."""
     for key in ("name", "direction", "length", "axis"):
         if key not in fields or not fields[key][1]:
-            _fail(path, number, f"a bone without {key}")
+            fail(path, number, f"a bone without {key}")
     name = fields["name"][1][0]
-    direction = np.array(_numbers(path, *fields["direction"], 3))
-    length = _numbers(path, *fields["length"], 1)[0]
+    direction = np.array(numbers(path, *fields["direction"], 3))
+    length = numbers(path, *fields["length"], 1)[0]
     at, words = fields.get("dof", (number, []))
     freedoms = tuple(word.lower() for word in words)
     if any(word not in _FREEDOMS for word in freedoms) or len(set(freedoms)) != len(freedoms):
-        _fail(path, at, f"dof of bone {name!r}: only rx, ry, rz, tx, ty, tz are known")
+        fail(path, at, f"dof of bone {name!r}: only rx, ry, rz, tx, ty, tz are known")
     return name, _Bone(direction * length * metre, _axis(path, *fields["axis"], radian), freedoms)
 
 
@@ -224,8 +224,8 @@ def _axis(path: Path, number: int, words: list[str], radian: float) -> Array:
     """Rotation matrix of three angles and the order in which they turn, such as XYZ."""
     order = words[-1].lower()
     if sorted(order) != ["x", "y", "z"]:
-        _fail(path, number, "three angles and their order, such as XYZ, were expected")
-    angles = np.array(_numbers(path, number, words[:-1], 3)) * radian
+        fail(path, number, "three angles and their order, such as XYZ, were expected")
+    angles = np.array(numbers(path, number, words[:-1], 3)) * radian
     return euler_to_matrix(angles[::-1], order[::-1])
 
 
@@ -241,19 +241,3 @@ def _lines(path: Path) -> list[tuple[int, list[str]]]:
         (number, line.split("#")[0].split()) for number, line in enumerate(text.splitlines(), start=1)
     )
     return [(number, words) for number, words in numbered if words]
-
-
-def _fail(path: Path, line: int, problem: str) -> NoReturn:
-    raise EdgeposeError(f"{path}, line {line}: {problem}")
-
-
-def _numbers(path: Path, line: int, words: list[str], count: int) -> list[float]:
-    try:
-        values = [float(word) for word in words]
-    except ValueError:
-        _fail(path, line, "a number was expected")
-    if len(values) != count:
-        _fail(path, line, f"{count} numbers were expected, {len(values)} found")
-    if not all(abs(value) < LARGEST for value in values):
-        _fail(path, line, "a number is not finite, or far too large")
-    return values

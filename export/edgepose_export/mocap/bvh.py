@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from edgepose.errors import EdgeposeError
 from edgepose.rotations import euler_to_matrix
 
-from .recording import LARGEST, Recording, tidy_rate
+from .recording import LARGEST, Recording, fail, numbers, tidy_rate
 
 Array = NDArray[np.float64]
 
@@ -63,19 +63,7 @@ def read_bvh(path: str | Path) -> Recording:
 
 def _fail(path: Path, line: int, problem: str) -> NoReturn:
     """Raise the error for a problem in a line, counted from 0 here and from 1 in the message."""
-    raise EdgeposeError(f"{path}, line {line + 1}: {problem}")
-
-
-def _numbers(path: Path, line: int, words: list[str], count: int) -> list[float]:
-    try:
-        values = [float(word) for word in words]
-    except ValueError:
-        _fail(path, line, "a number was expected")
-    if len(values) != count:
-        _fail(path, line, f"{count} numbers were expected, {len(values)} found")
-    if not all(abs(value) < LARGEST for value in values):
-        _fail(path, line, "a number is not finite, or far too large")
-    return values
+    fail(path, line + 1, problem)
 
 
 def _hierarchy(
@@ -129,7 +117,7 @@ def _hierarchy(
                 _fail(path, number, "an end site outside a joint")
             pending = -1
         elif key == "OFFSET" and open_joints:
-            values = _numbers(path, number, rest, 3)
+            values = numbers(path, number + 1, rest, 3)
             if open_joints[-1] >= 0:
                 offsets[open_joints[-1]] = values
         elif key == "CHANNELS" and open_joints and open_joints[-1] >= 0:
@@ -169,7 +157,7 @@ def _motion(path: Path, lines: list[str], start: int, width: int) -> tuple[float
         _fail(path, at_count, "'Frames: <count>' was expected")
     if time[:2] != ["Frame", "Time:"]:
         _fail(path, at_time, "'Frame Time: <seconds>' was expected")
-    frame_time = _numbers(path, at_time, time[2:], 1)[0]
+    frame_time = numbers(path, at_time + 1, time[2:], 1)[0]
     if not 1e-5 < frame_time < 1e2:
         _fail(path, at_time, f"a frame time of {frame_time:g} s is not possible")
     frames = body[2:]
@@ -182,7 +170,7 @@ def _motion(path: Path, lines: list[str], start: int, width: int) -> tuple[float
         table = np.array([words for _, words in frames], dtype=float)
     except ValueError:
         for number, words in frames:
-            _numbers(path, number, words, width)
+            numbers(path, number + 1, words, width)
         raise
     bad = np.flatnonzero(~(np.abs(table) < LARGEST).all(axis=1))
     if len(bad):

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from pathlib import Path
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
+
+from edgepose.errors import EdgeposeError
 
 Array = NDArray[np.float64]
 
@@ -51,3 +54,25 @@ def tidy_rate(frame_time: float) -> float:
     rate = 1.0 / frame_time
     whole = round(rate)
     return float(whole) if abs(rate - whole) < 1e-4 * rate else rate
+
+
+def fail(path: Path, line: int, problem: str) -> NoReturn:
+    """Raise the error for a problem in a line, counted from 1."""
+    raise EdgeposeError(f"{path}, line {line}: {problem}")
+
+
+def numbers(path: Path, line: int, words: list[str], count: int) -> list[float]:
+    """The numbers of a line, counted from 1.
+
+    Raises:
+        EdgeposeError: a word is no number, is not finite or beyond `LARGEST`, or there are more or fewer.
+    """
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        fail(path, line, "a number was expected")
+    if len(values) != count:
+        fail(path, line, f"{count} numbers were expected, {len(values)} found")
+    if not all(abs(value) < LARGEST for value in values):
+        fail(path, line, "a number is not finite, or far too large")
+    return values
