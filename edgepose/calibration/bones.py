@@ -1,0 +1,146 @@
+"""The calibration itself: bone offsets of a known pose (DIP eq. 7), and bones from oriented frames."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from edgepose import rotations as rot
+from edgepose.calibration.body_frame import body_from_inertial
+from edgepose.calibration.checks import GRAVITY, HoldSummary
+from edgepose.errors import EdgeposeError
+from edgepose.placements import PLACEMENTS
+from edgepose.rotations import Array
+
+
+def _arms(turn: float) -> Array:
+    """R_TB0 (6, 3, 3) with the left forearm turned by `turn` about Z and the right one by the opposite."""
+    bones = np.tile(np.eye(3), (len(PLACEMENTS), 1, 1))
+    for name, angle in (("left_forearm", turn), ("right_forearm", -turn)):
+        bones[PLACEMENTS.index(name)] = rot.about_axis("z", angle)
+    return bones
+
+
+POSES: Mapping[str, Array] = {"straight": _arms(-math.pi / 2), "t-pose": _arms(0.0)}
+"""R_TB0 (6, 3, 3) of the poses to hold: `straight` is the N-pose, arms hanging, palms to the thighs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Everything between an oriented frame and bones in the body frame.
+
+    Attributes:
+        body_from_inertial: (4,) quaternion of R_TI.
+        heading_offset: (6,) turn about Z of each sensor's inertial frame to the reference's, rad.
+        bone_from_sensor: (6, 4) quaternions of R_BS, how each sensor is mounted on its bone.
+        residual_deg: (6,) RMS angle of each sensor about its mean over the hold, degrees.
+        pose: key of POSES that was held.
+        body_frame: how R_TI was found: `head`, `SENSOR:AXIS` or `heading:DEG`.
+        created: ISO 8601 time.
+        metadata: what else is worth knowing (source, window, ...), JSON values.
+    """
+
+    body_from_inertial: Array
+    heading_offset: Array
+    bone_from_sensor: Array
+    residual_deg: Array
+    pose: str
+    body_frame: str
+    created: str
+    metadata: Mapping[str, Any]
+
+    @cached_property
+    def _maps(self) -> tuple[Array, Array, Array]:
+        """Products q q^T to R_TB (6, 16, 9), force as a row from I to T (6, 3, 3), gravity in T (3,)."""
+        r_ti = rot.quat_to_matrix(self.body_from_inertial)
+        left = r_ti @ rot.quat_to_matrix(rot.about_z(self.heading_offset))
+        right = rot.transpose(rot.quat_to_matrix(self.bone_from_sensor))
+        bones = np.einsum("sab,ijbc,scd->sijad", left, _quadratic_form(), right)
+        return bones.reshape(-1, 16, 9), rot.transpose(left), r_ti @ np.array([0.0, 0.0, -GRAVITY])
+
+
+def _quadratic_form() -> Array:
+    """(4, 4, 3, 3) symmetric coefficients K with R(q) = sum of q_i q_j K_ij for unit q."""
+    unit = np.eye(4)
+    squares = rot.quat_to_matrix(unit)
+    form = rot.quat_to_matrix((unit[:, None] + unit) / math.sqrt(2.0)) - (squares[:, None] + squares) / 2.0
+    form[range(4), range(4)] = squares  # the line above is right only for pairs of different axes
+    return form
+
+
+def calibrate(
+    summary: HoldSummary,
+    *,
+    pose: str,
+    body_frame: str,
+    created: str,
+    heading_offset: ArrayLike | None = None,
+    metadata: Mapping[str, Any] | None = None,
+) -> Calibration:
+    """Calibration (DIP 4.2, eq. 6 and 7) from a checked hold of a known pose.
+
+    Args:
+        summary: what `check_hold` returned.
+        pose: key of POSES that the wearer held.
+        body_frame: see `body_from_inertial`.
+        created: ISO 8601 time to note.
+        heading_offset: (6,) of `heading_offsets`, rad; None where all sensors share a north.
+        metadata: JSON values to note.
+    """
+    if pose not in POSES:
+        raise EdgeposeError(f"pose {pose!r} is none of: {', '.join(POSES)}")
+    offset = np.zeros(len(PLACEMENTS)) if heading_offset is None else np.asarray(heading_offset, float)
+    orientation = rot.quat_multiply(rot.about_z(offset), summary.orientation)
+    r_ti = body_from_inertial(orientation, body_frame)
+    r_bs = rot.transpose(POSES[pose]) @ (r_ti @ rot.quat_to_matrix(orientation))
+    return Calibration(
+        rot.matrix_to_quat(r_ti),
+        offset,
+        rot.matrix_to_quat(r_bs),
+        summary.spread_deg,
+        pose,
+        body_frame,
+        created,
+        dict(metadata or {}),
+    )
+
+
+def apply(calibration: Calibration, orientation: ArrayLike, force: ArrayLike) -> tuple[Array, Array]:
+    """Bones and accelerations in the body frame (DIP 4.2, SIP eq. 13); leading dimensions are free.
+
+    R_TB = R_TI R_IS inv(R_BS). DIP prints eq. 8 as R_BS R_TS, which would not give R_TB0 back at the
+    calibration instant. a_T = R_TI (f_I + g_I), zero at rest.
+
+    Args:
+        calibration: of this rig.
+        orientation: (..., 6, 4) unit quaternions, sensor to inertial, as measured: headings are reset here.
+        force: (..., 6, 3) specific force turned to the inertial frame by the same quaternions, m/s^2.
+
+    Returns:
+        (..., 6, 3, 3) R_TB and (..., 6, 3) a_T, m/s^2.
+    """
+    bones, to_body, gravity = calibration._maps
+    q, f = np.asarray(orientation, float), np.asarray(force, float)
+    # A rotation matrix is quadratic in its quaternion, so all constant turns fold into one product, which
+    # takes a fifth of the time of a conversion followed by two products.
+    squares = (q[..., :, None] * q[..., None, :]).reshape(*q.shape[:-1], 1, 16)
+    r_tb = (squares @ bones).reshape(*q.shape[:-1], 3, 3)
+    return r_tb, (f[..., None, :] @ to_body)[..., 0, :] + gravity
+
+
+def mounting(calibration: Calibration) -> list[str]:
+    """How each sensor sat in the held pose, for a person: the body directions nearest to its X and Z axes."""
+    words = (("left", "right"), ("up", "down"), ("forward", "back"))
+    r_ts = POSES[calibration.pose] @ rot.quat_to_matrix(calibration.bone_from_sensor)
+
+    def nearest(direction: Array) -> str:
+        i = int(np.argmax(np.abs(direction)))
+        return words[i][int(direction[i] < 0)]
+
+    return [f"x {nearest(r[:, 0])}, z {nearest(r[:, 2])}" for r in r_ts]

@@ -1,0 +1,195 @@
+"""Checks of a hold: whether all sensors reported, held still and measured gravity upwards."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from edgepose import rotations as rot
+from edgepose.calibration.holds import MIN_SAMPLES, Hold, SensorHold, check_reported, named, unit_or_zero
+from edgepose.errors import EdgeposeError
+from edgepose.placements import PLACEMENTS
+from edgepose.rotations import Array
+
+GRAVITY = 9.81
+"""What a sensor at rest measures, m/s^2; in I along +Z."""
+
+SPREAD_LIMIT_DEG = 3.0  # RMS about the mean over a hold; standing people sway 0.1 - 0.5
+DRIFT_LIMIT_DEG = 5.0  # first against last quarter of a hold
+RATE_LIMIT_DEG_S = (
+    20.0  # RMS of the angular rate without its mean, which may be bias; standing people 0.3 - 3
+)
+GRAVITY_SCALE_LIMIT = 0.05
+GRAVITY_TILT_LIMIT_DEG = 10.0
+
+
+class MovedError(EdgeposeError):
+    """A hold with movement in it: holding still once more helps."""
+
+
+class HoldSummary(NamedTuple):
+    """A hold that passed its checks.
+
+    Attributes:
+        samples: (6,) number of samples.
+        orientation: (6, 4) mean quaternions, sensor to inertial, without any heading offset.
+        spread_deg: (6,) RMS angle about the mean, degrees.
+        force: (6, 3) mean specific force in I, m/s^2; NaN where a sensor measures none.
+        warnings: one line each, naming the sensor.
+    """
+
+    samples: list[int]
+    orientation: Array
+    spread_deg: Array
+    force: Array
+    warnings: list[str]
+
+
+def check_hold(hold: Hold, advice: str = "stand still and repeat") -> HoldSummary:
+    """Means of a hold in which every sensor reported, was held still, and measured gravity along +Z of I.
+
+    Args:
+        hold: six sensors' samples.
+        advice: what to do about movement, for the message.
+
+    Raises:
+        MovedError: sensors moved; names all of them and how much.
+        EdgeposeError: any other fault of the hold; names the sensors and what to do.
+    """
+    check_reported(hold)
+    few = [f"{name} {len(s.quat)}" for name, s in named(hold) if len(s.quat) < MIN_SAMPLES]
+    if few:
+        raise EdgeposeError(
+            f"too few samples in the hold ({', '.join(few)}; at least {MIN_SAMPLES}): "
+            "check the rate and the link, or hold longer"
+        )
+    broken = [
+        f"{name} ({bad} of {len(s.quat)})" for name, s in named(hold) if (bad := _not_rotations(s.quat))
+    ]
+    if broken:
+        raise EdgeposeError(
+            f"quaternions that are not rotations (not of length 1): {', '.join(broken)}; "
+            "check the protocol and the sensor's settings"
+        )
+    quats = [unit_or_zero(s.quat) for s in hold]
+    shared = [
+        (name, apart)
+        for name, quat in zip(PLACEMENTS, quats, strict=True)
+        if (apart := _two_sensors(quat)) is not None
+    ]
+    if shared:
+        raise EdgeposeError(
+            "two sensors report as one placement: "
+            + ", ".join(f"{name} ({apart:.0f} deg apart)" for name, apart in shared)
+            + "; give every sensor a placement of its own"
+        )
+    mean = np.stack([rot.mean_rotation(quat) for quat in quats])
+    spread = np.array([_rms(_angles(quat, own)) for quat, own in zip(quats, mean, strict=True)])
+    moved = [
+        text
+        for name, s, quat, rms in zip(PLACEMENTS, hold, quats, spread, strict=True)
+        if (text := _movement(name, s, quat, rms))
+    ]
+    if moved:
+        raise MovedError(f"moved during the hold: {', '.join(moved)}; {advice}")
+    force, warnings = _gravity(hold, quats)
+    return HoldSummary([len(s.quat) for s in hold], mean, np.degrees(spread), force, warnings)
+
+
+def _not_rotations(quat: Array) -> int:
+    # Not (x < limit) rather than x >= limit: NaN has to count.
+    return int(np.count_nonzero(~(np.abs(np.linalg.norm(quat, axis=-1) - 1.0) < 0.01)))
+
+
+def _angles(quat: Array, reference: Array) -> Array:
+    """Rotation angle (n,) between unit quaternions (n, 4) and one (4,), radians."""
+    return np.linalg.norm(rot.quat_to_rotvec(rot.quat_multiply(rot.quat_conjugate(reference), quat)), axis=-1)
+
+
+def _rms(x: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(x))))
+
+
+def _two_sensors(quat: Array) -> float | None:
+    """Angle in degrees between two devices whose samples (n, 4) alternate under one name; None if one."""
+    from_first = _angles(quat, quat[0])
+    far = from_first > from_first.max() / 2
+    # One wearer passes through the angles between, and does not change sides every few samples.
+    if np.count_nonzero(far[1:] != far[:-1]) < max(4, len(quat) / 10):
+        return None
+    near, other = quat[~far], quat[far]
+    centre, other_centre = rot.mean_rotation(near), rot.mean_rotation(other)
+    spread = math.degrees(max(_rms(_angles(near, centre)), _rms(_angles(other, other_centre))))
+    apart = math.degrees(_angles(other_centre[None], centre)[0])
+    return apart if spread < SPREAD_LIMIT_DEG and apart > max(2.0 * SPREAD_LIMIT_DEG, 4.0 * spread) else None
+
+
+def _movement(name: str, s: SensorHold, quat: Array, spread: float) -> str | None:
+    """How one sensor moved, for a person; None if it held still."""
+    quarter = max(1, len(quat) // 4)
+    drift = _angles(rot.mean_rotation(quat[-quarter:])[None], rot.mean_rotation(quat[:quarter]))[0]
+    if math.degrees(spread) > SPREAD_LIMIT_DEG or math.degrees(drift) > DRIFT_LIMIT_DEG:
+        return f"{name} {math.degrees(max(spread, drift)):.1f} deg"
+    gyr = s.gyr[np.isfinite(s.gyr).all(axis=-1)]
+    rate = math.degrees(_rms(np.linalg.norm(gyr - gyr.mean(axis=0), axis=-1))) if len(gyr) else 0.0
+    return f"{name} {rate:.0f} deg/s" if rate > RATE_LIMIT_DEG_S else None
+
+
+def _gravity(hold: Hold, quats: list[Array]) -> tuple[Array, list[str]]:
+    """Mean specific force of each sensor in I (6, 3), m/s^2, and warnings about its size; up or an error."""
+    force, warnings, wrong = np.full((len(PLACEMENTS), 3), np.nan), [], []
+    for i, (name, s, quat) in enumerate(zip(PLACEMENTS, hold, quats, strict=True)):
+        measured = np.isfinite(s.acc).all(axis=-1)
+        if not measured.any():
+            warnings.append(f"{name} measures no acceleration: gravity was not checked")
+            continue
+        acc, quat = s.acc[measured], quat[measured]
+        force[i] = rot.quat_rotate(quat, acc).mean(axis=0)
+        size = float(np.linalg.norm(force[i]))
+        at_rest = _rms(np.linalg.norm(acc, axis=-1))
+        if at_rest < 0.5:
+            wrong.append(
+                f"{name} measures {at_rest:.2f} m/s^2 (gravity is removed already; send specific force)"
+            )
+        elif tilt_deg(force[i]) > GRAVITY_TILT_LIMIT_DEG:
+            wrong.append(f"{name} {tilt_deg(force[i]):.0f} deg off ({_why_not_up(quat, acc)})")
+        elif abs(size / GRAVITY - 1.0) > GRAVITY_SCALE_LIMIT:
+            warnings.append(
+                f"{name} measures {size:.2f} m/s^2 at rest, not {GRAVITY:.2f}: check its units and scale"
+            )
+    if wrong:
+        raise EdgeposeError(
+            f"at rest the acceleration in the inertial frame must point up along +Z: {', '.join(wrong)}; "
+            "the frame or sign convention of the orientation or the acceleration is wrong"
+        )
+    return force, warnings
+
+
+def tilt_deg(v: Array) -> float:
+    """Angle between a vector (3,) in I and the vertical, degrees."""
+    return math.degrees(math.atan2(math.hypot(v[0], v[1]), v[2]))
+
+
+def _why_not_up(quat: Array, acc: Array) -> str:
+    """A guess at the convention that a device uses instead of ours, from one hold."""
+    guesses: list[tuple[str, Array]] = [
+        ("looks negated: acceleration instead of specific force, or Z down", -rot.quat_rotate(quat, acc)),
+        (
+            "looks like an inverse: the quaternion must turn sensor to inertial",
+            rot.quat_rotate(rot.quat_conjugate(quat), acc),
+        ),
+        (
+            "looks like x, y, z, w: the quaternion must be w, x, y, z",
+            rot.quat_rotate(quat[:, [3, 0, 1, 2]], acc),
+        ),
+        (
+            "looks like a frame with Y up: the inertial frame must have Z up",
+            rot.quat_rotate(quat, acc)[:, [2, 0, 1]],
+        ),
+    ]
+    return next(
+        (why for why, f in guesses if tilt_deg(f.mean(axis=0)) < GRAVITY_TILT_LIMIT_DEG),
+        "no usual convention fits",
+    )
