@@ -77,7 +77,7 @@ def check_hold(hold: Hold, advice: str = "stand still and repeat") -> HoldSummar
     shared = [
         (name, apart)
         for name, quat in zip(PLACEMENTS, quats, strict=True)
-        if (apart := _two_sensors(quat)) is not None
+        if (apart := two_sensors(quat)) is not None
     ]
     if shared:
         raise EdgeposeError(
@@ -112,7 +112,7 @@ def _rms(x: Array) -> float:
     return float(np.sqrt(np.mean(np.square(x))))
 
 
-def _two_sensors(quat: Array) -> float | None:
+def two_sensors(quat: Array) -> float | None:
     """Angle in degrees between two devices whose samples (n, 4) alternate under one name; None if one."""
     from_first = _angles(quat, quat[0])
     far = from_first > from_first.max() / 2
@@ -154,7 +154,7 @@ def _gravity(hold: Hold, quats: list[Array]) -> tuple[Array, list[str]]:
                 f"{name} measures {at_rest:.2f} m/s^2 (gravity is removed already; send specific force)"
             )
         elif tilt_deg(force[i]) > GRAVITY_TILT_LIMIT_DEG:
-            wrong.append(f"{name} {tilt_deg(force[i]):.0f} deg off ({_why_not_up(quat, acc)})")
+            wrong.append(f"{name} {tilt_deg(force[i]):.0f} deg off ({why_not_up(quat, acc)})")
         elif abs(size / GRAVITY - 1.0) > GRAVITY_SCALE_LIMIT:
             warnings.append(
                 f"{name} measures {size:.2f} m/s^2 at rest, not {GRAVITY:.2f}: check its units and scale"
@@ -172,7 +172,7 @@ def tilt_deg(v: Array) -> float:
     return math.degrees(math.atan2(math.hypot(v[0], v[1]), v[2]))
 
 
-def _why_not_up(quat: Array, acc: Array) -> str:
+def why_not_up(quat: Array, acc: Array) -> str:
     """A guess at the convention that a device uses instead of ours, from one hold."""
     guesses: list[tuple[str, Array]] = [
         ("looks negated: acceleration instead of specific force, or Z down", -rot.quat_rotate(quat, acc)),
