@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from edgepose.placements import PLACEMENTS
 
 
 class PoseFrame(NamedTuple):
@@ -19,6 +22,7 @@ class PoseFrame(NamedTuple):
         rotations: (24, 3, 3) rotation of each joint against its parent, joint 0 against the body frame T.
         std: (24,) standard deviation that the network gives for each joint, radians; 0 for measured and
             resting joints.
+        translation: (3,) place of the pelvis in T, metres, where something estimates it.
     """
 
     index: int  # type: ignore[assignment]  # hides tuple.index, which nobody wants here
@@ -26,3 +30,30 @@ class PoseFrame(NamedTuple):
     status: str
     rotations: NDArray[np.float32]
     std: NDArray[np.float32]
+    translation: NDArray[np.float64] | None = None
+
+
+FILLING_WINDOW = 1
+"""Bit of a status' flags: the network has seen fewer frames than its window holds."""
+
+
+@lru_cache(maxsize=256)
+def status_bits(status: str) -> tuple[int, int]:
+    """Flags and held sensors (bit i: PLACEMENTS[i]) of a status text; what it does not know it leaves out."""
+    flags = held = 0
+    for part in status.split("; "):
+        if part == "filling window":
+            flags |= FILLING_WINDOW
+        elif part.startswith("held "):
+            names = set(part.split()[1:])
+            held |= sum(1 << i for i, name in enumerate(PLACEMENTS) if name in names)
+    return flags, held
+
+
+def status_text(flags: int, held: int) -> str:
+    """Inverse of `status_bits`."""
+    names = [name for i, name in enumerate(PLACEMENTS) if held >> i & 1]
+    parts = [" ".join(["held", *names])] if names else []
+    if flags & FILLING_WINDOW:
+        parts.append("filling window")
+    return "; ".join(parts) or "ok"

@@ -1,19 +1,33 @@
-"""Reading poses back from the CSV files that `edgepose.sinks.csv_file` writes."""
+"""Reading poses back from files: CSV as `edgepose.sinks.csv_file` writes it, and NPZ with the keys of AMASS.
+
+Files are hostile until checked: what comes out is finite, in order and made of rotations.
+"""
 
 from __future__ import annotations
 
 import csv
 import sys
+import zipfile
+import zlib
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from itertools import islice
 from pathlib import Path
-from typing import TextIO
+from typing import Any, NamedTuple, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
-from edgepose.rotations import euler_to_matrix, nearest_rotation, quat_to_matrix, rotvec_to_matrix
+from edgepose.placements import PLACEMENTS
+from edgepose.pose import FILLING_WINDOW, PoseFrame, status_text
+from edgepose.rotations import (
+    about_axis,
+    euler_to_matrix,
+    nearest_rotation,
+    quat_to_matrix,
+    rotvec_to_matrix,
+)
 from edgepose.sinks.csv_file import FORMS, pose_columns
 from edgepose.skeleton import JOINTS
 
@@ -21,6 +35,97 @@ Array = NDArray[np.float64]
 
 MAX_LINE = 16_384
 """Characters; a true row has less than 4000, and a file without line breaks must not fill the memory."""
+
+BLOCK = 4096
+"""Poses that are read from a CSV file at a time."""
+
+MAX_BYTES = 2 << 30
+"""That an NPZ file may unpack to: hours of poses. What is far more is no file of them."""
+
+LARGEST = 1e6
+"""Angles in radians and metres beyond this are taken for damage."""
+
+Z_UP_TO_T = about_axis("x", -np.pi / 2)
+"""Turns the world of AMASS, Z up, into the body frame T, Y up."""
+
+
+class Poses(NamedTuple):
+    """Poses of one file.
+
+    Attributes:
+        frames: (T,) numbers of the frames, rising.
+        time_s: (T,) on the source's clock, seconds.
+        status: T texts, see `PoseFrame`.
+        rotations: (T, 24, 3, 3) local rotations, joint 0 against T.
+        translation: (T, 3) place of the pelvis in T, metres, if the file has it.
+    """
+
+    frames: NDArray[np.int64]
+    time_s: Array
+    status: list[str]
+    rotations: Array
+    translation: Array | None
+
+    @property
+    def rate(self) -> float:
+        """Frames per second; 60 where there is but one frame."""
+        steps = np.diff(self.frames)
+        if not len(steps):
+            return 60.0
+        # The median, because time leaps where all sensors were silent for long.
+        return tidy_rate(float(np.median(np.diff(self.time_s) / steps)))
+
+    def pose_frames(self) -> Iterator[PoseFrame]:
+        """The poses one by one, as a sink takes them; files hold no standard deviations of joints here."""
+        unknown = np.full(len(JOINTS), np.nan, np.float32)
+        for i, (frame, time_s) in enumerate(zip(self.frames.tolist(), self.time_s.tolist(), strict=True)):
+            where = None if self.translation is None else self.translation[i]
+            yield PoseFrame(frame, time_s, self.status[i], self.rotations[i], unknown, where)
+
+
+def tidy_rate(frame_time: float) -> float:
+    """Frames per second of a frame time in seconds that was printed with few digits: .0083333 is 120 Hz."""
+    rate = 1.0 / frame_time
+    whole = round(rate)
+    return float(whole) if abs(rate - whole) < 1e-4 * rate else rate
+
+
+def read_poses(path: str | Path) -> Poses:
+    """Poses of a .npz file with the keys of AMASS, or of a CSV file, whatever its ending.
+
+    Args:
+        path: file to read; "-" is CSV on standard input.
+
+    Raises:
+        EdgeposeError: no such file, or not a file of poses.
+    """
+    if Path(path).suffix.lower() == ".npz":
+        return _read_npz(Path(path))
+    blocks = list(read_blocks(path))
+    translations = [block.translation for block in blocks if block.translation is not None]
+    return Poses(
+        np.concatenate([block.frames for block in blocks]),
+        np.concatenate([block.time_s for block in blocks]),
+        [text for block in blocks for text in block.status],
+        np.concatenate([block.rotations for block in blocks]),
+        np.concatenate(translations) if translations else None,
+    )
+
+
+def is_poses(path: Path) -> bool:
+    """Whether a .csv or .npz file seems to hold poses and not a recording of sensors."""
+    try:
+        if path.suffix.lower() == ".npz":
+            with zipfile.ZipFile(path) as archive:
+                names = set(archive.namelist())
+            return "poses.npy" in names and not _is_recording(names)
+        with path.open("rb") as file:
+            return file.read(32).removeprefix(b"\xef\xbb\xbf").startswith(b"frame,time_s,status,")
+    except (OSError, zipfile.BadZipFile):
+        return False
+
+
+# --- CSV ----------------------------------------------------------------------------------------------------
 
 
 def read_poses_csv(path: str | Path) -> tuple[NDArray[np.int64], Array, list[str], Array]:
@@ -35,27 +140,42 @@ def read_poses_csv(path: str | Path) -> tuple[NDArray[np.int64], Array, list[str
     Raises:
         EdgeposeError: no such file, or not a file of poses; names the row, counted from 1 for the header.
     """
+    poses = read_poses(path)
+    return poses.frames, poses.time_s, poses.status, poses.rotations
+
+
+def read_blocks(path: str | Path) -> Iterator[Poses]:
+    """Poses of a CSV file in blocks of up to `BLOCK`, at least one; see `read_poses_csv`.
+
+    Raises:
+        EdgeposeError: no such file, or not a file of poses; names the row, counted from 1 for the header.
+    """
     if str(path) == "-":
-        return _read(sys.stdin, "standard input")
+        yield from _read_csv(sys.stdin, "standard input")
+        return
     try:
         with Path(path).open(encoding="utf-8-sig", newline="") as file:
-            return _read(file, str(path))
+            yield from _read_csv(file, str(path))
     except OSError as error:
         raise EdgeposeError(f"cannot read poses from {path}: {error.strerror or error}") from error
 
 
-def _read(file: TextIO, name: str) -> tuple[NDArray[np.int64], Array, list[str], Array]:
+def _read_csv(file: TextIO, name: str) -> Iterator[Poses]:
     rows = csv.reader(_lines(file))
+    done, last = 0, -1
     try:
-        form, columns = _recognise(next(rows, []), name)
-        frames, times, status, numbers = _parse(rows, columns, name)
+        form, std, moves = _recognise(next(rows, []), name)
+        columns = len(pose_columns(form, std, moves))
+        while block := list(islice(rows, BLOCK)):
+            poses = _block(block, done + 2, last, columns, form, moves, name)
+            done, last = done + len(block), int(poses.frames[-1])
+            yield poses
     except csv.Error as error:
         raise EdgeposeError(f"{name}, row {rows.line_num + 1}: {error}") from error
     except UnicodeDecodeError as error:
         raise EdgeposeError(f"{name} is not a text file: byte {error.start} is not UTF-8") from error
-    width = len(FORMS[form])
-    values = numbers[:, : len(JOINTS) * width].reshape(len(frames), len(JOINTS), width)
-    return frames, times, status, _rotations(form, values, name)
+    if not done:
+        raise EdgeposeError(f"{name} has no poses, only a header")
 
 
 def _lines(file: TextIO) -> Iterator[str]:
@@ -65,66 +185,172 @@ def _lines(file: TextIO) -> Iterator[str]:
         yield line
 
 
-def _recognise(header: list[str], name: str) -> tuple[str, int]:
-    """Representation and number of columns that a header announces."""
+def _recognise(header: list[str], name: str) -> tuple[str, bool, bool]:
+    """Representation, whether there are standard deviations and translation, as a header announces them."""
     for form in FORMS:
         for std in (False, True):
-            if header == pose_columns(form, std):
-                return form, len(header)
+            for moves in (False, True):
+                if header == pose_columns(form, std, moves):
+                    return form, std, moves
     raise EdgeposeError(
         f"{name} is not a file of poses: its first line must be 'frame,time_s,status,pelvis_...' and name "
         "the 24 joints in SMPL order"
     )
 
 
-def _parse(
-    rows: Iterator[list[str]], columns: int, name: str
-) -> tuple[NDArray[np.int64], Array, list[str], Array]:
-    """Frames (T,), times (T,), status texts and all numbers after them (T, columns - 3)."""
+def _block(
+    rows: list[list[str]], first: int, last: int, columns: int, form: str, moves: bool, name: str
+) -> Poses:
+    """Poses of rows of which the first has number `first`, after the frame `last`."""
     frames, times, status, numbers = array("q"), array("d"), list[str](), array("d")
-    for number, row in enumerate(rows, start=2):
+    for number, row in enumerate(rows, start=first):
         if len(row) != columns:
             raise EdgeposeError(f"{name}, row {number}: {len(row)} columns, the header has {columns}")
         try:
             frame = int(row[0])
             times.append(float(row[1]))
             numbers.extend(map(float, row[3:]))
-            if frames and frame <= frames[-1]:
-                raise EdgeposeError(f"{name}, row {number}: frame {frame} comes after frame {frames[-1]}")
+            if frame <= last and (frames or first > 2):
+                raise EdgeposeError(f"{name}, row {number}: frame {frame} comes after frame {last}")
             frames.append(frame)
+            last = frame
         except (ValueError, OverflowError) as error:
             raise EdgeposeError(f"{name}, row {number}: {error}") from error
         status.append(sys.intern(row[2]))
-    if not frames:
-        raise EdgeposeError(f"{name} has no poses, only a header")
     values = np.frombuffer(numbers).reshape(len(frames), -1)
     seconds = np.frombuffer(times)
     bad = ~(np.isfinite(seconds) & np.isfinite(values).all(axis=1))
     if bad.any():
-        raise EdgeposeError(f"{name}, row {bad.argmax() + 2}: a number is infinite or not a number")
-    return np.frombuffer(frames, np.int64), seconds, status, values
+        raise EdgeposeError(f"{name}, row {bad.argmax() + first}: a number is infinite or not a number")
+    width = len(FORMS[form])
+    rotations = values[:, : len(JOINTS) * width].reshape(len(frames), len(JOINTS), width)
+    return Poses(
+        np.frombuffer(frames, np.int64),
+        seconds,
+        status,
+        _rotations(form, rotations, name, first),
+        values[:, -3:] if moves else None,
+    )
 
 
-def _rotations(form: str, values: Array, name: str) -> Array:
-    """Rotation matrices (T, 24, 3, 3) of the numbers (T, 24, n) of one representation."""
+def _rotations(form: str, values: Array, name: str, first: int) -> Array:
+    """Rotation matrices (T, 24, 3, 3) of the numbers (T, 24, n) of one representation, from row `first`."""
     if form == "axis-angle":
         return rotvec_to_matrix(values)
     if form == "euler":
         return euler_to_matrix(values, "zxy")
     if form == "quat":
         norms = np.linalg.norm(values, axis=-1, keepdims=True)
-        _check(np.abs(norms[..., 0] - 1.0), name)
+        _check(np.abs(norms[..., 0] - 1.0), name, first)
         return quat_to_matrix(values / norms)
     matrices = values.reshape(*values.shape[:-1], 3, 3)
     # Six written digits leave a matrix a little off a rotation; anything further is not one.
     nearest = nearest_rotation(matrices)
-    _check(np.abs(matrices - nearest).max(axis=(-2, -1)), name)
+    _check(np.abs(matrices - nearest).max(axis=(-2, -1)), name, first)
     return nearest
 
 
-def _check(error: Array, name: str) -> None:
+def _check(error: Array, name: str, first: int) -> None:
     """Raise for the first row and joint whose numbers (T, 24) are far from a rotation's."""
     bad = error > 1e-3
     if bad.any():
         row, joint = np.argwhere(bad)[0]
-        raise EdgeposeError(f"{name}, row {row + 2}: the numbers of {JOINTS[joint]} are not a rotation")
+        raise EdgeposeError(f"{name}, row {row + first}: the numbers of {JOINTS[joint]} are not a rotation")
+
+
+# --- NPZ ----------------------------------------------------------------------------------------------------
+
+
+def _is_recording(names: set[str]) -> bool:
+    """Whether an archive with these members is a recording of sensors, which may hold true poses besides."""
+    return any(f"{placement}_quat.npy" in names for placement in PLACEMENTS)
+
+
+def _read_npz(path: Path) -> Poses:
+    """Poses of an AMASS file, in its world with Z up, or the true poses of a recording, which are in T.
+
+    Frames, times and status are there if edgepose has written the file. Of SMPL-H and SMPL-X the body's 22
+    joints are taken, hands stay at rest.
+    """
+    arrays, in_t = _load(path)
+    if "poses" not in arrays or arrays["poses"].ndim != 2 or not len(arrays["poses"]):
+        raise EdgeposeError(f"{path}: no poses in it; it needs an array 'poses' (frames, 72)")
+    count, width = arrays["poses"].shape
+    if width < 66 or width % 3:
+        raise EdgeposeError(f"{path}: 'poses' must be (frames, 72), it is {arrays['poses'].shape}")
+    joints = len(JOINTS) if width == 72 else 22
+    vectors = _numbers(path, arrays, "poses", (count, width))[:, : 3 * joints].reshape(count, joints, 3)
+    rotations = np.broadcast_to(np.eye(3), (count, len(JOINTS), 3, 3)).copy()
+    rotations[:, :joints] = rotvec_to_matrix(vectors)
+    translation = _numbers(path, arrays, "trans", (count, 3)) if "trans" in arrays else None
+    if translation is not None and not translation.any():
+        translation = None  # AMASS wants the array where nothing is known, too
+    if not in_t:
+        rotations[:, 0] = Z_UP_TO_T @ rotations[:, 0]
+        translation = None if translation is None else translation @ Z_UP_TO_T.T
+    frames, time_s = _clock(path, arrays, count)
+    return Poses(frames, time_s, _status(path, arrays, count), rotations, translation)
+
+
+def _load(path: Path) -> tuple[dict[str, NDArray[Any]], bool]:
+    """The arrays of a file that matter, and whether it is a recording with true poses in T."""
+    wanted = ("poses", "trans", "mocap_framerate", "mocap_frame_rate", "time_s", "frame", "held", "filling")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            # Sizes as declared are the most that zipfile unpacks.
+            sizes = {member.filename: member.file_size for member in archive.infolist()}
+        size = sum(sizes.get(f"{key}.npy", 0) for key in wanted)
+        if size > MAX_BYTES:
+            raise EdgeposeError(
+                f"{path}: unpacks to {size >> 20} MB; poses are read up to {MAX_BYTES >> 20} MB"
+            )
+        with np.load(path, allow_pickle=False) as archive:
+            return {key: archive[key] for key in wanted if key in archive.files}, _is_recording(set(sizes))
+    except OSError as error:
+        raise EdgeposeError(f"cannot read poses from {path}: {error.strerror or error}") from error
+    except (
+        zipfile.BadZipFile, zlib.error, EOFError, ValueError, TypeError, RuntimeError, MemoryError
+    ) as error:  # fmt: skip
+        reason = " ".join(str(error).split())
+        raise EdgeposeError(f"{path}: not a whole NPZ file ({reason}); copy it again") from None
+
+
+def _numbers(path: Path, arrays: Mapping[str, NDArray[Any]], key: str, shape: tuple[int, ...]) -> Array:
+    """An array as numbers, finite and not absurd."""
+    values = arrays[key]
+    if values.dtype.kind not in "fiub" or values.shape != shape:
+        raise EdgeposeError(f"{path}: {key!r} is {values.dtype} {values.shape} and not numbers {shape}")
+    numbers = values.astype(np.float64)
+    bad = ~np.isfinite(numbers) | (np.abs(numbers) > (1e12 if key in ("time_s", "frame") else LARGEST))
+    if bad.any():
+        where = f" of frame {np.argwhere(bad)[0][0]}" if shape else ""
+        raise EdgeposeError(f"{path}: a number in {key!r}{where} is not finite, or far too large")
+    return numbers
+
+
+def _clock(path: Path, arrays: Mapping[str, NDArray[Any]], count: int) -> tuple[NDArray[np.int64], Array]:
+    """Frames (T,) and times (T,): as written, else counted from 0 at the file's rate."""
+    frames = np.arange(count)
+    if "frame" in arrays:
+        frames = _numbers(path, arrays, "frame", (count,)).astype(np.int64)
+        if (np.diff(frames) <= 0).any():
+            raise EdgeposeError(f"{path}: the numbers in 'frame' do not rise")
+    if "time_s" in arrays:
+        return frames, _numbers(path, arrays, "time_s", (count,))
+    key = "mocap_framerate" if "mocap_framerate" in arrays else "mocap_frame_rate"
+    if key not in arrays or arrays[key].size != 1:
+        raise EdgeposeError(f"{path}: needs one number 'mocap_framerate', frames per second")
+    rate = float(_numbers(path, {key: arrays[key].reshape(())}, key, ()))
+    if not 1e-2 < rate < 1e5:
+        raise EdgeposeError(f"{path}: a frame rate of {rate:g} Hz is not possible")
+    return frames, np.arange(count) / rate
+
+
+def _status(path: Path, arrays: Mapping[str, NDArray[Any]], count: int) -> list[str]:
+    if "held" not in arrays or "filling" not in arrays:
+        return ["ok"] * count
+    held = _numbers(path, arrays, "held", (count, len(PLACEMENTS))) != 0
+    filling = _numbers(path, arrays, "filling", (count,)) != 0
+    masks = held @ (1 << np.arange(len(PLACEMENTS)))
+    pairs = zip((filling * FILLING_WINDOW).tolist(), masks.tolist(), strict=True)
+    return [status_text(flags, mask) for flags, mask in pairs]

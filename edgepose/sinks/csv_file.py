@@ -6,13 +6,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from edgepose.appending import FLUSH_S, explain, is_regular, open_output, write_rows
 from edgepose.errors import EdgeposeError
 from edgepose.pose import PoseFrame
-from edgepose.rotations import matrix_to_quat, matrix_to_rotvec
+from edgepose.rotations import matrix_to_euler_zxy, matrix_to_quat, matrix_to_rotvec
 from edgepose.sinks import Sink
 from edgepose.skeleton import JOINTS
 
@@ -25,22 +24,11 @@ FORMS = {
 """Column endings of each representation; euler: R = Rz Rx Ry, turns about the axes as they have moved."""
 
 
-def pose_columns(rotations: str, std: bool) -> list[str]:
+def pose_columns(rotations: str, std: bool, translation: bool = False) -> list[str]:
     """Names of all columns, in order; `rotations` is a key of `FORMS`."""
     names = ["frame", "time_s", "status"] + [f"{joint}_{end}" for joint in JOINTS for end in FORMS[rotations]]
-    return names + [f"{joint}_std" for joint in JOINTS] if std else names
-
-
-def matrix_to_euler_zxy(r: ArrayLike) -> NDArray[np.float64]:
-    """Angles (..., 3) about z, x, y, radians, of rotation matrices (..., 3, 3) = Rz Rx Ry; |x| <= pi/2."""
-    r = np.asarray(r, float)
-    z = np.arctan2(-r[..., 0, 1], r[..., 1, 1])
-    c, s = np.cos(z), np.sin(z)
-    # What is left after undoing z is Rx Ry. Taking x and y from it, not from R, stays exact where x is near
-    # +-pi/2 and z by itself means little.
-    x = np.arctan2(r[..., 2, 1], c * r[..., 1, 1] - s * r[..., 0, 1])
-    y = np.arctan2(c * r[..., 0, 2] + s * r[..., 1, 2], c * r[..., 0, 0] + s * r[..., 1, 0])
-    return np.stack([z, x, y], axis=-1)
+    names += [f"{joint}_std" for joint in JOINTS] if std else []
+    return names + [f"trans_{axis}" for axis in "xyz"] if translation else names
 
 
 def _numbers(rotations: str, matrices: NDArray[Any]) -> NDArray[Any]:
@@ -61,21 +49,28 @@ class CsvSink(Sink):
     a program that reads along has no added latency. After an error a file ends at a whole row.
     """
 
-    def __init__(self, path: str | Path, rotations: str = "axis-angle", std: bool = False) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        rotations: str = "axis-angle",
+        std: bool = False,
+        translation: bool = False,
+    ) -> None:
         """Open the file and write the header.
 
         Args:
             path: file to write, replaced if it exists; "-" is standard output.
             rotations: a key of `FORMS`; angles are in radians.
             std: add the network's standard deviation of each joint, radians.
+            translation: add the place of the pelvis, metres, which every pose must then have.
 
         Raises:
             EdgeposeError: the file cannot be written.
         """
         if rotations not in FORMS:
             raise EdgeposeError(f"unknown rotations {rotations!r}: choose one of {', '.join(FORMS)}")
-        self._rotations, self._std = rotations, std
-        columns = pose_columns(rotations, std)
+        self._rotations, self._std, self._translation = rotations, std, translation
+        columns = pose_columns(rotations, std, translation)
         self._format = ",".join(["%d,%.6f,%s"] + ["%.6f"] * (len(columns) - 3)) + "\n"
         self._path = str(path)
         self._closed = False
@@ -93,6 +88,10 @@ class CsvSink(Sink):
         numbers = _numbers(self._rotations, pose.rotations).ravel().tolist()
         if self._std:
             numbers += pose.std.tolist()
+        if self._translation:
+            if pose.translation is None:
+                raise ValueError(f"pose {pose.index} has no translation")
+            numbers += pose.translation.tolist()
         self._rows.append(self._format % (pose.index, pose.time_s, pose.status, *numbers))
         if not self._regular or time.monotonic() - self._flushed >= FLUSH_S:
             self._flush()

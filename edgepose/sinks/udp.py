@@ -11,16 +11,13 @@ from typing import NamedTuple
 import numpy as np
 
 from edgepose.errors import EdgeposeError
-from edgepose.placements import PLACEMENTS
-from edgepose.pose import PoseFrame
+from edgepose.pose import PoseFrame, status_bits, status_text
 from edgepose.rotations import matrix_to_quat, matrix_to_rotvec, quat_to_matrix
 from edgepose.sinks import Sink
 from edgepose.skeleton import JOINTS
 
 MAGIC = b"EPOS"
 VERSION = 1
-FILLING_WINDOW = 1
-"""Bit of the flags byte: the network has seen fewer frames than its window holds."""
 
 _JSON = '{"frame":%d,"time_s":%.6f,"status":%s,"pose":[' + ",".join(["%.6f"] * 72) + "]}\n"
 # Magic, version, flags, held sensors, joints, time, frame, quaternions: each at a multiple of its size.
@@ -74,7 +71,7 @@ def encode_json(pose: PoseFrame) -> bytes:
 
 def encode_binary(pose: PoseFrame) -> bytes:
     """The binary datagram of a pose, 404 bytes."""
-    flags, held = _status_bits(pose.status)
+    flags, held = status_bits(pose.status)
     quats = matrix_to_quat(pose.rotations).ravel().tolist()
     index = pose.index & 0xFFFFFFFF  # Wraps after two years at 60 Hz.
     return _BINARY.pack(MAGIC, VERSION, flags, held, len(JOINTS), pose.time_s, index, *quats)
@@ -101,7 +98,7 @@ def decode_binary(datagram: bytes) -> PoseFrame:
         )
     rotations = quat_to_matrix(quats / norms).astype(np.float32)
     return PoseFrame(
-        index, time_s, _status_text(flags, held), rotations, np.full(len(JOINTS), np.nan, np.float32)
+        index, time_s, status_text(flags, held), rotations, np.full(len(JOINTS), np.nan, np.float32)
     )
 
 
@@ -164,24 +161,3 @@ class UdpSink(Sink):
 @lru_cache(maxsize=64)
 def _quoted(text: str) -> str:
     return json.dumps(text)
-
-
-@lru_cache(maxsize=256)
-def _status_bits(status: str) -> tuple[int, int]:
-    """Flags byte and held-sensor mask (bit i: PLACEMENTS[i]) of a status text."""
-    flags = held = 0
-    for part in status.split("; "):
-        if part == "filling window":
-            flags |= FILLING_WINDOW
-        elif part.startswith("held "):
-            held |= sum(1 << PLACEMENTS.index(name) for name in part.split()[1:])
-    return flags, held
-
-
-def _status_text(flags: int, held: int) -> str:
-    """Inverse of `_status_bits`."""
-    names = [name for i, name in enumerate(PLACEMENTS) if held >> i & 1]
-    parts = [" ".join(["held", *names])] if names else []
-    if flags & FILLING_WINDOW:
-        parts.append("filling window")
-    return "; ".join(parts) or "ok"

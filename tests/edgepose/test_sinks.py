@@ -13,10 +13,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from edgepose.errors import EdgeposeError
+from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseFrame
 from edgepose.poses import read_poses_csv
-from edgepose.sinks import csv_file, udp
-from edgepose.sinks.csv_file import CsvSink, matrix_to_euler_zxy, pose_columns
+from edgepose.rotations import matrix_to_euler_zxy
+from edgepose.sinks import csv_file
+from edgepose.sinks.csv_file import CsvSink, pose_columns
 from edgepose.sinks.udp import UdpSink, decode_binary, encode_binary, encode_json, parse_destination
 from edgepose.skeleton import JOINTS
 
@@ -436,5 +438,5 @@ def test_receiver_of_the_documentation(receiver):
 def test_documented_tables_are_those_of_the_code():
     text = DOCS.read_text()
     assert " ".join(JOINTS) in " ".join(text.split())
-    for i, name in enumerate(udp.PLACEMENTS):
+    for i, name in enumerate(PLACEMENTS):
         assert re.search(rf"\b{i} {name}\b", text)

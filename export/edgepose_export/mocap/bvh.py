@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
+from edgepose.poses import tidy_rate
 from edgepose.rotations import euler_to_matrix
 
-from .recording import LARGEST, Recording, fail, numbers, tidy_rate
+from .recording import LARGEST, Recording, fail, numbers
 
 Array = NDArray[np.float64]
 

@@ -49,13 +49,6 @@ def forward(recording: Recording) -> tuple[Array, Array]:
     return rotations, positions
 
 
-def tidy_rate(frame_time: float) -> float:
-    """Frames per second of a frame time in seconds that was printed with few digits: .0083333 is 120 Hz."""
-    rate = 1.0 / frame_time
-    whole = round(rate)
-    return float(whole) if abs(rate - whole) < 1e-4 * rate else rate
-
-
 def fail(path: Path, line: int, problem: str) -> NoReturn:
     """Raise the error for a problem in a line, counted from 1."""
     raise EdgeposeError(f"{path}, line {line}: {problem}")

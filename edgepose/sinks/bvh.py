@@ -1,0 +1,171 @@
+"""Poses as BVH, a skeleton and its angles over time, for Blender and other animation programs."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgepose.appending import FLUSH_S, explain, open_output, write_rows
+from edgepose.errors import EdgeposeError
+from edgepose.pose import PoseFrame
+from edgepose.rotations import matrix_to_euler_zxy
+from edgepose.sinks import Sink
+from edgepose.skeleton import JOINTS, PARENTS, Body, default_body, forward_kinematics
+
+Array = NDArray[np.float64]
+
+BLOCK = 600
+"""Poses that are held back at most."""
+
+TIPS = {10: (0, 0, 6), 11: (0, 0, 6), 15: (0, 18, 0), 22: (8, 0, 0), 23: (-8, 0, 0)}
+"""Where the bones without a joint at their end stop: joint, and tip in its frame, cm."""
+
+_COUNT = "Frames: "
+_DIGITS = 10
+"""Room for the number of frames, which is known only at the end."""
+
+
+def hierarchy(offsets: Array) -> str:
+    """The part of a file that describes a skeleton; offsets (24, 3), row 0 the pelvis' place, in cm."""
+    children: dict[int, list[int]] = {joint: [] for joint in range(len(JOINTS))}
+    for joint, parent in enumerate(PARENTS[1:], start=1):
+        children[parent].append(joint)
+
+    def lines(joint: int, depth: int) -> list[str]:
+        room = "  " * depth
+        channels = "3 " if joint else "6 Xposition Yposition Zposition "
+        result = [
+            f"{room}{'JOINT' if joint else 'ROOT'} {JOINTS[joint]}",
+            f"{room}{{",
+            f"{room}  OFFSET {_text(offsets[joint])}",
+            f"{room}  CHANNELS {channels}Zrotation Xrotation Yrotation",
+        ]
+        for child in children[joint]:
+            result += lines(child, depth + 1)
+        if joint in TIPS:
+            tip = _text(np.array(TIPS[joint], float))
+            result += [f"{room}  End Site", f"{room}  {{", f"{room}    OFFSET {tip}", f"{room}  }}"]
+        return [*result, f"{room}}}"]
+
+    return "\n".join(["HIERARCHY", *lines(0, 0), ""])
+
+
+def _text(numbers: Array) -> str:
+    return " ".join(f"{number:.4f}" for number in numbers)
+
+
+def depth_first() -> list[int]:
+    """Joints in the order in which a file lists them."""
+    order: list[int] = []
+
+    def visit(joint: int) -> None:
+        order.append(joint)
+        for child, parent in enumerate(PARENTS):
+            if parent == joint:
+                visit(child)
+
+    visit(0)
+    return order
+
+
+class BvhSink(Sink):
+    """Writes poses to a file, which is whole after every write to the disk, about once a second.
+
+    The body frame T is the file's world: X to the wearer's left, Y up, Z forward; lengths in cm.
+    """
+
+    def __init__(self, path: str | Path, rate: float = 60.0, body: Body | None = None) -> None:
+        """Open the file and write the skeleton.
+
+        Args:
+            path: file to write, replaced if it exists.
+            rate: frames per second.
+            body: whose bone lengths the file gets; the default body if None.
+
+        Raises:
+            EdgeposeError: the file cannot be written.
+        """
+        self._path = str(path)
+        offsets = (body or default_body()).offsets.copy()
+        _, joints = forward_kinematics(np.tile(np.eye(3), (len(JOINTS), 1, 1)), offsets)
+        # Where nobody knows a pose's place, the soles of someone who stands straight are near the ground.
+        self._standing = np.array([0.0, -joints[:, 1].min(), 0.0])
+        self._channels = np.array(depth_first())
+        self._before = np.zeros((len(JOINTS), 3))
+        self._poses: list[PoseFrame] = []
+        self._count, self._closed = 0, False
+        if self._path == "-" or (Path(path).exists() and not Path(path).is_file()):
+            raise EdgeposeError(
+                f"cannot write BVH to {path}: it must be a file, which tells its length at once"
+            )
+        self._file = open_output(self._path, "poses")
+        head = f"{hierarchy(offsets * 100)}MOTION\n{_COUNT}"
+        self._count_at = len(head)
+        head += f"{0:<{_DIGITS}}\nFrame Time: {1 / rate:.8f}\n"
+        self._flushed = time.monotonic()
+        try:
+            self._append(head.encode())
+        except EdgeposeError:
+            self._closed = True
+            self._file.close()
+            raise
+
+    def write(self, pose: PoseFrame) -> None:
+        """Add a frame."""
+        self._poses.append(pose)
+        if len(self._poses) >= BLOCK or time.monotonic() - self._flushed >= FLUSH_S:
+            self._flush()
+
+    def close(self) -> None:
+        """Write what is still held back and close the file; a second call does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            self._flush()
+        finally:
+            try:
+                self._file.close()
+            except OSError as error:  # Network file systems may report a full disk only here.
+                raise EdgeposeError(explain(error, self._path, "poses")) from error
+
+    def _flush(self) -> None:
+        poses, self._poses = self._poses, []
+        self._flushed = time.monotonic()
+        if not poses:
+            return
+        rows = self._rows(poses)
+        start = self._file.tell()
+        try:
+            self._append(rows)
+        finally:
+            self._count += rows[: self._file.tell() - start].count(b"\n")
+            end = self._file.seek(0, 2)
+            # In its place, which needs no room on a full disk.
+            with contextlib.suppress(OSError):
+                self._file.seek(self._count_at)
+                self._file.write(f"{self._count:<{_DIGITS}}".encode())
+            self._file.seek(end)
+
+    def _rows(self, poses: Sequence[PoseFrame]) -> bytes:
+        """Lines of channel values."""
+        angles = matrix_to_euler_zxy(np.stack([pose.rotations for pose in poses]))
+        # Without leaps of a whole turn, because programs interpolate between frames.
+        angles = np.unwrap(np.concatenate([self._before[None], angles]), axis=0)[1:]
+        self._before = angles[-1]
+        places = [self._standing if pose.translation is None else pose.translation for pose in poses]
+        values = np.degrees(angles[:, self._channels]).reshape(len(poses), -1)
+        table = np.concatenate([100.0 * np.array(places, float), values], axis=1)
+        line = " ".join(["%.4f"] * table.shape[1]) + "\n"
+        return "".join(line % tuple(row) for row in table.tolist()).encode()
+
+    def _append(self, data: bytes) -> None:
+        try:
+            write_rows(self._file, data)
+        except OSError as error:
+            raise EdgeposeError(explain(error, self._path, "poses")) from error

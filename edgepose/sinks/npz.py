@@ -1,0 +1,136 @@
+"""Poses as NPZ with the keys of AMASS, for what reads SMPL motion. The arrays are in docs/outputs.md."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgepose.appending import replace_file
+from edgepose.errors import EdgeposeError
+from edgepose.placements import PLACEMENTS
+from edgepose.pose import FILLING_WINDOW, PoseFrame, status_bits
+from edgepose.poses import Z_UP_TO_T, Poses, read_blocks
+from edgepose.rotations import matrix_to_rotvec
+from edgepose.sinks import Sink
+from edgepose.sinks.csv_file import CsvSink
+
+BETAS = 16
+"""Shape coefficients of SMPL; all are zero, the average body."""
+
+
+def write_npz(path: Path, blocks: Iterable[Poses], count: int, rate: float) -> None:
+    """Write poses with little of them in memory at a time.
+
+    Args:
+        path: file to write.
+        blocks: the poses, in order.
+        count: how many poses the blocks hold together.
+        rate: frames per second.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    frames, times, held, filling, places = [], [], [], [], []
+    with zipfile.ZipFile(path, "w") as archive:
+        with archive.open("poses.npy", "w", force_zip64=True) as member:
+            header = {"descr": "<f4", "fortran_order": False, "shape": (count, 72)}
+            np.lib.format.write_array_header_1_0(member, header)
+            for block in blocks:
+                member.write(_vectors(block).tobytes())
+                bits = [status_bits(text) for text in block.status]
+                frames.append(block.frames)
+                times.append(block.time_s)
+                filling.append(np.array([flags & FILLING_WINDOW for flags, _ in bits], bool))
+                masks = np.array([mask for _, mask in bits])
+                held.append((masks[:, None] >> np.arange(len(PLACEMENTS)) & 1).astype(bool))
+                places.append(_places(block))
+        arrays: dict[str, NDArray[Any]] = {
+            "trans": np.concatenate(places),
+            "betas": np.zeros(BETAS),
+            "gender": np.array("neutral"),
+            "mocap_framerate": np.array(float(rate)),
+            "frame": np.concatenate(frames),
+            "time_s": np.concatenate(times),
+            "held": np.concatenate(held),
+            "filling": np.concatenate(filling),
+        }
+        for key, values in arrays.items():
+            with archive.open(f"{key}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, values, allow_pickle=False)
+
+
+def _vectors(block: Poses) -> NDArray[np.float32]:
+    """Axis-angle vectors (T, 72), the pelvis against AMASS's world with Z up."""
+    rotations = block.rotations.copy()
+    rotations[:, 0] = Z_UP_TO_T.T @ rotations[:, 0]
+    return matrix_to_rotvec(rotations).reshape(len(rotations), 72).astype("<f4")
+
+
+def _places(block: Poses) -> NDArray[np.float32]:
+    """Places of the pelvis (T, 3), metres, Z up; zeros where nothing is known."""
+    if block.translation is None:
+        return np.zeros((len(block.frames), 3), "<f4")
+    return (block.translation @ Z_UP_TO_T).astype("<f4")
+
+
+class NpzSink(Sink):
+    """Writes poses to a file that appears when the sink closes.
+
+    Until then they are in a CSV file beside it, `walk.part.csv` for `walk.npz`: however a run ends, there is
+    a file of poses that everything reads, and no more than a second of them is in memory.
+    """
+
+    def __init__(self, path: str | Path, rate: float = 60.0, translation: bool = False) -> None:
+        """Open the CSV file.
+
+        Args:
+            path: file to write, replaced if it exists.
+            rate: frames per second.
+            translation: whether the poses have a translation.
+
+        Raises:
+            EdgeposeError: it cannot be written.
+        """
+        self._path = Path(path)
+        if str(path) == "-" or self._path.is_dir():
+            raise EdgeposeError(f"cannot write poses to {path}: an NPZ file needs a file's name")
+        self._part = self._path.with_name(f"{self._path.stem}.part.csv")
+        self._rate, self._closed = rate, False
+        self._csv = CsvSink(self._part, translation=translation)
+
+    def write(self, pose: PoseFrame) -> None:
+        """Add a pose."""
+        self._csv.write(pose)
+
+    def close(self) -> None:
+        """Write the file and take the other away; a second call does nothing.
+
+        Raises:
+            EdgeposeError: something could not be written; what was is in the CSV file.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            self._csv.close()
+        finally:  # A full disk may have room for this one, which is smaller.
+            self._finish()
+
+    def _finish(self) -> None:
+        with self._part.open("rb") as file:
+            count = sum(piece.count(b"\n") for piece in iter(lambda: file.read(1 << 20), b"")) - 1
+        if count > 0:
+            try:
+                replace_file(
+                    self._path,
+                    lambda path: write_npz(path, read_blocks(self._part), count, self._rate),
+                    "poses",
+                )
+            except EdgeposeError as error:
+                raise EdgeposeError(f"{error}; all poses are in {self._part}") from error
+        self._part.unlink()
