@@ -32,6 +32,7 @@ class Job(NamedTuple):
     body: Body
     hold_s: float
     mounting_seed: int | None
+    seated_seed: int | None
 
 
 @click.command(short_help="Make recordings from motion capture.")
@@ -71,6 +72,14 @@ class Job(NamedTuple):
     help="Strap the sensors on at random angles drawn with this seed  [default: along the bones]",
 )
 @click.option(
+    "--seated",
+    "seated_seed",
+    type=int,
+    metavar="SEED",
+    help="Keep only the upper bodies: play each to and fro while the wearer stands, sits, squats and rises "
+    "as drawn with this seed; half a minute a take",
+)
+@click.option(
     "--jobs", type=click.IntRange(1), default=1, show_default=True, help="Files to work on at once."
 )
 def synthesize(
@@ -81,6 +90,7 @@ def synthesize(
     body_path: Path | None,
     hold: float,
     mounting_seed: int | None,
+    seated_seed: int | None,
     jobs: int,
 ) -> None:
     """Make IMU recordings with true poses from motion capture (.bvh, .amc, AMASS .npz; folders are searched).
@@ -92,6 +102,7 @@ def synthesize(
     Examples:
       edgepose synthesize mocap/ --out recordings/ --jobs 2
       edgepose synthesize walk.bvh --out . --hold 6 --mounting 1 --rate 100
+      edgepose synthesize mocap/ --out recordings/seated --seated 1
     """
     from edgepose.skeleton import default_body
     from edgepose_export.body import read_smpl
@@ -104,7 +115,7 @@ def synthesize(
     if not files:
         raise EdgeposeError(f"no motion files ({', '.join(KINDS)}) in {', '.join(map(str, inputs))}")
     tasks = [
-        (path, Job(out, root if root.is_dir() else root.parent, rate, body, hold, mounting_seed))
+        (path, Job(out, root if root.is_dir() else root.parent, rate, body, hold, mounting_seed, seated_seed))
         for root, path in files
     ]
     _check_targets(tasks)
@@ -150,6 +161,7 @@ def convert(path: Path, job: Job) -> str | None:
 
     from edgepose.rotations import rotvec_to_matrix
     from edgepose_export.mocap import pieces, read_motion, resample
+    from edgepose_export.seating import seated
     from edgepose_export.synthesis import recording_arrays, virtual_imus, with_hold
 
     try:
@@ -163,6 +175,10 @@ def convert(path: Path, job: Job) -> str | None:
             return f"{path}: shorter than a second between jumps"
         for i, take in enumerate(takes):
             motion = resample(take, job.rate)
+            if job.seated_seed is not None:
+                # Each take has its own draw, whatever others are made with it.
+                rng = np.random.default_rng([job.seated_seed, i, *path.stem.encode()])
+                motion = seated(motion, job.body, rng)
             if job.hold_s:
                 motion = with_hold(motion, job.hold_s)
             imus = virtual_imus(motion, job.body, mounting)
