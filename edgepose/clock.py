@@ -6,7 +6,10 @@ minutes; or with nothing, and then arrivals have to do.
 
 from __future__ import annotations
 
-from math import inf
+from collections import deque
+from math import inf, nan
+
+import numpy as np
 
 WRAP_US = 1 << 32
 """Where the clocks of native packets wrap, microseconds."""
@@ -14,9 +17,12 @@ WRAP_US = 1 << 32
 STEP_S = 1e-6
 """Smallest step between two times of one sensor, seconds."""
 
-_DRIFT = 200e-6
+FOLLOWED_PPM = 200.0
+"""Largest drift of a device's clock that is followed, parts per million."""
+
 _LATE_S = 0.05
 _LATE_FOR_S = 1.0
+_DRIFT_S, _DRIFT_BLOCKS, _DRIFT_LEAST = 1.0, 120, 8  # the fastest arrival of each second tells the drift
 _AHEAD_S = 1.0
 _BACK_S = 0.1
 
@@ -59,6 +65,8 @@ class DeviceClock:
         self._result = 0.0
         self._window_s = 0.0  # arrival time at which the present look-out for lateness began
         self._least_late = 0.0
+        # Since the offset began anew: start of a second, and least arrival less device time in it.
+        self._fastest: deque[tuple[float, float]] = deque(maxlen=_DRIFT_BLOCKS)
 
     def host_time(self, t_us: int, arrival_s: float) -> float:
         """Host time of a measurement, seconds; always larger than that of the call before.
@@ -83,13 +91,17 @@ class DeviceClock:
                 # One packet after a pause is no proof: a second of them is.
                 self._window_s, self._least_late = arrival_s, inf
             self._device_s, self._arrival_s = device_s, arrival_s
-            rise = min(_DRIFT * step, late)  # negative where this packet came faster than any before
+            self._note_delay(arrival_s, arrival_s - device_s)
+            rise = min(
+                FOLLOWED_PPM * 1e-6 * step, late
+            )  # negative where this packet came faster than any before
             self._offset += rise
             self._least_late = min(self._least_late, late - rise)
             if arrival_s - self._window_s > _LATE_FOR_S:
                 if self._least_late > _LATE_S:
                     self.resets += 1
                     self._offset += self._least_late
+                    self._fastest.clear()
                 self._window_s, self._least_late = arrival_s, inf
         # Not the arrival: a packet can be measured long before it comes.
         self._result = max(self._result + STEP_S, self._time(t_us))
@@ -98,7 +110,30 @@ class DeviceClock:
     def _time(self, t_us: int) -> float:
         return unwrap(t_us, self._device_s, self._wrap_us) + self._offset
 
+    def drift_ppm(self) -> tuple[float, float]:
+        """What the device's clock loses against the host's, and the standard error of that, parts per
+        million; NaN in the first seconds.
+        """
+        if len(self._fastest) < _DRIFT_LEAST:
+            return nan, nan
+        arrival_s, delay_s = np.array(self._fastest).T
+        arrival_s = arrival_s - arrival_s.mean()
+        square = float(arrival_s @ arrival_s)
+        slope = float(arrival_s @ delay_s) / square
+        rest = delay_s - delay_s.mean() - slope * arrival_s
+        error = float(np.sqrt(rest @ rest / (len(rest) - 2) / square))
+        return 1e6 * slope, 1e6 * error
+
+    def _note_delay(self, arrival_s: float, delay_s: float) -> None:
+        if self._fastest and arrival_s - self._fastest[-1][0] < _DRIFT_S:
+            start_s, least_s = self._fastest[-1]
+            if delay_s < least_s:
+                self._fastest[-1] = (start_s, delay_s)
+        else:
+            self._fastest.append((arrival_s, delay_s))
+
     def _restart(self, t_us: int, arrival_s: float) -> None:
+        self._fastest.clear()
         self._device_s = t_us * 1e-6
         self._arrival_s = self._window_s = arrival_s
         self._offset = arrival_s - self._device_s

@@ -11,11 +11,12 @@ once at the start and carried on by the monotonic clock, so that it never jumps;
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
+from edgepose.clock import DeviceClock
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 
@@ -55,6 +56,10 @@ class Source(AbstractContextManager["Source"], Protocol):
         """What has come in so far."""
 
     @property
+    def clocks(self) -> Mapping[int, DeviceClock]:
+        """Clocks of the sensors on live lines that send a time, by placement."""
+
+    @property
     def damage(self) -> str | None:
         """One line for the user if something was wrong with the input although the rest of it was
         delivered."""
@@ -84,6 +89,7 @@ def open_source(
     protocol: str = "auto",
     sensors: Path | str | None = None,
     raw: list[tuple[float, Any]] | None = None,
+    lenient: bool = False,
 ) -> Source:
     """The source that the options ask for; nothing is opened before it is entered.
 
@@ -99,6 +105,8 @@ def open_source(
         protocol: name of a wire format, a TOML file that describes text lines, or "auto".
         sensors: map of devices to placements; ports and buses that it names need no `port` and `can`.
         raw: filled with what comes over live lines: Unix time of arrival, s, and bytes or a CAN message.
+        lenient: take what there is: of a recording the good rows of any sensors, of lines those that speak;
+            those that do not are told and waited for.
 
     Raises:
         EdgeposeError: no input or two; a protocol, kind of file or entry of the map that means nothing.
@@ -112,8 +120,8 @@ def open_source(
     if file is not None:
         from edgepose.sources.files import open_file
 
-        return open_file(Path(file), realtime, protocol, sensor_map)
+        return open_file(Path(file), realtime, protocol, sensor_map, lenient)
     from edgepose.sources.links import links
     from edgepose.sources.live import LiveSource
 
-    return LiveSource(links(port, baud, can, bitrate, fd, protocol, sensor_map), raw)
+    return LiveSource(links(port, baud, can, bitrate, fd, protocol, sensor_map), raw, lenient)

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import inf, isnan, nan
 from pathlib import Path
 from types import TracebackType
 
 from edgepose.capture import read_capture
-from edgepose.clock import CaptureClock, HostClocks
+from edgepose.clock import CaptureClock, DeviceClock, HostClocks
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
-from edgepose.recording import Recording, read_recording, samples
+from edgepose.recording import Recording, read_recording, salvage_recording, samples
 from edgepose.sources import Batch, Counters, Source, total
 from edgepose.sources.detection import Chunk, candidates, protocol_named
 from edgepose.sources.sensor_map import SensorMap, default_places
@@ -35,14 +35,16 @@ class RecordingSource:
 
     behind_s = 0.0
 
-    def __init__(self, path: Path, realtime: bool) -> None:
+    def __init__(self, path: Path, realtime: bool, lenient: bool = False) -> None:
         """Nothing is read yet.
 
         Args:
             path: the file.
             realtime: deliver it at its own pace.
+            lenient: take the good rows of any sensors; without, all six and no bad row.
         """
         self._path = path
+        self._read = salvage_recording if lenient else read_recording
         self._realtime = realtime
         self._recording: Recording | None = None
         self._packets = 0
@@ -51,6 +53,11 @@ class RecordingSource:
     def counters(self) -> Counters:
         """What has come in so far."""
         return Counters(self._packets)
+
+    @property
+    def clocks(self) -> Mapping[int, DeviceClock]:
+        """Always none: a recording has one clock."""
+        return {}
 
     @property
     def damage(self) -> str | None:
@@ -63,7 +70,7 @@ class RecordingSource:
         Raises:
             EdgeposeError: it is no recording.
         """
-        self._recording = read_recording(self._path)
+        self._recording = self._read(self._path)
         return self
 
     def __exit__(
@@ -103,6 +110,11 @@ class LogSource:
     def counters(self) -> Counters:
         """What has come in so far."""
         return total(stream.counters for stream in self._streams.values())
+
+    @property
+    def clocks(self) -> Mapping[int, DeviceClock]:
+        """Always none: most logs do not say when what came."""
+        return {}
 
     @property
     def damage(self) -> str | None:
@@ -162,7 +174,9 @@ class LogSource:
         )
 
 
-def open_file(path: Path, realtime: bool, protocol: str, sensor_map: SensorMap | None) -> Source:
+def open_file(
+    path: Path, realtime: bool, protocol: str, sensor_map: SensorMap | None, lenient: bool = False
+) -> Source:
     """The source that a file is.
 
     Raises:
@@ -171,7 +185,7 @@ def open_file(path: Path, realtime: bool, protocol: str, sensor_map: SensorMap |
     if is_recording(path):
         if protocol != "auto":
             protocol_named(protocol)  # a wrong name is told although it would not be needed
-        return RecordingSource(path, realtime)
+        return RecordingSource(path, realtime, lenient)
     named = None if protocol == "auto" else protocol_named(protocol)
     if is_can_log(path) and (named is None or named.transport == "can"):
         from edgepose.sources.can_bus import read_log

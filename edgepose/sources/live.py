@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from queue import Empty, SimpleQueue
 from types import TracebackType
 from typing import Any, NamedTuple, Protocol
 
-from edgepose.clock import HostClocks
+from edgepose.clock import DeviceClock, HostClocks
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
@@ -95,6 +95,7 @@ class _Line:
         self.stream = Stream(link.name, link.protocols, link.places, self._clock, claimed)
         self.jumps: dict[int, int] = {}  # of the devices' clocks, a second ago
         self.twins = False
+        self.told = False  # that nothing usable comes
         self._queue = queue
         self._now = now
         self._stop = threading.Event()
@@ -157,14 +158,18 @@ class _Line:
 class LiveSource:
     """Samples from serial ports and CAN buses. A line that disappears is opened again when it is back."""
 
-    def __init__(self, links: Sequence[Link], raw: list[tuple[float, Any]] | None = None) -> None:
+    def __init__(
+        self, links: Sequence[Link], raw: list[tuple[float, Any]] | None = None, lenient: bool = False
+    ) -> None:
         """Nothing is opened yet.
 
         Args:
             links: what to listen to.
             raw: filled with what comes: arrival in Unix time, seconds, and bytes or a CAN message.
+            lenient: warn of a line on which nothing usable comes, and go on with the others.
         """
         self.behind_s = 0.0
+        self._lenient = lenient
         self._links = links
         self._raw = raw
         self._lines: list[_Line] = []
@@ -176,6 +181,16 @@ class LiveSource:
     def counters(self) -> Counters:
         """What has come in so far."""
         return total(line.stream.counters for line in self._lines)
+
+    @property
+    def clocks(self) -> Mapping[int, DeviceClock]:
+        """Clocks of the sensors that send a time, by placement."""
+        return {
+            place: clock
+            for line in self._lines
+            if line.clocks is not None
+            for place, clock in line.clocks.devices.items()
+        }
 
     @property
     def damage(self) -> str | None:
@@ -234,11 +249,22 @@ class LiveSource:
             self.behind_s = self._now() - now_s
             yield now_s, samples
             for line in self._lines:
-                _check_start(line, now_s, start_s)
+                self._check_start(line, now_s, start_s)
             if now_s - checked_s > 1.0:
                 checked_s = now_s
                 for line in self._lines:
                     _warn_of_twins(line)
+
+    def _check_start(self, line: _Line, now_s: float, start_s: float) -> None:
+        if line.told:
+            return
+        try:
+            _check_start(line, now_s, start_s)
+        except EdgeposeError as error:
+            if not self._lenient:
+                raise
+            line.told = True
+            _log.warning("%s", error)
 
     def _now(self) -> float:
         return self._unix_s + time.monotonic()
