@@ -65,6 +65,12 @@ def local_from_global(rotations: ArrayLike) -> Array:
     return local
 
 
+def standing_place(offsets: ArrayLike) -> Array:
+    """Place of the pelvis (3,) above the ground of someone who stands straight, metres; offsets (24, 3)."""
+    _, joints = forward_kinematics(np.tile(np.eye(3), (len(JOINTS), 1, 1)), offsets)
+    return np.array([0.0, joints[0, 1] - joints[:, 1].min(), 0.0])
+
+
 # --- the default body ------------------------------------------------------------------------------------
 
 MIN_HEIGHT, MAX_HEIGHT = 0.8, 2.5

@@ -15,7 +15,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.pose import PoseFrame
 from edgepose.rotations import matrix_to_euler_zxy
 from edgepose.sinks import Sink
-from edgepose.skeleton import JOINTS, PARENTS, Body, default_body, forward_kinematics
+from edgepose.skeleton import JOINTS, PARENTS, Body, default_body, standing_place
 
 Array = NDArray[np.float64]
 
@@ -92,9 +92,7 @@ class BvhSink(Sink):
         """
         self._path = str(path)
         offsets = (body or default_body()).offsets.copy()
-        _, joints = forward_kinematics(np.tile(np.eye(3), (len(JOINTS), 1, 1)), offsets)
-        # Where nobody knows a pose's place, the soles of someone who stands straight are near the ground.
-        self._standing = np.array([0.0, -joints[:, 1].min(), 0.0])
+        self._standing = standing_place(offsets)
         self._channels = np.array(depth_first())
         self._before = np.zeros((len(JOINTS), 3))
         self._poses: list[PoseFrame] = []

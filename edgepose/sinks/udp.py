@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import socket
 import struct
+from abc import abstractmethod
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -32,15 +34,14 @@ class Destination(NamedTuple):
     format: str
 
 
-def parse_destination(text: str) -> Destination:
-    """Destination written as "HOST:PORT[,format=json|binary]", an IPv6 address in brackets; JSON by default.
+def parse_address(text: str) -> tuple[str, int]:
+    """Host and port written as "HOST:PORT", an IPv6 address in brackets.
 
     Raises:
         EdgeposeError: not such a text.
     """
-    address, *options = text.split(",")
-    host, colon, port = address.rpartition(":")
-    if not colon or not port or address.endswith("]"):
+    host, colon, port = text.rpartition(":")
+    if not colon or not port or text.endswith("]"):
         raise EdgeposeError(f"no port in {text!r}: write HOST:PORT, for example 127.0.0.1:9000")
     if host.startswith("[") and host.endswith("]"):
         host = host[1:-1]
@@ -50,6 +51,17 @@ def parse_destination(text: str) -> Destination:
         raise EdgeposeError(f"no host in {text!r}: write HOST:PORT, for example 127.0.0.1:9000")
     if not (port.isascii() and port.isdigit() and len(port) <= 5 and 1 <= int(port) <= 65535):
         raise EdgeposeError(f"port {port!r} in {text!r} is not a number from 1 to 65535")
+    return host, int(port)
+
+
+def parse_destination(text: str) -> Destination:
+    """Destination written as "HOST:PORT[,format=json|binary]"; JSON by default, see `parse_address`.
+
+    Raises:
+        EdgeposeError: not such a text.
+    """
+    address, *options = text.split(",")
+    host, port = parse_address(address)
     form = "json"
     for option in options:
         key, _, value = option.partition("=")
@@ -60,7 +72,7 @@ def parse_destination(text: str) -> Destination:
         if value not in ("json", "binary"):
             raise EdgeposeError(f"unknown format {value!r} in {text!r}: choose json or binary")
         form = value
-    return Destination(host, int(port), form)
+    return Destination(host, port, form)
 
 
 def encode_json(pose: PoseFrame) -> bytes:
@@ -102,25 +114,23 @@ def decode_binary(datagram: bytes) -> PoseFrame:
     )
 
 
-class UdpSink(Sink):
+class DatagramSink(Sink):
     """Sends each pose to one address.
 
     A run goes on whether or not anybody listens: datagrams that could not be sent are counted in `unsent`.
     """
 
-    def __init__(self, host: str, port: int, format: str = "json") -> None:
+    def __init__(self, host: str, port: int) -> None:
         """Resolve the host, once.
 
         Args:
             host: name or address. A name with addresses of both kinds stands for its IPv4 one, which most
                 receivers listen on.
             port: UDP port.
-            format: "json" or "binary".
 
         Raises:
             EdgeposeError: unknown host or no network to reach it.
         """
-        self._encode = {"json": encode_json, "binary": encode_binary}[format]
         self.unsent = 0
         try:
             found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
@@ -137,13 +147,17 @@ class UdpSink(Sink):
                 f"cannot send poses to {host} port {port}: {error.strerror or error}"
             ) from error
 
+    @abstractmethod
+    def encode(self, pose: PoseFrame) -> Sequence[bytes]:
+        """The datagrams of a pose."""
+
     def write(self, pose: PoseFrame) -> None:
         """Send a pose."""
-        datagram = self._encode(pose)
-        try:
-            self._send(datagram)
-        except OSError:
-            self.unsent += 1
+        for datagram in self.encode(pose):
+            try:
+                self._send(datagram)
+            except OSError:
+                self.unsent += 1
 
     def close(self) -> None:
         """Close the socket."""
@@ -156,6 +170,19 @@ class UdpSink(Sink):
             # The answer to the datagram before, with nobody listening then; this one has not left yet.
             self.unsent += 1
             self._socket.send(datagram)
+
+
+class UdpSink(DatagramSink):
+    """Sends each pose as one datagram, JSON or binary."""
+
+    def __init__(self, host: str, port: int, format: str = "json") -> None:
+        """Resolve the host; `format` is "json" or "binary". See `DatagramSink`."""
+        self._encode = {"json": encode_json, "binary": encode_binary}[format]
+        super().__init__(host, port)
+
+    def encode(self, pose: PoseFrame) -> Sequence[bytes]:
+        """The datagram of a pose."""
+        return (self._encode(pose),)
 
 
 @lru_cache(maxsize=64)

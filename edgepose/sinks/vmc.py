@@ -1,0 +1,108 @@
+"""Poses by the VMC protocol (Virtual Motion Capture, OSC over UDP), which programs for VRM avatars read.
+
+Version 2.0 of https://protocol.vmc.info; what is sent is described in docs/outputs.md.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+
+import numpy as np
+
+from edgepose.pose import PoseFrame
+from edgepose.rotations import matrix_to_quat
+from edgepose.sinks.udp import DatagramSink
+from edgepose.skeleton import JOINTS, Body, default_body, standing_place
+
+BONES = {
+    "Hips": "pelvis",
+    "LeftUpperLeg": "left_hip",
+    "RightUpperLeg": "right_hip",
+    "Spine": "spine1",
+    "LeftLowerLeg": "left_knee",
+    "RightLowerLeg": "right_knee",
+    "Chest": "spine2",
+    "LeftFoot": "left_ankle",
+    "RightFoot": "right_ankle",
+    "LeftToes": "left_foot",
+    "RightToes": "right_foot",
+    "Neck": "neck",
+    "LeftShoulder": "left_collar",
+    "RightShoulder": "right_collar",
+    "Head": "head",
+    "LeftUpperArm": "left_shoulder",
+    "RightUpperArm": "right_shoulder",
+    "LeftLowerArm": "left_elbow",
+    "RightLowerArm": "right_elbow",
+    "LeftHand": "left_wrist",
+    "RightHand": "right_wrist",
+}
+"""Bones of VRM's humanoid and the joints that turn them.
+
+spine3 would be UpperChest, which an avatar may lack; Chest turns by spine2 and spine3 together instead, so
+that head and arms point the same way on every avatar.
+"""
+
+_INDEX = [JOINTS.index(joint) for joint in BONES.values()]
+_CHEST, _UPPER_CHEST = JOINTS.index("spine2"), JOINTS.index("spine3")
+_ON_UPPER_CHEST = [JOINTS.index(name) for name in ("neck", "left_collar", "right_collar")]
+
+TO_UNITY = np.array([-1.0, 1.0, 1.0])
+"""Ours is X left, Y up, Z forward; Unity's is X right: points are mirrored, turns about Y and Z reverse."""
+
+
+def _string(text: str) -> bytes:
+    data = text.encode() + b"\0"
+    return data + bytes(-len(data) % 4)
+
+
+def _bundle(messages: Sequence[bytes]) -> bytes:
+    """An OSC bundle that is due at once."""
+    parts = [b"#bundle\0", struct.pack(">Q", 1)]
+    for message in messages:
+        parts += [struct.pack(">i", len(message)), message]
+    return b"".join(parts)
+
+
+_BONE_HEADS = [_string("/VMC/Ext/Bone/Pos") + _string(",sfffffff") + _string(bone) for bone in BONES]
+_ROOT = _string("/VMC/Ext/Root/Pos") + _string(",sfffffff") + _string("root")
+_ROOT += struct.pack(">7f", 0, 0, 0, 0, 0, 0, 1)
+_OK = _string("/VMC/Ext/OK") + _string(",i") + struct.pack(">i", 1)
+_TIME = _string("/VMC/Ext/T") + _string(",f")
+_HALF = (len(BONES) + 1) // 2
+"""Bones in the first datagram: more would not fit into an Ethernet frame with the rest."""
+
+
+class VmcSink(DatagramSink):
+    """Sends each pose as two bundles to one address; see `DatagramSink`."""
+
+    def __init__(self, host: str, port: int, body: Body | None = None) -> None:
+        """Resolve the host.
+
+        Args:
+            host: name or address.
+            port: UDP port.
+            body: whose bone lengths are sent; the default body if None.
+        """
+        offsets = (body or default_body()).offsets.copy()
+        self._standing = standing_place(offsets)
+        offsets[_ON_UPPER_CHEST] += offsets[_UPPER_CHEST]
+        self._places = offsets[_INDEX] * TO_UNITY
+        self._start_s: float | None = None
+        super().__init__(host, port)
+
+    def encode(self, pose: PoseFrame) -> Sequence[bytes]:
+        """The two bundles of a pose."""
+        if self._start_s is None:
+            self._start_s = pose.time_s
+        rotations = pose.rotations.copy()
+        rotations[_CHEST] = rotations[_CHEST] @ rotations[_UPPER_CHEST]
+        w, x, y, z = matrix_to_quat(rotations[_INDEX]).T
+        places = self._places.copy()
+        places[0] = (self._standing if pose.translation is None else pose.translation) * TO_UNITY
+        numbers = np.column_stack([places, x, -y, -z, w]).astype(">f4")
+        bones = [head + row.tobytes() for head, row in zip(_BONE_HEADS, numbers, strict=True)]
+        # Relative, because single precision keeps no fractions of a second of Unix time.
+        time_s = _TIME + struct.pack(">f", pose.time_s - self._start_s)
+        return _bundle([_OK, time_s, _ROOT, *bones[:_HALF]]), _bundle([time_s, *bones[_HALF:]])
