@@ -1,0 +1,305 @@
+"""Orientation of one sensor from its gyroscope, accelerometer and magnetometer: a Kalman filter on errors.
+
+Every sample is integrated as it comes. Block by block (0.14 s) the errors of what was integrated are
+estimated and taken out: by a velocity that has to stay near zero, which tells tilt from acceleration; by the
+rate at rest; by the heading of a magnetic field that is as usual.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from math import atan2, hypot, inf, pi
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from edgepose import rotations as rot
+from edgepose.orientation import error_model as model
+from edgepose.orientation.columns import NO_FIELD, columns
+from edgepose.orientation.intake import FieldWatch, Intake
+from edgepose.orientation.magnetic import MagneticReference
+from edgepose.orientation.rest import RestDetector
+from edgepose.orientation.result import Event, Oriented
+from edgepose.orientation.settings import FilterSettings
+
+Array = NDArray[np.float64]
+
+_UP = np.array([0.0, 0.0, 1.0])
+_LEAST_FORCE = 1.0  # m/s^2; less has no direction
+_GAP, _SATURATED, _MAG_LOST, _RESTART = (
+    int(e) for e in (Event.GAP, Event.SATURATED, Event.MAG_LOST, Event.RESTART)
+)
+
+
+class Step(NamedTuple):
+    """A correction, for smoothing.
+
+    Attributes:
+        row: the sample after which it was made, counted from the filter's first.
+        matrix: (15, 15) what became of errors since the step before; None where the filter began anew.
+        predicted: (15, 15) covariance before the correction.
+        error: (15,) the error that was found and taken out.
+        covariance: (15, 15) after it.
+        bias: (3,) gyroscope bias after it, rad/s.
+        turned: heading that the step gave to the inertial frame (the first field after a time without),
+            rad; in it are all errors from here on.
+    """
+
+    row: int
+    matrix: Array | None
+    predicted: Array
+    error: Array
+    covariance: Array
+    bias: Array
+    turned: float = 0.0
+
+
+class OrientationFilter:
+    """One sensor, online and causal: a sample's orientation follows from it and those before it.
+
+    Any chunking of the same samples gives the same result. What happens to bad samples, gaps and stamps is
+    in `Event`. A rate counts as the mean since the sample before, which is what sensors send that integrate
+    or average; of others the orientation is late by half an interval.
+
+    Attributes:
+        on_step: called after each correction, if set.
+    """
+
+    def __init__(self, settings: FilterSettings | None = None) -> None:
+        """Start with nothing known."""
+        # Most commands never filter.
+        from filterpy.kalman import KalmanFilter
+
+        self.on_step: Callable[[Step], None] | None = None
+        self._settings = settings or FilterSettings()
+        self._kalman = KalmanFilter(dim_x=model.SIZE, dim_z=3)
+        self._kalman.x = np.zeros(model.SIZE)
+        self._intake = Intake(self._settings)
+        self._rest = RestDetector(self._settings)
+        self._watch = FieldWatch(self._settings)
+        self._reference = MagneticReference(self._settings)
+        self._row = self._last = 0  # number of the sample, of the last good one
+        self._started = False
+        self._quat: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
+        self._rate: Sequence[float] = (0.0, 0.0, 0.0)  # of the sample before
+        self._velocity = np.zeros(3)
+        self._bias = np.zeros(3)
+        self._bias_sigma = np.full(3, self._settings.bias_start)
+        self._acc_bias = np.zeros(3)
+        self._scale = np.zeros(3)
+        # The same as floats: the loop over samples has no arrays in it.
+        self._correction = (1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
+        self._has_heading = False
+        self._field_age_s = 0.0  # of the last one that was used or rejected
+        self._begin_block()
+
+    def _begin_block(self) -> None:
+        self._block: list[tuple[float, ...]] = []  # dt, gyr, acc, mag
+        self._quats = [self._quat]
+        self._block_s = 0.0
+        self._lost_angle = self._lost_speed = 0.0
+
+    def update(
+        self, time_s: ArrayLike, gyr: ArrayLike, acc: ArrayLike, mag: ArrayLike | None = None
+    ) -> Oriented:
+        """Orientations of the next samples.
+
+        Args:
+            time_s: (N,) times of the measurements, s.
+            gyr: (N, 3) rates, sensor frame, rad/s.
+            acc: (N, 3) specific force, sensor frame, m/s^2.
+            mag: (N, 3) magnetic field, sensor frame, any one unit; rows of NaN where it was not measured.
+
+        Raises:
+            ValueError: the shapes do not go together.
+        """
+        times, rates, forces, fields = columns(time_s, gyr, acc, mag)
+        quats, flags, which = [], [], []
+        known = [self._known()]  # changes with corrections only
+        for sample in zip(times, rates, forces, fields, strict=True):
+            events, corrected = self._take(*sample)
+            if corrected:
+                known.append(self._known())
+            quats.append(self._quat)
+            flags.append(events)
+            which.append(len(known) - 1)
+        bias, sigma, rest, disturbed = (np.array(column)[which] for column in zip(*known, strict=True))
+        return Oriented(
+            np.array(quats).reshape(-1, 4), bias, sigma, rest, disturbed, np.array(flags, np.uint8)
+        )
+
+    def _known(self) -> tuple[Array, Array, bool, bool]:
+        return (
+            self._bias,
+            self._bias_sigma,
+            self._rest.rest,
+            self._reference.disturbed and not self._watch.lost,
+        )
+
+    def _take(
+        self, time_s: float, gyr: Sequence[float], acc: Sequence[float], mag: Sequence[float]
+    ) -> tuple[int, bool]:
+        """Events of a sample, and whether corrections were made."""
+        s = self._settings
+        events, dt = self._intake.check(time_s, gyr, acc)
+        corrected = False
+        if dt == inf:
+            corrected = True
+            events |= _RESTART if self._started else 0
+            self._restart(acc, mag)
+        elif dt > 0.0:
+            rate = gyr
+            if events & _GAP:
+                rate = [0.5 * (a + b) for a, b in zip(gyr, self._rate, strict=True)]
+                self._lost_angle = min(self._lost_angle + s.gap_turn * dt * dt, pi)
+                self._lost_speed += s.gap_acc * dt
+            if events & _SATURATED:
+                self._lost_angle = min(self._lost_angle + s.lost_share * hypot(*gyr) * dt, pi)
+                self._lost_speed += s.lost_share * hypot(*acc) * dt
+            kx, ky, kz, bx, by, bz = self._correction
+            x, y, z = rate
+            self._quat = rot.turn(self._quat, (kx * x - bx) * dt, (ky * y - by) * dt, (kz * z - bz) * dt)
+            self._quats.append(self._quat)
+            if not self._watch.check(dt, mag):
+                mag = NO_FIELD
+            self._block.append((dt, *rate, *acc, *mag))
+            self._block_s += dt
+            if self._block_s >= s.block_s:
+                self._correct(self._row)
+                corrected = True
+        if dt > 0.0:
+            self._rate, self._last = gyr, self._row
+        self._row += 1
+        return events | (_MAG_LOST if self._watch.lost else 0), corrected
+
+    # --- beginning and beginning anew -----------------------------------------------------------------------
+
+    def _restart(self, acc: Sequence[float], mag: Sequence[float]) -> None:
+        """Take the tilt from a force, and at the very first sample the heading from the field."""
+        s = self._settings
+        if self._block:
+            self._correct(self._last)
+        self._quat = _levelled(self._quat, acc)
+        covariance = model.start_covariance(s, 0.0)
+        if self._started:
+            before = self._kalman.P
+            heading = min(before[model.HEADING, model.HEADING] + s.heading_start**2, pi**2)
+            for part in (model.BIAS, model.ACC_BIAS, model.SCALE):
+                covariance[part, part] = before[part, part]
+            covariance[model.HEADING, model.HEADING] = heading
+        self._kalman.P = covariance
+        self._velocity = np.zeros(3)
+        self._rest.restart()
+        self._started = True
+        if self._watch.check(0.0, mag) and not self._has_heading:
+            self._find_north(rot.quat_rotate(self._quat, mag), self._row)
+            return
+        self._tell(self._row, None, covariance, np.zeros(model.SIZE))
+        self._begin_block()
+
+    def _find_north(self, field: Array, row: int) -> None:
+        """Turn the inertial frame's Y axis to a field's direction, which is the first one."""
+        angle = atan2(field[0], field[1])
+        turn = rot.about_z(angle)
+        self._quat = tuple(rot.quat_multiply(turn, self._quat).tolist())
+        self._velocity = rot.quat_rotate(turn, self._velocity)
+        frame = np.eye(model.SIZE)
+        frame[model.TURN, model.TURN] = frame[model.VEL, model.VEL] = rot.quat_to_matrix(turn)
+        frame[model.HEADING] = 0.0
+        covariance = frame @ self._kalman.P @ frame.T
+        covariance[model.HEADING, model.HEADING] = self._settings.heading_start**2
+        self._kalman.P = covariance
+        self._has_heading = True
+        self._tell(row, None, covariance, np.zeros(model.SIZE), angle)
+        self._begin_block()
+
+    # --- corrections ----------------------------------------------------------------------------------------
+
+    def _correct(self, row: int) -> None:
+        """Close the block: estimate the errors at its end and take them out."""
+        kalman, s = self._kalman, self._settings
+        block = np.array(self._block)
+        dt, gyr, acc, mag = block[:, 0], block[:, 1:4], block[:, 4:7], block[:, 7:10]
+        quats = np.array(self._quats)
+        quats[:-1] += quats[1:]  # becomes the middles, and at the end the end
+        quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+        rotations = rot.quat_to_matrix(quats)
+        rotation, last = rotations[:-1], rotations[-1]
+        grown = model.transition(dt, rotation, gyr, acc - self._acc_bias)
+        rate = float(np.linalg.norm(gyr - self._bias, axis=1).mean())
+        noise = model.process_noise(s, self._block_s, rate, self._lost_angle, self._lost_speed)
+        self._velocity = self._velocity + grown.velocity
+        self._rest.update(self._block_s, gyr, acc, self._bias, float(self._bias_sigma.max()))
+        kalman.predict(F=grown.matrix, Q=noise)
+        field = self._mean_field(rotation, mag)
+        self._field_age_s += self._block_s
+        states, errors, variances = self._measure(field, rate)
+        kalman.dim_z = len(states)  # filterpy 1.4.5 compares it with the measurement
+        kalman.update(np.array(errors), R=np.diag(variances), H=np.eye(model.SIZE)[states])
+        kalman.P = 0.5 * (kalman.P + kalman.P.T)
+        self._take_out(kalman.x, last)
+        self._tell(row, grown.matrix, kalman.P_prior, kalman.x)
+        kalman.x = np.zeros(model.SIZE)
+        self._begin_block()
+        if field is not None and not self._has_heading:
+            self._find_north(field, row)
+
+    def _mean_field(self, rotation: Array, mag: Array) -> Array | None:
+        """Mean field (3,) of a block in the inertial frame; None if there is none."""
+        there = ~np.isnan(mag[:, 0])
+        if not there.any():
+            return None
+        field: Array = np.einsum("nij,nj->i", rotation[there], mag[there]) / there.sum()
+        return field
+
+    def _measure(self, field: Array | None, rate: float) -> tuple[list[int], list[float], list[float]]:
+        """Which errors are measured, what they are, and their variances."""
+        s, rest = self._settings, self._rest
+        per_block = max(1.0, s.block_s / self._block_s)
+        states, errors = [6, 7, 8], (-self._velocity).tolist()
+        if rest.rest:
+            variances = [s.rest_vel**2 * per_block] * 3
+            states += [3, 4, 5]
+            errors += (rest.rate * (1.0 - self._scale) - self._bias).tolist()
+            variances += [(s.rest_rate**2 + rest.rate_sigma**2) * per_block] * 3
+        else:
+            variances = [s.vel**2 * max(1.0, s.vel_time / self._block_s)] * 3
+        if field is not None and self._has_heading:
+            heading = self._reference.heading(field.tolist(), self._field_age_s, rate)
+            self._field_age_s = 0.0
+            if heading is not None:
+                states.append(model.HEADING)
+                errors.append(heading[0])
+                variances.append(heading[1])
+        return states, errors, variances
+
+    def _take_out(self, error: Array, rotation: Array) -> None:
+        """Correct the state by errors, at an orientation (3, 3)."""
+        quat = rot.turn(self._quat, *(error[model.TURN] @ rotation).tolist())
+        size = hypot(*quat)
+        self._quat = (quat[0] / size, quat[1] / size, quat[2] / size, quat[3] / size)
+        self._bias = self._bias + error[model.BIAS]
+        self._velocity = self._velocity + error[model.VEL]
+        self._acc_bias = self._acc_bias + error[model.ACC_BIAS]
+        self._scale = self._scale + error[model.SCALE]
+        self._bias_sigma = np.sqrt(np.diag(self._kalman.P)[model.BIAS])
+        self._correction = (*(1.0 - self._scale).tolist(), *self._bias.tolist())
+
+    def _tell(
+        self, row: int, matrix: Array | None, predicted: Array, error: Array, turned: float = 0.0
+    ) -> None:
+        if self.on_step is not None:
+            self.on_step(Step(row, matrix, predicted, error, self._kalman.P, self._bias, turned))
+
+
+def _levelled(quat: tuple[float, ...], acc: Sequence[float]) -> tuple[float, ...]:
+    """An orientation (4,) turned the shortest way so that a force points up."""
+    force = rot.quat_rotate(quat, acc)
+    if np.linalg.norm(force) < _LEAST_FORCE:
+        return quat
+    try:
+        turn = rot.matrix_to_quat(rot.minimal_rotation(force, _UP))
+    except ValueError:  # upside down: any way is the shortest
+        turn = np.array([0.0, 1.0, 0.0, 0.0])
+    return tuple(rot.quat_multiply(turn, quat).tolist())

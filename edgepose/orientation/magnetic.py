@@ -1,0 +1,89 @@
+"""Which magnetic fields to take a heading from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import atan2, degrees, hypot
+
+from edgepose.orientation.settings import FilterSettings
+
+
+class _Field:
+    """Strength and dip of a field, averaged."""
+
+    def __init__(self, norm: float, dip: float) -> None:
+        self.norm, self.dip = norm, dip
+        self.time_s = 0.0
+
+    def follow(self, norm: float, dip: float, duration_s: float, longest_s: float) -> None:
+        self.time_s += duration_s
+        share = duration_s / min(self.time_s, longest_s)
+        self.norm += share * (norm - self.norm)
+        self.dip += share * (dip - self.dip)
+
+
+class MagneticReference:
+    """Knows the usual field, tells others from it, and takes a new one for the usual one in time.
+
+    Attributes:
+        disturbed: whether the field of the last block is not the usual one.
+    """
+
+    def __init__(self, settings: FilterSettings) -> None:
+        """Start with no field seen."""
+        self.disturbed = False
+        self._settings = settings
+        self._usual: _Field | None = None
+        self._other = _Field(0.0, 0.0)
+        self._good_s = settings.mag_good_s
+        self._rejected_s = 0.0
+
+    def heading(self, field: Sequence[float], duration_s: float, rate: float) -> tuple[float, float] | None:
+        """Heading error, rad, that the mean field of a block shows, and its variance; None if not to be used.
+
+        Args:
+            field: as the present orientation turns it to the inertial frame.
+            duration_s: since the last field.
+            rate: mean magnitude of the rotation, rad/s.
+        """
+        s = self._settings
+        x, y, z = field
+        level = hypot(x, y)
+        norm, dip = hypot(level, z), atan2(-z, level)
+        if self._usual is None:
+            self._usual = _Field(norm, dip)
+        usual = self._usual
+        if self._is_like(usual, norm, dip):
+            self._good_s += duration_s
+            self.disturbed = self._good_s < s.mag_good_s
+            if not self.disturbed:
+                usual.follow(norm, dip, duration_s, s.mag_reference_s)
+        else:
+            self._good_s, self.disturbed = 0.0, True
+        self._follow_other(norm, dip, duration_s, rate)
+        usual = self._usual
+        if self.disturbed:
+            self._rejected_s = min(self._rejected_s + duration_s, s.mag_reject_s)
+            if self._rejected_s < s.mag_reject_s:
+                return None
+        else:
+            self._rejected_s = max(self._rejected_s - duration_s, 0.0)
+        percent = 100.0 * (norm / usual.norm - 1.0)
+        soft = 1.0 + s.mag_soft * (percent**2 + degrees(dip - usual.dip) ** 2)
+        return atan2(x, y), s.mag_heading**2 * max(1.0, s.mag_time / duration_s) * soft
+
+    def _follow_other(self, norm: float, dip: float, duration_s: float, rate: float) -> None:
+        """Watch the present field, and take it as the usual one if it lasts."""
+        s = self._settings
+        if not self._is_like(self._other, norm, dip):
+            self._other = _Field(norm, dip)
+        elif rate >= s.mag_new_rate:
+            # A sensor that lies beside a magnet would see the same field for ever.
+            self._other.follow(norm, dip, duration_s, s.mag_reference_s)
+        if self.disturbed and self._other.time_s >= s.mag_new_s:
+            self._usual, self._other = self._other, _Field(norm, dip)
+            self._good_s, self.disturbed, self._rejected_s = s.mag_good_s, False, 0.0
+
+    def _is_like(self, field: _Field, norm: float, dip: float) -> bool:
+        s = self._settings
+        return abs(norm - field.norm) < s.mag_norm * field.norm and abs(dip - field.dip) < s.mag_dip

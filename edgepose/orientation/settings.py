@@ -1,0 +1,93 @@
+"""Constants of the orientation filter, in physical units: none depends on a sensor's rate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import radians
+
+
+@dataclass(frozen=True)
+class FilterSettings:
+    """What the filter assumes of a sensor that nobody tuned it for; SI units.
+
+    Attributes:
+        block_s: time between corrections, s. Orientations are integrated at every sample.
+        gyr_noise: growth of the orientation's error, rad / sqrt(s).
+        gyr_noise_per_rate: the same in addition for each rad/s of rotation, 1 / sqrt(s).
+        vel_noise: growth of the velocity's error, m/s / sqrt(s).
+        bias_start: what the gyroscope's bias may be at first, one sigma, rad/s.
+        bias_walk: how it changes, rad/s / sqrt(s).
+        scale_start: relative error of the gyroscope's scale, one sigma, per axis.
+        scale_walk: how it changes, 1 / sqrt(s).
+        acc_bias_start: what the accelerometer's bias may be, one sigma per axis, m/s^2.
+        acc_bias_walk: how it changes, m/s^2 / sqrt(s).
+        tilt_start: error of the tilt taken from the first sample's force, one sigma, rad.
+        heading_start: error of the heading taken from the first field, one sigma, rad.
+        vel: how fast the sensor is, one sigma, m/s: a body does not go far in a room.
+        vel_time: how long a velocity lasts, s.
+        rest_gyr: greatest change of the rate at rest, rad/s.
+        rest_acc: greatest change of the force at rest, m/s^2.
+        rest_time: how long both hold before it is rest, s.
+        rest_bias: greatest rate at rest beyond what the known bias explains, rad/s.
+        rest_bias_first: greatest rate at the first rest, when the bias is not known yet, rad/s.
+        rest_rate: error of the bias measured in a block at rest, one sigma, rad/s.
+        rest_vel: error of a velocity of zero in a block at rest, one sigma, m/s.
+        mag_heading: error of the heading of a good field, one sigma, rad.
+        mag_time: how long such an error lasts, s.
+        mag_norm: relative change of the field's strength that makes it a disturbed one.
+        mag_dip: change of its dip that does, rad.
+        mag_soft: growth of the heading's variance with the square of the change, per percent of strength and
+            per degree of dip.
+        mag_good_s: time without a disturbance before a field is trusted again, s.
+        mag_reference_s: time constant of the undisturbed field's strength and dip, s.
+        mag_new_s: time after which a field that stays what it is while the sensor turns is the new
+            reference, s.
+        mag_new_rate: how fast a sensor must turn for that, rad/s.
+        mag_reject_s: longest time that a disturbed field is not used, s.
+        mag_lost_s: time without a reading after which the magnetometer counts as lost, s.
+        gap_periods: interval between samples, in usual periods, from which on samples are missing.
+        gap_turn: how fast rotation changes unseen in a gap, rad/s^2.
+        gap_acc: acceleration not seen in a gap, m/s^2.
+        restart_s: gap after which the tilt is taken anew from the force, s.
+        lost_share: what is not seen of a rate or a force at the end of its range, as a share of it.
+        shock: force from which on the accelerometer is not believed, m/s^2.
+    """
+
+    block_s: float = 0.14
+    gyr_noise: float = radians(0.2)
+    gyr_noise_per_rate: float = 0.01
+    vel_noise: float = 0.03
+    bias_start: float = radians(1.0)
+    bias_walk: float = radians(0.002)
+    scale_start: float = 0.005
+    scale_walk: float = 2e-5
+    acc_bias_start: float = 0.1
+    acc_bias_walk: float = 1e-3
+    tilt_start: float = radians(10.0)
+    heading_start: float = radians(30.0)
+    vel: float = 1.0
+    vel_time: float = 1.0
+    rest_gyr: float = radians(2.0)
+    rest_acc: float = 0.5
+    rest_time: float = 1.5
+    rest_bias: float = radians(2.0)
+    rest_bias_first: float = radians(20.0)
+    rest_rate: float = radians(0.03)
+    rest_vel: float = 0.02
+    mag_heading: float = radians(5.0)
+    mag_time: float = 20.0
+    mag_norm: float = 0.1
+    mag_dip: float = radians(5.0)
+    mag_soft: float = 0.5
+    mag_good_s: float = 0.5
+    mag_reference_s: float = 40.0
+    mag_new_s: float = 20.0
+    mag_new_rate: float = radians(20.0)
+    mag_reject_s: float = 60.0
+    mag_lost_s: float = 1.0
+    gap_periods: float = 1.75
+    gap_turn: float = 10.0
+    gap_acc: float = 5.0
+    restart_s: float = 1.0
+    lost_share: float = 0.3
+    shock: float = 100.0

@@ -1,0 +1,136 @@
+"""VQF (Laidig and Seel, Information Fusion 91, 2023) in the place of the Kalman filter.
+
+The `vqf` package has one fixed sampling time. It is measured over the first samples; after that a sample
+counts for as many steps as fit into its interval, its rate scaled so that the angle is that of the real
+interval. VQF's own time constants are as far off as the rate changes after the first samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import inf
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from edgepose import rotations as rot
+from edgepose.errors import EdgeposeError
+from edgepose.orientation.columns import columns
+from edgepose.orientation.intake import FieldWatch, Intake
+from edgepose.orientation.result import Event, Oriented
+from edgepose.orientation.settings import FilterSettings
+
+Array = NDArray[np.float64]
+
+_LEARNT = 20  # samples
+_FIRST_PERIOD_S = 0.01
+_MAG_LOST, _RESTART = int(Event.MAG_LOST), int(Event.RESTART)
+
+_Timed = tuple[float, Sequence[float], Sequence[float], Sequence[float] | None]  # interval, gyr, acc, mag
+
+
+class VqfFilter:
+    """One sensor; takes and gives what `OrientationFilter` does, with VQF's default parameters."""
+
+    def __init__(self, settings: FilterSettings | None = None) -> None:
+        """Start with nothing known; of the settings those of gaps, stamps and losses count.
+
+        Raises:
+            EdgeposeError: the vqf package is not installed.
+        """
+        try:
+            from vqf import VQF
+        except ImportError:
+            raise EdgeposeError(
+                "--filter vqf needs the vqf package: pip install 'edgepose[vqf]', or use --filter kalman"
+            ) from None
+        self._class: Any = VQF
+        settings = settings or FilterSettings()
+        self._intake = Intake(settings)
+        self._watch = FieldWatch(settings)
+        self._period_s = self._mag_period_s = _FIRST_PERIOD_S
+        self._vqf = self._new()
+        self._learning: list[_Timed] | None = []
+        self._started = False
+        self._heading = 0.0  # of VQF's frame without a magnetometer in that of the first sample
+        self._quat = np.array([1.0, 0.0, 0.0, 0.0])
+
+    def update(
+        self, time_s: ArrayLike, gyr: ArrayLike, acc: ArrayLike, mag: ArrayLike | None = None
+    ) -> Oriented:
+        """Orientations of the next samples; arguments as in `OrientationFilter.update`.
+
+        Raises:
+            ValueError: the shapes do not go together.
+        """
+        rows = [self._take(*sample) for sample in zip(*columns(time_s, gyr, acc, mag), strict=True)]
+        count = len(rows)
+        quat, bias, sigma, rest, disturbed, flags = zip(*rows, strict=True) if rows else ((),) * 6
+        return Oriented(
+            np.array(quat).reshape(count, 4),
+            np.array(bias).reshape(count, 3),
+            np.repeat(np.array(sigma, float)[:, None], 3, axis=1),
+            np.array(rest, bool),
+            np.array(disturbed, bool),
+            np.array(flags, np.uint8),
+        )
+
+    def _take(
+        self, time_s: float, gyr: Sequence[float], acc: Sequence[float], mag: Sequence[float]
+    ) -> tuple[Array, Array, float, bool, bool, int]:
+        events, dt = self._intake.check(time_s, gyr, acc)
+        if dt > 0.0:
+            is_field = self._watch.check(0.0 if dt == inf else dt, mag)
+            if dt == inf:
+                events |= _RESTART if self._started else 0
+                self._begin()
+                dt = self._period_s
+            sample = (dt, gyr, acc, mag if is_field else None)
+            self._feed(sample)
+            self._learn(sample)
+            if self._watch.seen:
+                self._quat = self._vqf.getQuat9D()
+            else:
+                self._quat = rot.quat_multiply(rot.about_z(self._heading), self._vqf.getQuat6D())
+        bias, sigma = self._vqf.getBiasEstimate()
+        disturbed = self._watch.seen and not self._watch.lost and self._vqf.getMagDistDetected()
+        events |= _MAG_LOST if self._watch.lost else 0
+        return self._quat, bias, sigma, self._vqf.getRestDetected(), disturbed, events
+
+    def _begin(self) -> None:
+        """A new VQF, which takes the tilt from the next force, but keeps the bias and the heading."""
+        if self._started:
+            known = self._vqf.getBiasEstimate()
+            self._vqf = self._new()
+            self._vqf.setBiasEstimate(*known)
+            self._heading = float(rot.heading(self._quat))
+        self._started = True
+
+    def _new(self) -> Any:
+        return self._class(self._period_s, magTs=self._mag_period_s)
+
+    def _feed(self, sample: _Timed) -> None:
+        dt, gyr, acc, mag = sample
+        steps = max(1, round(dt / self._period_s))
+        rate = np.array(gyr) * (dt / (steps * self._period_s))
+        force = np.array(acc)
+        for _ in range(steps):
+            self._vqf.update(rate, force)
+        if mag is not None:
+            self._vqf.updateMag(np.array(mag))
+
+    def _learn(self, sample: _Timed) -> None:
+        """Measure the sampling time over the first samples, then run these again with it."""
+        if self._learning is None:
+            return
+        self._learning.append(sample)
+        if len(self._learning) > _LEARNT:
+            first, *others = self._learning
+            self._learning = None
+            self._period_s = float(np.median([dt for dt, *_ in others]))
+            fields = sum(mag is not None for *_, mag in others)
+            self._mag_period_s = self._period_s * len(others) / max(fields, 1)
+            self._vqf = self._new()
+            for again in ((self._period_s, *first[1:]), *others):
+                self._feed(again)
