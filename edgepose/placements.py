@@ -10,3 +10,12 @@ BONES = (18, 19, 4, 5, 15, 0)
 
 ROOT = PLACEMENTS.index("pelvis")
 """Index of the root sensor."""
+
+SITES = {
+    **dict(zip(PLACEMENTS, BONES, strict=True)),
+    "chest": 9, "left_shoulder": 13, "right_shoulder": 14, "left_upper_arm": 16, "right_upper_arm": 17,
+    "left_hand": 20, "right_hand": 21, "left_upper_leg": 1, "right_upper_leg": 2, "left_foot": 7,
+    "right_foot": 8,
+}  # fmt: skip
+"""All bones that a sensor can be named by and the SMPL joints that turn them; only `edgepose solve` takes
+more than the six."""

@@ -11,7 +11,7 @@ import heapq
 import sys
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from math import inf, nan
 from operator import attrgetter
@@ -103,14 +103,24 @@ def salvage_recording(path: Path | str) -> Recording:
     return _read(Path(path), salvage=True)
 
 
+def read_sensors(path: Path | str, names: Sequence[str]) -> Recording:
+    """Recording of any of the named sensors, as `read_recording` reads those of the six placements.
+
+    Raises:
+        EdgeposeError: the file cannot be read, or holds anything else than a recording of such sensors.
+    """
+    return _read(Path(path), salvage=False, names=names)
+
+
 def missing_sensors(recording: Recording) -> list[str]:
     """Placements of which there is no sample."""
     return [name for name in PLACEMENTS if name not in recording.sensors]
 
 
-def _read(path: Path, salvage: bool) -> Recording:
+def _read(path: Path, salvage: bool, names: Sequence[str] = PLACEMENTS) -> Recording:
     try:
-        return _read_npz(path, salvage) if path.suffix.lower() == ".npz" else _read_csv(path, salvage)
+        read = _read_npz if path.suffix.lower() == ".npz" else _read_csv
+        return read(path, salvage, names)
     except (OSError, UnicodeDecodeError) as error:
         raise EdgeposeError(f"{path}: cannot read it: {getattr(error, 'strerror', None) or error}") from None
 
@@ -195,7 +205,7 @@ def write_csv(path: Path | str, recording: Recording) -> None:
         file.writelines(map(csv_row, samples(recording)))
 
 
-def _read_csv(path: Path, salvage: bool) -> Recording:
+def _read_csv(path: Path, salvage: bool, names: Sequence[str]) -> Recording:
     # Bytes that are no UTF-8 become a mark that is no number either.
     opened = (
         nullcontext(sys.stdin)
@@ -206,7 +216,7 @@ def _read_csv(path: Path, salvage: bool) -> Recording:
         lines = _Lines(path, file)
         metadata = _read_metadata(path, lines)
         lines.unlimited = salvage
-        table, cut = _read_rows(path, lines, salvage)
+        table, cut = _read_rows(path, lines, salvage, names)
     sensors = table.sensors()  # checks the last rows
     return Recording(sensors, metadata, table.damage() or cut)
 
@@ -262,9 +272,9 @@ def _read_metadata(path: Path, lines: _Lines) -> dict[str, str]:
     raise EdgeposeError(f"{path}: the file is empty; a recording starts with the columns {COLUMNS}")
 
 
-def _read_rows(path: Path, lines: _Lines, salvage: bool) -> tuple[_Table, str | None]:
+def _read_rows(path: Path, lines: _Lines, salvage: bool, names: Sequence[str]) -> tuple[_Table, str | None]:
     """All rows, and what to say if the last one is cut off."""
-    table = _Table(str(path), salvage)
+    table = _Table(str(path), salvage, names)
     rows = csv.reader(lines, quoting=csv.QUOTE_NONE)
     while True:
         try:
@@ -272,7 +282,7 @@ def _read_rows(path: Path, lines: _Lines, salvage: bool) -> tuple[_Table, str | 
             if cells is None:
                 return table, None
             if cells:
-                sensor, numbers = _parse_row(cells, lines.cut)
+                sensor, numbers = _parse_row(cells, lines.cut, names)
                 table.add(sensor, lines.number, numbers, cells.count(""))
         except csv.Error as error:
             table.reject(f"row {lines.number}: {error}")
@@ -287,7 +297,7 @@ def _read_rows(path: Path, lines: _Lines, salvage: bool) -> tuple[_Table, str | 
             )
 
 
-def _parse_row(cells: list[str], cut: bool) -> tuple[str, list[float]]:
+def _parse_row(cells: list[str], cut: bool, names: Sequence[str]) -> tuple[str, list[float]]:
     """Sensor and numbers (time first, NaN where empty) of a row; cut says that the row has no line end.
 
     Raises:
@@ -297,8 +307,8 @@ def _parse_row(cells: list[str], cut: bool) -> tuple[str, list[float]]:
         raise ValueError(f"has {len(cells)} columns and not {_WIDTH}")
     time_s, sensor, *rest = cells
     sensor = sensor.strip('"')  # some programs quote text; a quoted line break cannot be meant here
-    if sensor not in PLACEMENTS:
-        raise ValueError(f"names an unknown sensor {_short(sensor)}; the names are {', '.join(PLACEMENTS)}")
+    if sensor not in names:
+        raise ValueError(f"names an unknown sensor {_short(sensor)}; the names are {', '.join(names)}")
     if cut and (rest[-1] or rest[-2]):
         # Digits may be missing, which nobody can see.
         raise ValueError("has no line end")
@@ -339,9 +349,9 @@ def write_npz(path: Path | str, recording: Recording) -> None:
         np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
-def _read_npz(path: Path, salvage: bool) -> Recording:
+def _read_npz(path: Path, salvage: bool, names: Sequence[str]) -> Recording:
     try:
-        arrays = _load_arrays(path)
+        arrays = _load_arrays(path, names)
     except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, RuntimeError, MemoryError) as error:
         raise EdgeposeError(
             f"{path}: not a whole NPZ file ({error}); what is left of a cut one cannot be read: copy it again"
@@ -351,14 +361,14 @@ def _read_npz(path: Path, salvage: bool) -> Recording:
     for line in _lines_of(path, arrays, "metadata"):
         key, _, value = line.partition(":")
         metadata[key.strip()] = value.strip()
-    table = _Table(str(path), salvage)
-    for placement in PLACEMENTS:
+    table = _Table(str(path), salvage, names)
+    for placement in names:
         if any(f"{placement}_{name}" in arrays for name in QUANTITIES):
             _add_arrays(path, table, placement, arrays, sparse)
     return Recording(table.sensors(), metadata, table.damage())
 
 
-def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
+def _load_arrays(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Arrays of an NPZ file that belong to a recording."""
     with zipfile.ZipFile(path) as archive:
         # Sizes as declared are the most that zipfile unpacks.
@@ -370,9 +380,9 @@ def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
         for key in archive.files:
             placement, _, name = key.rpartition("_")
             is_sensor = name in QUANTITIES or (name == "t" and placement)
-            if is_sensor and placement not in PLACEMENTS:
+            if is_sensor and placement not in names:
                 raise EdgeposeError(
-                    f"{path}: {_short(key)} is of an unknown sensor; the names are {', '.join(PLACEMENTS)}"
+                    f"{path}: {_short(key)} is of an unknown sensor; the names are {', '.join(names)}"
                 )
             if is_sensor or key in ("t", "sparse", "metadata"):
                 result[key] = archive[key]
@@ -426,9 +436,10 @@ class _Table:
         count: good rows so far, save those of the last, unchecked blocks that turn out bad.
     """
 
-    def __init__(self, name: str, salvage: bool = False) -> None:
+    def __init__(self, name: str, salvage: bool = False, names: Sequence[str] = PLACEMENTS) -> None:
         self._name = name
         self._salvage = salvage
+        self._names = names
         self._left_out = 0
         self._problem = ""  # of the first row left out
         self._rows: dict[str, list[list[float]]] = {}
@@ -505,11 +516,11 @@ class _Table:
             raise EdgeposeError(f"{self._name}: more than {MAX_SAMPLES} samples; split the recording")
 
     def sensors(self) -> dict[str, SensorData]:
-        """All data by sensor, in the order of PLACEMENTS."""
+        """All data by sensor, in the order of the names."""
         for sensor in self._rows:
             self._close(sensor)
         result = {}
-        for sensor in PLACEMENTS:
+        for sensor in self._names:
             blocks = self._blocks.get(sensor)
             if not blocks:
                 continue
