@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
+FILTERS = ("none", "kalman", "vqf")
+"""What makes orientations of samples: the devices themselves, or a filter here."""
+
 
 class ImuSample(NamedTuple):
     """One reading of one sensor, in SI units.

@@ -9,12 +9,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from edgepose.calibration import Calibration, apply
+from edgepose.calibration import apply
 from edgepose.engine import Engine, EngineOutput
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuFrame, ImuSample
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseFrame
+from edgepose.rezero import Headings
+from edgepose.silence import Silences
 from edgepose.sinks import Sink
 from edgepose.sync import FrameClock
 
@@ -63,9 +65,11 @@ def status(frame: ImuFrame, filling: bool) -> str:
 def run(
     source: Iterable[tuple[float, list[ImuSample]]],
     clock: FrameClock,
-    calibration: Calibration,
+    headings: Headings,
     engine: Engine,
     sinks: list[Sink],
+    orient: Callable[[list[ImuSample]], list[ImuSample]] = lambda samples: samples,
+    tell: Callable[[str], None] = lambda text: None,
     on_pose: Callable[[RunSummary], None] = lambda summary: None,
     stopped: Callable[[], bool] = lambda: False,
     behind_s: Callable[[], float] = lambda: 0.0,
@@ -78,14 +82,16 @@ def run(
     Args:
         source: batches (time on the source's clock, samples that came).
         clock: makes frames.
-        calibration: of the wearer.
+        headings: the calibration of each frame; frames without one give no pose.
         engine: makes poses.
         sinks: written in order.
+        orient: makes raw samples oriented ones.
+        tell: hears of sensors that fall silent and are back.
         on_pose: called after each pose was written.
         stopped: asked after each batch whether to end the run. An interrupt would lose the frame under way.
         behind_s: how long the newest batch had waited for this function, seconds.
     """
-    summary = RunSummary()
+    summary, silences = RunSummary(), Silences()
     started = arrived = time.perf_counter()
 
     def write(outputs: list[EngineOutput]) -> None:
@@ -113,7 +119,7 @@ def run(
                 summary.behind_s = behind_s()
                 arrived = time.perf_counter() - summary.behind_s
                 if samples:
-                    clock.push(samples, now_s)
+                    clock.push(orient(samples), now_s)
                 yield from clock.frames(now_s)
                 if stopped():
                     break
@@ -123,6 +129,11 @@ def run(
 
     try:
         for frame in frames():
+            for line in silences.of(frame):
+                tell(line)
+            calibration = headings.at(frame)
+            if calibration is None:
+                continue
             orientation, force = apply(calibration, frame.orientation, frame.force)
             write(engine.push(frame, orientation.astype(np.float32), force.astype(np.float32)))
         write(engine.finish())

@@ -151,8 +151,8 @@ class FrameClock:
         sensor, time_s, quat, acc, _, _ = sample
         if quat is None:
             raise EdgeposeError(
-                f"{PLACEMENTS[sensor]}: the device sends no orientation; "
-                "set it to send quaternions, raw gyroscopes are not fused here"
+                f"{PLACEMENTS[sensor]}: the device sends no orientation; set it to send quaternions, "
+                "or make it here of gyroscope and accelerometer: --filter kalman"
             )
         if acc is None:
             raise EdgeposeError(

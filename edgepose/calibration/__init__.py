@@ -5,10 +5,16 @@ are radians, except where a name ends in `_deg`: those are for a person.
 """
 
 from edgepose.calibration.body_frame import body_from_inertial, check_body_frame
-from edgepose.calibration.bones import POSES, Calibration, apply, calibrate, mounting
+from edgepose.calibration.bones import POSES, Calibration, apply, calibrate
 from edgepose.calibration.checks import GRAVITY, HoldSummary, MovedError, check_hold
 from edgepose.calibration.files import from_json, load_calibration, save, to_json
-from edgepose.calibration.headings import HeadingReset, heading_offsets
+from edgepose.calibration.headings import (
+    HeadingReset,
+    heading_offsets,
+    headings_from_axis,
+    headings_from_mounting,
+    headings_from_pose,
+)
 from edgepose.calibration.holds import (
     Hold,
     SensorHold,
@@ -17,16 +23,21 @@ from edgepose.calibration.holds import (
     hold_from_samples,
     stillest_start,
 )
+from edgepose.calibration.motion import EXERCISE_S, ROUTINE, WeakMotionError, headings_from_motion
+from edgepose.calibration.mounting import mounting, mounting_warnings
 
 __all__ = [
+    "EXERCISE_S",
     "GRAVITY",
     "POSES",
+    "ROUTINE",
     "Calibration",
     "HeadingReset",
     "Hold",
     "HoldSummary",
     "MovedError",
     "SensorHold",
+    "WeakMotionError",
     "apply",
     "body_from_inertial",
     "calibrate",
@@ -35,10 +46,15 @@ __all__ = [
     "cut",
     "from_json",
     "heading_offsets",
+    "headings_from_axis",
+    "headings_from_motion",
+    "headings_from_mounting",
+    "headings_from_pose",
     "hold_from_recording",
     "hold_from_samples",
     "load_calibration",
     "mounting",
+    "mounting_warnings",
     "save",
     "stillest_start",
     "to_json",

@@ -37,13 +37,15 @@ class Calibration:
 
     Attributes:
         body_from_inertial: (4,) quaternion of R_TI.
-        heading_offset: (6,) turn about Z of each sensor's inertial frame to the reference's, rad.
+        heading_offset: (6,) turn about Z of each sensor's inertial frame to the common one, rad.
         bone_from_sensor: (6, 4) quaternions of R_BS, how each sensor is mounted on its bone.
         residual_deg: (6,) RMS angle of each sensor about its mean over the hold, degrees.
         pose: key of POSES that was held.
         body_frame: how R_TI was found: `head`, `SENSOR:AXIS` or `heading:DEG`.
         created: ISO 8601 time.
         metadata: what else is worth knowing (source, window, ...), JSON values.
+        filter: one of `edgepose.imu.FILTERS`, which made the orientations.
+        north: whether all headings count from one north; if not, they begin anew when a filter does.
     """
 
     body_from_inertial: Array
@@ -54,6 +56,8 @@ class Calibration:
     body_frame: str
     created: str
     metadata: Mapping[str, Any]
+    filter: str = "none"
+    north: bool = True
 
     @cached_property
     def _maps(self) -> tuple[Array, Array, Array]:
@@ -82,6 +86,8 @@ def calibrate(
     created: str,
     heading_offset: ArrayLike | None = None,
     metadata: Mapping[str, Any] | None = None,
+    filter: str = "none",
+    north: bool = True,
 ) -> Calibration:
     """Calibration (DIP 4.2, eq. 6 and 7) from a checked hold of a known pose.
 
@@ -90,8 +96,10 @@ def calibrate(
         pose: key of POSES that the wearer held.
         body_frame: see `body_from_inertial`.
         created: ISO 8601 time to note.
-        heading_offset: (6,) of `heading_offsets`, rad; None where all sensors share a north.
+        heading_offset: (6,) of a `HeadingReset`, rad; None where all sensors share a north.
         metadata: JSON values to note.
+        filter: one of `edgepose.imu.FILTERS`, which made the orientations.
+        north: whether all headings count from one north.
     """
     if pose not in POSES:
         raise EdgeposeError(f"pose {pose!r} is none of: {', '.join(POSES)}")
@@ -108,6 +116,8 @@ def calibrate(
         body_frame,
         created,
         dict(metadata or {}),
+        filter,
+        north,
     )
 
 
@@ -132,15 +142,3 @@ def apply(calibration: Calibration, orientation: ArrayLike, force: ArrayLike) ->
     squares = (q[..., :, None] * q[..., None, :]).reshape(*q.shape[:-1], 1, 16)
     r_tb = (squares @ bones).reshape(*q.shape[:-1], 3, 3)
     return r_tb, (f[..., None, :] @ to_body)[..., 0, :] + gravity
-
-
-def mounting(calibration: Calibration) -> list[str]:
-    """How each sensor sat in the held pose, for a person: the body directions nearest to its X and Z axes."""
-    words = (("left", "right"), ("up", "down"), ("forward", "back"))
-    r_ts = POSES[calibration.pose] @ rot.quat_to_matrix(calibration.bone_from_sensor)
-
-    def nearest(direction: Array) -> str:
-        i = int(np.argmax(np.abs(direction)))
-        return words[i][int(direction[i] < 0)]
-
-    return [f"x {nearest(r[:, 0])}, z {nearest(r[:, 2])}" for r in r_ts]

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 
 from edgepose.calibration.body_frame import check_body_frame
-from edgepose.calibration.bones import POSES, Calibration, mounting
+from edgepose.calibration.bones import POSES, Calibration
+from edgepose.calibration.mounting import mounting
 from edgepose.errors import EdgeposeError
+from edgepose.imu import FILTERS
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 
@@ -38,6 +40,7 @@ def to_json(calibration: Calibration) -> str:
         "pose": calibration.pose,
         "body_frame": calibration.body_frame,
         "body_from_inertial": calibration.body_from_inertial.tolist(),
+        "orientation": {"filter": calibration.filter, "north": calibration.north},
         "sensors": sensors,
         "metadata": dict(calibration.metadata),
     }
@@ -82,6 +85,10 @@ def from_json(text: str, where: str = "calibration") -> Calibration:
         body_frame = check_body_frame(_member(document, "body_frame", str, fail))
     except EdgeposeError as error:
         raise fail(str(error).removeprefix(f"{where}: ")) from None
+    # Files of versions without filters say nothing about them.
+    made = _member({"orientation": {"filter": "none", "north": True}} | document, "orientation", dict, fail)
+    if made.get("filter") not in FILTERS or not isinstance(made.get("north"), bool):
+        raise fail(f"'orientation' must say filter ({', '.join(FILTERS)}) and north (true or false)")
     own = {name: _numbers_of(name, sensors[name], fail) for name in PLACEMENTS}
     return Calibration(
         body_from_inertial=_unit_quaternion(document, "body_from_inertial", "", fail),
@@ -92,6 +99,8 @@ def from_json(text: str, where: str = "calibration") -> Calibration:
         body_frame=body_frame,
         created=_member(document, "created", str, fail),
         metadata=_member(document, "metadata", dict, fail),
+        filter=made["filter"],
+        north=made["north"],
     )
 
 

@@ -125,7 +125,10 @@ def check_reported(hold: Hold) -> None:
         raise EdgeposeError(f"nothing from {', '.join(silent)}: check power, link and placement of each")
     raw = [name for name, s in named(hold) if np.isnan(s.quat).all()]
     if raw:
-        raise EdgeposeError(f"no orientation from {', '.join(raw)}: set each to send quaternions")
+        raise EdgeposeError(
+            f"no orientation from {', '.join(raw)}: set each to send quaternions, "
+            "or make it here of gyroscope and accelerometer: --filter kalman"
+        )
 
 
 def unit_or_zero(quat: Array) -> Array:

@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from edgepose.errors import EdgeposeError
+from edgepose.imu import FILTERS, ImuSample
 from edgepose.placements import PLACEMENTS
 from edgepose.sources.detection import protocol_named
 from firmware_protocols.registry import PROTOCOLS
 
 if TYPE_CHECKING:
+    from edgepose.orientation import Orienter
     from edgepose.sources import Source
 
 BITS_PER_SECOND = click.IntRange(1)
@@ -145,3 +147,60 @@ def _check(source: SourceFlags) -> None:
     lines = source.port is not None or source.can is not None
     if (source.file is not None and lines) or not (lines or source.file or source.sensors):
         raise click.UsageError("give one source: --port PORT, --can INTERFACE:CHANNEL or --file PATH")
+
+
+class Orientations:
+    """Turns samples into oriented ones as the flags of `filter_options` say."""
+
+    def __init__(self, filter: str, magnetometer: bool) -> None:
+        """No sample has come.
+
+        Args:
+            filter: one of FILTERS.
+            magnetometer: use magnetometers, where there are any.
+        """
+        self._filter, self._magnetometer = filter, magnetometer
+        self._with_north: set[int] = set()
+        self._orienter: Orienter | None = None
+        if filter != "none":
+            from edgepose.orientation import Orienter
+
+            self._orienter = Orienter(filter, magnetometer)
+
+    @property
+    def passes(self) -> bool:
+        """Whether samples pass as they are."""
+        return self._orienter is None
+
+    def anew(self) -> Orientations:
+        """The same, with no sample seen, for another recording."""
+        return Orientations(self._filter, self._magnetometer)
+
+    @property
+    def north(self) -> bool:
+        """Whether all sensors have a heading that counts from north, as far as the samples have shown.
+
+        What devices with a filter of their own do is not known here: it is taken for granted.
+        """
+        return self._orienter is None or (self._magnetometer and len(self._with_north) == len(PLACEMENTS))
+
+    def __call__(self, samples: list[ImuSample]) -> list[ImuSample]:
+        """The samples, oriented."""
+        if self._orienter is None:
+            return samples
+        self._with_north.update(sample.sensor for sample in samples if sample.mag is not None)
+        return self._orienter.orient(samples)
+
+
+def filter_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Adds --filter and --no-mag; the command gets them as `filter: str` and `no_mag: bool`."""
+    chosen = click.option(
+        "--filter",
+        type=click.Choice(FILTERS),
+        default="none",
+        show_default=True,
+        help="Make orientations here of gyroscope, accelerometer and, where there is one, magnetometer; "
+        "none: the sensors send them.",
+    )
+    no_mag = click.option("--no-mag", is_flag=True, help="Leave magnetometers out of --filter.")
+    return chosen(no_mag(command))

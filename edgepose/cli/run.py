@@ -11,18 +11,36 @@ from typing import TYPE_CHECKING
 
 import click
 
-from edgepose.cli.options import SourceFlags, source_options
+from edgepose.cli.options import Orientations, SourceFlags, filter_options, source_options
+from edgepose.cli.outputs import OutputFlags, output_options
 from edgepose.cli.stop import Stop
+from edgepose.cli.wishes import Wishes
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 
 if TYPE_CHECKING:
+    from edgepose.calibration import Calibration
     from edgepose.pipeline import RunSummary
     from edgepose.sources import Source
+    from edgepose.sync import FrameClock
+
+
+def _address(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, int] | None:
+    from edgepose.sinks.udp import parse_destination
+
+    try:
+        if value is None:
+            return None
+        if "," in value:
+            raise EdgeposeError(f"{value!r} is more than HOST:PORT")
+        return parse_destination(value)[:2]
+    except EdgeposeError as error:
+        raise click.BadParameter(str(error)) from None
 
 
 @click.command(short_help="Turn sensor data into poses.")
 @source_options
+@filter_options
 @click.option(
     "--calibration",
     "calibration_path",
@@ -58,32 +76,30 @@ if TYPE_CHECKING:
     help="Frames after the present one that a bidirectional model waits for; each adds 1/60 s of latency  "
     "[default: the model's]",
 )
-@click.option("--csv", "csv_path", metavar="FILE", help="Write poses as CSV; - is standard output.")
+@output_options
 @click.option(
-    "--rotations",
-    type=click.Choice(["axis-angle", "quat", "matrix", "euler"]),
-    default="axis-angle",
-    show_default=True,
-    help="Representation of rotations in the CSV.",
+    "--control",
+    callback=_address,
+    metavar="HOST:PORT",
+    help="Listen here for datagrams `rezero` and OSC messages /edgepose/rezero; live only.",
 )
-@click.option(
-    "--std", is_flag=True, help="Add the network's standard deviation of each joint to the CSV, radians."
-)
-@click.option("--udp", metavar="HOST:PORT[,format=json|binary]", help="Send each pose as a datagram.")
 def run(
     source: SourceFlags,
+    filter: str,
+    no_mag: bool,
     calibration_path: Path,
     model: str,
     trust: bool,
     online: str,
     past: int | None,
     future: int | None,
-    csv_path: str | None,
-    rotations: str,
-    std: bool,
-    udp: str | None,
+    outputs: OutputFlags,
+    control: tuple[str, int] | None,
 ) -> None:
     """Turn packets or a recording into poses until the source ends or Ctrl-C.
+
+    On a live source, r or Enter on the terminal (or a message to --control) re-zeroes the headings: stand in
+    the calibration pose once more.
 
     \b
     Examples:
@@ -91,22 +107,25 @@ def run(
       edgepose run --port COM3 --calibration calib.json --model rnn --udp 10.0.0.5:9000,format=binary
       edgepose run --can socketcan:can0 --protocol hipnuc-canopen --calibration calib.json --csv poses.csv
       edgepose run --sensors rig.toml --calibration calib.json --udp 127.0.0.1:9000
+      edgepose run --port /dev/ttyUSB0 --filter kalman --calibration calib.json --csv poses.csv
       edgepose run --file walk.csv --calibration calib.json --csv - | head
     """
-    if csv_path is None and udp is None:
+    if not outputs.any:
         raise click.UsageError("give at least one output: --csv FILE or --udp HOST:PORT")
     for flag, given in (("--file", source.file), ("--calibration", calibration_path)):
-        if given is not None and _is_same_file(csv_path, given):
-            raise click.UsageError(f"--csv would overwrite {given}, which is {flag}; name another file")
+        for output, path in outputs.files.items():
+            if given is not None and _is_same_file(path, given):
+                raise click.UsageError(
+                    f"{output} would overwrite {given}, which is {flag}; name another file"
+                )
+    if control is not None and not source.live:
+        raise click.UsageError("--control needs sensors that send, or --realtime")
 
     from edgepose import archive
     from edgepose.calibration import load_calibration
-    from edgepose.sinks import Sink
-    from edgepose.sinks.csv_file import CsvSink
-    from edgepose.sinks.udp import UdpSink, parse_destination
 
-    destination = None if udp is None else parse_destination(udp)
     calibration = load_calibration(calibration_path)
+    _check_filter(calibration, filter, no_mag, source)
     info = archive.inspect(archive.find(model))
     kind, rate = info.metadata["kind"], float(info.metadata["rate_hz"])
     past = info.metadata["past"] if past is None else past
@@ -116,48 +135,81 @@ def run(
     with ExitStack() as stack:
         # The source is opened before the model is loaded: a wrong port is told at once.
         opened = stack.enter_context(source.open())
+        wishes = Wishes(stack, control, keys=source.live)
         module = archive.load(info, trust)
         from edgepose.engine import StreamEngine, WindowEngine
         from edgepose.pipeline import run as run_pipeline
+        from edgepose.rezero import Headings
         from edgepose.sync import FrameClock
 
         engine = (StreamEngine if kind == "rnn" or online == "stream" else WindowEngine)(module, past, future)
         stop = stack.enter_context(Stop())
-        sinks: list[Sink] = []
-        if csv_path is not None:
-            sinks.append(stack.enter_context(CsvSink(csv_path, rotations, std)))
-        if destination:
-            sinks.append(stack.enter_context(UdpSink(*destination)))
+        sinks = outputs.open(stack)
         clock = FrameClock(rate)
         way = "stream" if isinstance(engine, StreamEngine) else "window"
-        _say(f"running {model} ({kind}, {way}); Ctrl-C ends the run")
+        _say(f"running {model} ({kind}, {way}); Ctrl-C ends the run{wishes.hint}")
+        headings = Headings(
+            calibration,
+            hold_first=source.live and _begins_anew(calibration),
+            requests=wishes.poll,
+            tell=_say,
+        )
         summary = run_pipeline(
-            *(opened, clock, calibration, engine, sinks, _progress()),
+            *(opened, clock, headings, engine, sinks),
+            orient=Orientations(filter, magnetometer=calibration.north),
+            tell=_say if source.live else lambda text: None,
+            on_pose=_progress(),
             stopped=lambda: stop.asked,
             behind_s=lambda: opened.behind_s,
         )
-        unsent = sum(sink.unsent for sink in sinks if isinstance(sink, UdpSink))
         for sink in sinks:
             try:
                 sink.close()
             except EdgeposeError as error:
                 summary.error = summary.error or error
-    _report(summary, opened, clock.dropped, rate, future, live=source.live)
-    if unsent:
-        _say(f"udp      {unsent} datagrams did not arrive; is anything listening at {udp}?")
+    _report(summary, opened, clock, rate, future, live=source.live)
+    for line in (*outputs.remarks(sinks), *wishes.remarks()):
+        _say(line)
     if summary.error:
         raise summary.error
     if opened.damage:
         raise EdgeposeError(opened.damage)
 
 
+def _begins_anew(calibration: Calibration) -> bool:
+    """Whether a filter without a north has begun anew since the calibration."""
+    return calibration.filter != "none" and not calibration.north
+
+
+def _check_filter(calibration: Calibration, filter: str, no_mag: bool, source: SourceFlags) -> None:
+    """Raises EdgeposeError unless orientations are made as they were for the calibration.
+
+    Not a warning: another filter has other headings, and all poses would be wrong without looking so.
+    """
+    if filter != calibration.filter:
+        raise EdgeposeError(
+            f"the calibration was made with --filter {calibration.filter}, and this run has --filter "
+            f"{filter}: headings would differ; use the same one, or calibrate again"
+        )
+    if no_mag and filter != "none" and calibration.north:
+        raise EdgeposeError(
+            "the calibration was made with magnetometers: leave --no-mag out, or calibrate again with it"
+        )
+    made_from = calibration.metadata.get("source")
+    if not source.live and _begins_anew(calibration) and made_from != source.name:
+        _say(
+            f"warning: the calibration was made from {made_from}, and headings of a filter without "
+            "magnetometers begin anew in each recording: calibrate from this one"
+        )
+
+
 BEHIND_S = 1.0
 """A run that is further behind its sensors says so, seconds."""
 
 
-def _is_same_file(output: str | None, given: Path) -> bool:
+def _is_same_file(output: str, given: Path) -> bool:
     try:
-        return output not in (None, "-") and given.samefile(str(output))
+        return given.samefile(output)
     except OSError:  # there is no such file yet
         return False
 
@@ -190,7 +242,9 @@ def _progress() -> Callable[[RunSummary], None]:
     return show
 
 
-def _report(summary: RunSummary, source: Source, dropped: int, rate: float, future: int, live: bool) -> None:
+def _report(
+    summary: RunSummary, source: Source, clock: FrameClock, rate: float, future: int, live: bool
+) -> None:
     """Prints the counts of a finished run."""
     import numpy as np
 
@@ -204,8 +258,12 @@ def _report(summary: RunSummary, source: Source, dropped: int, rate: float, futu
     counts = source.counters
     _say(
         f"packets  {counts.packets} good, {counts.lost} lost, {counts.bad} bad; "
-        f"{dropped} samples too late or twice"
+        f"{clock.dropped} samples too late or twice"
     )
+    if clock.restarts:
+        _say(
+            f"clock    began anew {clock.restarts} times, after all sensors were silent for a minute or more"
+        )
     if summary.held:
         worst = sorted(zip(summary.held_by_sensor, PLACEMENTS, strict=True), reverse=True)
         _say("held     " + ", ".join(f"{name} in {count} frames" for count, name in worst if count))

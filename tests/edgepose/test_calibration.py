@@ -262,14 +262,14 @@ def test_heading_reset_finds_every_offset(seed: int) -> None:
     np.testing.assert_allclose(np.cos(reset.offset - rig.error), 1.0, atol=1e-9)
     assert reset.offset[ROOT] == pytest.approx(0.0, abs=1e-9)
     assert np.abs(reset.offset).max() <= math.pi
-    assert reset.tilt_deg.max() < 1e-6
+    assert reset.error_deg.max() < 1e-6
 
 
 def test_heading_reset_reports_tilt_and_refuses_too_much_of_it() -> None:
     quats = rot.quat_multiply(rot.about_z([0.3, 1, 2, -1, -3, 0.0]), np.array([1.0, 0, 0, 0]))
     tilt = np.radians([0, 4, 0, 0, 0, 0.0])
     reset = cal.heading_offsets(rig_at_rest(rot.quat_multiply(quats, turns_about_x(tilt))))
-    np.testing.assert_allclose(reset.tilt_deg, np.degrees(tilt), atol=1e-6)
+    np.testing.assert_allclose(reset.error_deg, np.degrees(tilt), atol=1e-6)
     tilt = np.radians([0, 0, 90, 0, 16, 0.0])
     with pytest.raises(
         EdgeposeError, match=r"pelvis sensor does: left_lower_leg \(90 deg\), head \(16 deg\); lay all six"

@@ -149,13 +149,13 @@ def test_unknown_commands_are_wrong_use(command):
 def fail(command, wearer, tmp_path):
     """The problem of a run with these flags instead of the good ones."""
 
-    def run(**changes):
+    def run(code=1, **changes):
         flags = {"file": wearer.short, "calibration": wearer.calibration, "csv": tmp_path / "poses.csv"}
         flags |= changes
         words = [
             word for key, value in flags.items() if value is not None for word in (f"--{key}", str(value))
         ]
-        text = problem(command("run", *words))
+        text = problem(command("run", *words), code)
         assert not (tmp_path / "poses.csv").exists()
         return text
 
@@ -297,7 +297,7 @@ def test_an_archive_of_unknown_sum(fail, tmp_path):
     ],
 )
 def test_a_bad_udp_destination(fail, udp, says):
-    assert says in fail(udp=udp)
+    assert says in fail(code=2, udp=udp)
 
 
 # --- the whole traceback ------------------------------------------------------------------------------------

@@ -126,7 +126,7 @@ def test_a_heading_reset_from_a_recording(tmp_path: Path) -> None:
     calibration = cal.load_calibration(out)
     np.testing.assert_allclose(calibration.heading_offset, ERRORS, atol=1e-6)
     assert_recovers(calibration, ERRORS, 0.01)
-    assert max(calibration.metadata["heading_reset"]["tilt_deg"].values()) < 0.01
+    assert max(calibration.metadata["heading_reset"]["error_deg"].values()) < 0.01
 
 
 def test_a_moved_recording_says_who_and_what_to_do(tmp_path: Path) -> None:
@@ -314,7 +314,7 @@ def test_after_three_repeats_it_gives_up(wearer: Wearer, tmp_path: Path) -> None
 def test_missing_sensors_are_waited_for_and_then_named(
     wearer: Wearer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("edgepose.cli.calibrate.ALL_REPORT_S", 1.1)
+    monkeypatch.setattr("edgepose.cli.guide.ALL_REPORT_S", 1.1)
     wearer.silent = {1, 4}
     result = run("--port", wearer.port, "--out", tmp_path / "calib.json")
     assert "Waiting for right_forearm, head." in result.output

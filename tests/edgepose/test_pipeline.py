@@ -15,6 +15,7 @@ from edgepose.imu import ImuFrame
 from edgepose.pipeline import LATENCIES, RunSummary, run, status
 from edgepose.placements import PLACEMENTS
 from edgepose.poses import read_poses_csv
+from edgepose.rezero import Headings
 from edgepose.sinks import Sink
 from edgepose.sinks.csv_file import CsvSink
 from edgepose.sources import open_source
@@ -52,7 +53,7 @@ def walk(wearer, module):
             return run(
                 change(source),
                 FrameClock(),
-                load_calibration(wearer.calibration),
+                Headings(load_calibration(wearer.calibration)),
                 engine,
                 list(sinks),
                 **options,
