@@ -1,4 +1,4 @@
-"""Recordings of any kind to CSV or NPZ, many at once; a broken one costs only itself."""
+"""Recordings and poses of any kind to other kinds of files, many at once; a broken one costs only itself."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from edgepose.appending import replace_file
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
+from edgepose.pose_converter import convert_poses
+from edgepose.poses import is_poses
 from edgepose.recording import (
     Recording,
     from_samples,
@@ -35,7 +37,7 @@ ENDINGS = (".csv", ".npz", *CAPTURES, *CAN_LOGS)
 
 
 class Job(NamedTuple):
-    """One recording to convert.
+    """One recording, or file of poses, to convert.
 
     Attributes:
         source: file, or folder of an x-io session.
@@ -51,18 +53,18 @@ class Result(NamedTuple):
 
     Attributes:
         job: the recording.
-        samples: written.
+        samples: written, or poses.
         seconds: from the first sample to the last.
-        sensors: of which there are samples.
         problem: one line for the user if it could not be read, or not all of it; None if all is well.
+        sensors: of which there are samples, if it is a recording.
         skipped: the target was there already.
     """
 
     job: Job
     samples: int = 0
     seconds: float = 0.0
-    sensors: int = 0
     problem: str | None = None
+    sensors: int = len(PLACEMENTS)
     skipped: bool = False
 
 
@@ -72,7 +74,7 @@ def plan(inputs: Sequence[Path], to: str, out: Path) -> list[Job]:
     Args:
         inputs: files ("-" is CSV on standard input), folders of them at any depth, and x-io sessions; names
             with `*`, `?` or `[` that are no file are patterns.
-        to: a key of WRITERS.
+        to: ending of what is to be written.
         out: folder to write to; what is in an input folder keeps its place in that.
 
     Raises:
@@ -148,6 +150,9 @@ def convert(job: Job, protocol: str = "auto", sensors: Path | None = None) -> Re
         sensors: map of devices to placements, for captures, CAN logs and x-io sessions.
     """
     try:
+        if job.target.suffix == ".bvh" or is_poses(job.source):
+            job.target.parent.mkdir(parents=True, exist_ok=True)
+            return Result(job, *convert_poses(job.source, job.target))
         recording = _read(job.source, protocol, sensors)
         data = recording.sensors.values()
         if not data:

@@ -101,7 +101,29 @@ def read_poses(path: str | Path) -> Poses:
     """
     if Path(path).suffix.lower() == ".npz":
         return _read_npz(Path(path))
-    blocks = list(read_blocks(path))
+    return _joined(list(read_blocks(path)))
+
+
+def salvage_poses(path: Path) -> tuple[Poses, str | None]:
+    """What is good in a file of poses, and one line on what is not; see `read_poses`.
+
+    Raises:
+        EdgeposeError: nothing is.
+    """
+    if path.suffix.lower() == ".npz":
+        return _read_npz(path), None
+    blocks: list[Poses] = []
+    try:
+        blocks.extend(read_blocks(path))  # one by one: what has come before an error stays
+    except EdgeposeError as error:
+        if not blocks:
+            raise
+        poses = _joined(blocks)
+        return poses, f"{error}; only the {len(poses.frames)} poses before it are taken"
+    return _joined(blocks), None
+
+
+def _joined(blocks: list[Poses]) -> Poses:
     translations = [block.translation for block in blocks if block.translation is not None]
     return Poses(
         np.concatenate([block.frames for block in blocks]),
@@ -149,6 +171,7 @@ def read_blocks(path: str | Path) -> Iterator[Poses]:
 
     Raises:
         EdgeposeError: no such file, or not a file of poses; names the row, counted from 1 for the header.
+            All poses before that have come.
     """
     if str(path) == "-":
         yield from _read_csv(sys.stdin, "standard input")
@@ -160,22 +183,46 @@ def read_blocks(path: str | Path) -> Iterator[Poses]:
         raise EdgeposeError(f"cannot read poses from {path}: {error.strerror or error}") from error
 
 
+class _BadRowError(EdgeposeError):
+    """A row that is no pose; `row` is its number, counted from 1 for the header."""
+
+    def __init__(self, name: str, row: int, problem: str) -> None:
+        super().__init__(f"{name}, row {row}: {problem}")
+        self.row = row
+
+
 def _read_csv(file: TextIO, name: str) -> Iterator[Poses]:
     rows = csv.reader(_lines(file))
-    done, last = 0, -1
+    first, last = 2, None
     try:
         form, std, moves = _recognise(next(rows, []), name)
         columns = len(pose_columns(form, std, moves))
         while block := list(islice(rows, BLOCK)):
-            poses = _block(block, done + 2, last, columns, form, moves, name)
-            done, last = done + len(block), int(poses.frames[-1])
-            yield poses
+            poses, error = _good(block, first, last, columns, form, moves, name)
+            if poses is not None:
+                first, last = first + len(poses.frames), int(poses.frames[-1])
+                yield poses
+            if error is not None:
+                raise error
     except csv.Error as error:
         raise EdgeposeError(f"{name}, row {rows.line_num + 1}: {error}") from error
     except UnicodeDecodeError as error:
         raise EdgeposeError(f"{name} is not a text file: byte {error.start} is not UTF-8") from error
-    if not done:
+    if last is None:
         raise EdgeposeError(f"{name} has no poses, only a header")
+
+
+def _good(
+    rows: list[list[str]], first: int, last: int | None, columns: int, form: str, moves: bool, name: str
+) -> tuple[Poses | None, EdgeposeError | None]:
+    """The poses before the first bad row, and what is wrong with that."""
+    problem = None
+    while rows:
+        try:
+            return _block(rows, first, last, columns, form, moves, name), problem
+        except _BadRowError as error:
+            problem, rows = error, rows[: error.row - first]
+    return None, problem
 
 
 def _lines(file: TextIO) -> Iterator[str]:
@@ -199,63 +246,56 @@ def _recognise(header: list[str], name: str) -> tuple[str, bool, bool]:
 
 
 def _block(
-    rows: list[list[str]], first: int, last: int, columns: int, form: str, moves: bool, name: str
+    rows: list[list[str]], first: int, last: int | None, columns: int, form: str, moves: bool, name: str
 ) -> Poses:
     """Poses of rows of which the first has number `first`, after the frame `last`."""
     frames, times, status, numbers = array("q"), array("d"), list[str](), array("d")
     for number, row in enumerate(rows, start=first):
         if len(row) != columns:
-            raise EdgeposeError(f"{name}, row {number}: {len(row)} columns, the header has {columns}")
+            raise _BadRowError(name, number, f"{len(row)} columns, the header has {columns}")
         try:
             frame = int(row[0])
             times.append(float(row[1]))
             numbers.extend(map(float, row[3:]))
-            if frame <= last and (frames or first > 2):
-                raise EdgeposeError(f"{name}, row {number}: frame {frame} comes after frame {last}")
             frames.append(frame)
-            last = frame
         except (ValueError, OverflowError) as error:
-            raise EdgeposeError(f"{name}, row {number}: {error}") from error
+            raise _BadRowError(name, number, str(error)) from error
+        if last is not None and frame <= last:
+            raise _BadRowError(name, number, f"frame {frame} comes after frame {last}")
         status.append(sys.intern(row[2]))
+        last = frame
     values = np.frombuffer(numbers).reshape(len(frames), -1)
     seconds = np.frombuffer(times)
     bad = ~(np.isfinite(seconds) & np.isfinite(values).all(axis=1))
     if bad.any():
-        raise EdgeposeError(f"{name}, row {bad.argmax() + first}: a number is infinite or not a number")
+        raise _BadRowError(name, int(bad.argmax()) + first, "a number is infinite or not a number")
     width = len(FORMS[form])
-    rotations = values[:, : len(JOINTS) * width].reshape(len(frames), len(JOINTS), width)
-    return Poses(
-        np.frombuffer(frames, np.int64),
-        seconds,
-        status,
-        _rotations(form, rotations, name, first),
-        values[:, -3:] if moves else None,
+    rotations, off = _rotations(
+        form, values[:, : len(JOINTS) * width].reshape(len(frames), len(JOINTS), width)
     )
+    if (off > 1e-3).any():
+        at, joint = np.argwhere(off > 1e-3)[0].tolist()
+        raise _BadRowError(name, at + first, f"the numbers of {JOINTS[joint]} are not a rotation")
+    where = values[:, -3:] if moves else None
+    return Poses(np.frombuffer(frames, np.int64), seconds, status, rotations, where)
 
 
-def _rotations(form: str, values: Array, name: str, first: int) -> Array:
-    """Rotation matrices (T, 24, 3, 3) of the numbers (T, 24, n) of one representation, from row `first`."""
+def _rotations(form: str, values: Array) -> tuple[Array, Array]:
+    """Rotation matrices (T, 24, 3, 3) of the numbers (T, 24, n) of one representation, and how far (T, 24)
+    these are from any rotation's.
+    """
+    none = np.zeros(values.shape[:2])
     if form == "axis-angle":
-        return rotvec_to_matrix(values)
+        return rotvec_to_matrix(values), none
     if form == "euler":
-        return euler_to_matrix(values, "zxy")
+        return euler_to_matrix(values, "zxy"), none
     if form == "quat":
         norms = np.linalg.norm(values, axis=-1, keepdims=True)
-        _check(np.abs(norms[..., 0] - 1.0), name, first)
-        return quat_to_matrix(values / norms)
+        return quat_to_matrix(values / np.where(norms > 0.0, norms, 1.0)), np.abs(norms[..., 0] - 1.0)
     matrices = values.reshape(*values.shape[:-1], 3, 3)
     # Six written digits leave a matrix a little off a rotation; anything further is not one.
     nearest = nearest_rotation(matrices)
-    _check(np.abs(matrices - nearest).max(axis=(-2, -1)), name, first)
-    return nearest
-
-
-def _check(error: Array, name: str, first: int) -> None:
-    """Raise for the first row and joint whose numbers (T, 24) are far from a rotation's."""
-    bad = error > 1e-3
-    if bad.any():
-        row, joint = np.argwhere(bad)[0]
-        raise EdgeposeError(f"{name}, row {row + first}: the numbers of {JOINTS[joint]} are not a rotation")
+    return nearest, np.abs(matrices - nearest).max(axis=(-2, -1))
 
 
 # --- NPZ ----------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""`edgepose convert`: recordings of any kind to CSV or NPZ, many at once."""
+"""`edgepose convert`: recordings and poses of any kind to CSV, NPZ or BVH, many at once."""
 
 from __future__ import annotations
 
@@ -16,11 +16,16 @@ if TYPE_CHECKING:
     from edgepose.converter import Result
 
 
-@click.command(short_help="Convert recordings and captures.")
+@click.command(short_help="Convert recordings, captures and poses.")
 @click.argument(
     "inputs", nargs=-1, required=True, metavar="IN...", type=click.Path(path_type=Path, allow_dash=True)
 )
-@click.option("--to", required=True, type=click.Choice(["csv", "npz"]), help="Kind of recording to write.")
+@click.option(
+    "--to",
+    required=True,
+    type=click.Choice(["csv", "npz", "bvh"]),
+    help="Kind of file to write; bvh is for poses only.",
+)
 @click.option(
     "--out",
     required=True,
@@ -53,11 +58,15 @@ def convert(
     with --sensors, their serial numbers as ids: id = 0x64F61CB3). Of a damaged recording what is good is
     written, and the exit code is 1.
 
+    Files of poses, CSV as `run` writes it or NPZ with the keys of AMASS, become CSV, NPZ or BVH; of a
+    recording that holds true poses, --to bvh takes these.
+
     \b
     Examples:
       edgepose convert walk.npz --to csv --out .
       edgepose convert sessions/ "more/*.bin" --to npz --out recordings --jobs 4
       edgepose convert walk.part.csv --to npz --out saved
+      edgepose convert poses/ --to bvh --out for-blender --jobs 2
     """
     from edgepose.converter import Result, convert_all, plan
     from edgepose.sources.sensor_map import read_map

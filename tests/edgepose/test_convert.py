@@ -408,7 +408,7 @@ def test_impossible_plans(tmp_path, monkeypatch, inputs, out, says):
 @pytest.mark.parametrize(
     ("words", "code", "says"),
     [
-        ("REAL --to bvh --out o", 2, "--to"),
+        ("REAL --to fbx --out o", 2, "--to"),
         ("--to csv --out o", 2, "IN"),
         ("REAL --to csv --out o --protocol nonsense", 2, "unknown protocol 'nonsense'"),
         ("REAL --to csv --out o --jobs 0", 2, "--jobs"),
