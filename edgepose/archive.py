@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 METADATA_FILE = "edgepose.json"
 FORMAT = 1
 MODELS = Path(str(resources.files("edgepose") / "models"))
+KINDS = ("birnn", "rnn", "feed-forward", "wavenet")
 
 _METADATA_LIMIT = 1 << 20
 _MOST_FRAMES = 1000
@@ -124,7 +125,7 @@ def _check(path: Path, metadata: Any) -> None:
             f"{path}: archive format {metadata['format']} is newer than this edgepose reads ({FORMAT}); "
             "update edgepose"
         )
-    if metadata.get("kind") not in ("birnn", "rnn"):
+    if metadata.get("kind") not in KINDS:
         raise EdgeposeError(f"{path}: unknown kind of network {metadata.get('kind')!r}")
     if metadata.get("placements") != list(PLACEMENTS):
         raise EdgeposeError(f"{path}: made for other sensor placements: {metadata.get('placements')}")

@@ -17,14 +17,33 @@ from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 from edgepose.skeleton import JOINTS
 from edgepose_export.dataset import RATE
-from edgepose_export.networks import BirnnArchive, Ends, PoseDecoder, PoseNetwork, RnnArchive
+from edgepose_export.fields import FeedForward, FieldArchive, WaveNet
+from edgepose_export.networks import (
+    BirnnArchive,
+    Ends,
+    NetworkShape,
+    PoseDecoder,
+    PoseNetwork,
+    RnnArchive,
+)
+from edgepose_export.normalisation import FromFirstFrame, Inputs
+
+Network = PoseNetwork | FeedForward | WaveNet
+
+KINDS: dict[str, type[Network]] = {
+    "birnn": PoseNetwork,
+    "rnn": PoseNetwork,
+    "feed-forward": FeedForward,
+    "wavenet": WaveNet,
+}
+"""What trains a network of each kind."""
 
 METHODS = ["window", "start", "stream", "drain"]
 
 
 class Statistics(NamedTuple):
-    """Means and standard deviations over the training set: inputs (60,), accelerations being its last 15, and
-    pose targets.
+    """Means and standard deviations over the training set: of the inputs, the last 15 being accelerations
+    where the network has them, and of the pose targets.
     """
 
     input_mean: Tensor
@@ -33,19 +52,41 @@ class Statistics(NamedTuple):
     target_std: Tensor
 
 
-def build(network: PoseNetwork, statistics: Statistics) -> nn.Module:
-    """The archive's module, in Python, sharing the network's weights."""
-    decoder = PoseDecoder(network.shape, statistics.target_mean, statistics.target_std)
-    ends = Ends(network, statistics.input_mean, statistics.input_std, decoder)
-    return (BirnnArchive if network.shape.kind == "birnn" else RnnArchive)(network, ends).eval()
+def new_network(shape: NetworkShape) -> Network:
+    """A network of a shape with random weights."""
+    return KINDS[shape.kind](shape)
 
 
-def script(network: PoseNetwork, statistics: Statistics) -> torch.jit.ScriptModule:
-    """The archive's module, scripted and frozen."""
+def build(network: Network, statistics: Statistics, std_scale: Tensor | None = None) -> nn.Module:
+    """The archive's module, in Python, sharing the network's weights.
+
+    Args:
+        network: a trained one.
+        statistics: of what it was trained on.
+        std_scale: (24,) factors of the joints' standard deviations, see `reliability`; ones when None.
+    """
+    shape = network.shape
+    decoder = PoseDecoder(shape, statistics.target_mean, statistics.target_std)
+    if std_scale is not None:
+        decoder.std_scale.copy_(std_scale)
+    if isinstance(network, PoseNetwork):
+        ends = Ends(network, statistics.input_mean, statistics.input_std, decoder)
+        module: nn.Module = (BirnnArchive if shape.kind == "birnn" else RnnArchive)(network, ends)
+    else:
+        inputs = Inputs(shape.normalisation, shape.acceleration, statistics.input_mean, statistics.input_std)
+        module = FieldArchive(network, inputs, decoder)
+    return (FromFirstFrame(module) if shape.normalisation == "sequence" else module).eval()
+
+
+def script(
+    network: Network, statistics: Statistics, std_scale: Tensor | None = None
+) -> torch.jit.ScriptModule:
+    """The archive's module, scripted and frozen; arguments as in `build`."""
     with warnings.catch_warnings():
         # TorchScript is deprecated in favour of torch.export; it is used on purpose, see docs/models.md.
         warnings.filterwarnings("ignore", message="`torch.jit", category=DeprecationWarning)
-        return torch.jit.freeze(torch.jit.script(build(network, statistics)), preserved_attrs=METHODS)
+        module = torch.jit.script(build(network, statistics, std_scale))
+        return torch.jit.freeze(module, preserved_attrs=METHODS)
 
 
 def save(module: torch.jit.ScriptModule, path: Path, metadata: dict[str, object]) -> None:
@@ -79,7 +120,7 @@ def revision() -> str | None:
 
 
 def describe(
-    name: str, network: PoseNetwork, checkpoint: dict[str, Any], past: int, future: int
+    name: str, network: Network, checkpoint: dict[str, Any], past: int, future: int
 ) -> dict[str, Any]:
     """Metadata of an archive, without measures.
 
@@ -87,10 +128,14 @@ def describe(
         name: of the model.
         network: whose weights the archive holds.
         checkpoint: the training run's state.
-        past: default frames before the present one in a window.
+        past: default frames before the present one in a window, of a bidirectional network.
         future: default frames after it.
     """
     shape = network.shape
+    if not isinstance(network, PoseNetwork):
+        past, future = network.past, network.future
+    elif shape.kind == "rnn":
+        past, future = 0, 0
     return {
         "format": FORMAT,
         "name": name,
@@ -104,6 +149,8 @@ def describe(
         "joints": [JOINTS[joint] for joint in shape.joints],
         "targets": shape.targets,
         "measured_bones": shape.measured,
+        "normalisation": shape.normalisation,
+        "acceleration": shape.acceleration,
         "precision": "f32",
         "training": {
             "steps": checkpoint["step"],

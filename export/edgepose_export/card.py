@@ -4,26 +4,39 @@ from __future__ import annotations
 
 from typing import Any
 
+from edgepose_export.reliability import EXPECTED
+
 _KINDS = {
     "birnn": "bidirectional LSTM; the pose of a frame is known once its {future} future frames have come "
     "({latency:.0f} ms)",
     "rnn": "unidirectional LSTM; the pose of a frame is known at once",
+    "feed-forward": "five dense layers over {past} past and {future} future frames; the pose of a frame is "
+    "known once these have come ({latency:.0f} ms)",
+    "wavenet": "dilated convolutions over {past} past frames; the pose of a frame is known at once",
+}
+
+_INPUTS = {
+    "root": "as seen from the pelvis",
+    "heading": "without the pelvis' heading",
+    "sequence": "as seen from the pelvis in the first frame",
 }
 
 
 def card(metadata: dict[str, Any]) -> str:
     """Markdown of an archive's card, made from its metadata alone."""
     kind = _KINDS[metadata["kind"]].format(
-        future=metadata["future"], latency=1e3 * metadata["future"] / metadata["rate_hz"]
+        past=metadata["past"],
+        future=metadata["future"],
+        latency=1e3 * metadata["future"] / metadata["rate_hz"],
     )
     training = metadata["training"]
     lines = [
         f"# {metadata['name']}",
         "",
-        f"- Network: {kind}; {metadata['hidden']} units a direction, two layers, "
-        f"{metadata['parameters'] / 1e6:.2f} million weights.",
-        f"- Input: calibrated orientations and accelerations of {', '.join(metadata['placements'])} "
-        f"at {metadata['rate_hz']:g} Hz.",
+        f"- Network: {kind}; {_size(metadata)}, {metadata['parameters'] / 1e6:.2f} million weights.",
+        f"- Input: calibrated orientations{' and accelerations' if metadata['acceleration'] else ''} of "
+        f"{', '.join(metadata['placements'])} at {metadata['rate_hz']:g} Hz, "
+        f"{_INPUTS[metadata['normalisation']]}.",
         f"- Targets: {metadata['targets']}; bones that carry a sensor are {metadata['measured_bones']}.",
         f"- Trained on: {training['summary']}; {training['takes']} takes, {training['hours']:.2f} h, "
         f"{training['steps']} steps.",
@@ -44,6 +57,7 @@ def card(metadata: dict[str, Any]) -> str:
     for part, rows in metadata["measures"].items():
         lines += [f"### {part}", "", *_table(rows), ""]
     if metadata["measures"]:
+        lines += _deviations(metadata["deviations"])
         lines += [
             "The parts: `cmu-walk-run` is CMU subjects 07, 08, 09; `cmu-02` is CMU subject 02 (bends, "
             "punches, sword, washing); `bandai-styles` is Bandai-Namco's styles exhausted and tired. None of "
@@ -85,3 +99,27 @@ def _table(rows: dict[str, dict[str, list[float]]]) -> list[str]:
         cells = [f"{measures[key][0]:.2f} ± {measures[key][1]:.2f}" for key in _COLUMNS]
         lines.append("| " + " | ".join([name, *cells, str(int(measures["sip_error_deg"][2]))]) + " |")
     return lines
+
+
+def _size(metadata: dict[str, Any]) -> str:
+    if metadata["kind"] in ("birnn", "rnn"):
+        return f"{metadata['hidden']} units a direction, two layers"
+    return f"{metadata['hidden']} units in the widest layer"
+
+
+def _deviations(parts: dict[str, dict[str, Any]]) -> list[str]:
+    """How often errors are within the predicted standard deviations, once these are fitted."""
+    lines = [
+        "### Predicted standard deviations",
+        "",
+        "Fitted to the errors on validation takes, a factor a joint. The joints' errors within one and two "
+        f"deviations (expected {100 * EXPECTED[0]:.0f} and {100 * EXPECTED[1]:.0f} %), and the factor that "
+        "would make the deviations right on the part:",
+        "",
+        "| part | within one, % | within two, % | factor | errors |",
+        "|---|---|---|---|---|",
+    ]
+    for part, numbers in parts.items():
+        one, two = (100 * share for share in numbers["within"])
+        lines.append(f"| {part} | {one:.1f} | {two:.1f} | {numbers['scale']:.2f} | {numbers['values']} |")
+    return [*lines, ""]

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import re
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +18,7 @@ from edgepose.calibration import GRAVITY
 from edgepose.errors import EdgeposeError
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import PARENTS, forward_kinematics
+from edgepose_export.splits import part_of
 from edgepose_export.synthesis import INERTIAL_FROM_BODY
 
 RATE = 60.0
@@ -86,35 +86,8 @@ def read_take(path: Path) -> Take:
     )
 
 
-HELD_OUT = ("cmu-walk-run", "cmu-02", "bandai-styles")
-"""Parts of the split that no training sees."""
-
-
-def part_of(name: str) -> str:
-    """Part that a take belongs to, by its name.
-
-    CMU subjects 07, 08, 09 (walking, running) and 02 (bends, punches, sword) and Bandai-Namco's styles
-    "exhausted" and "tired" are held out. CMU subject 03 and the style "not-confident" tell training when to
-    stop. Other splits leak: Bandai-Namco's takes of one style resemble each other so closely that a
-    nearest-neighbour look-up would win.
-    """
-    if match := re.match(r"(\d\d)_\d\d\b", name):
-        return {
-            "07": "cmu-walk-run",
-            "08": "cmu-walk-run",
-            "09": "cmu-walk-run",
-            "02": "cmu-02",
-            "03": "validation",
-        }.get(match[1], "train")
-    if re.search(r"_(exhausted|tired)_", name):
-        return "bandai-styles"
-    return "validation" if "_not-confident_" in name else "train"
-
-
-def read_takes(
-    folder: Path, part: str, progress: Callable[[list[Path]], Iterable[Path]] = iter
-) -> list[Take]:
-    """All takes of one part of the split below a folder, by name; the part "all" is every take.
+def take_paths(folder: Path, part: str) -> list[Path]:
+    """Files of all takes of one part of the split below a folder, by name; the part "all" is every take.
 
     Raises:
         EdgeposeError: none found.
@@ -127,25 +100,23 @@ def read_takes(
             f"{folder}: no {'recordings' if part == 'all' else f'recording of the part {part!r}'}; "
             f"make them with edgepose synthesize --out {folder}"
         )
-    return [read_take(path) for path in progress(paths)]
+    return paths
 
 
-def read_training_takes(
-    folder: Path, progress: Callable[[list[Path]], Iterable[Path]] = iter
-) -> tuple[list[Take], list[Take]]:
-    """Takes to train on and takes that tell when to stop.
+def training_paths(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Files of takes to train on and of takes that tell when to stop.
 
     Where no name belongs to the validation part (a user's own recordings), every tenth take goes there.
 
     Raises:
         EdgeposeError: fewer than two takes, or none to train on.
     """
-    takes = read_takes(folder, "train", progress)
+    paths = take_paths(folder, "train")
     if any(part_of(path.stem) == "validation" for path in folder.rglob("*.npz")):
-        return takes, read_takes(folder, "validation", progress)
-    if len(takes) < 2:
+        return paths, take_paths(folder, "validation")
+    if len(paths) < 2:
         raise EdgeposeError(f"{folder}: one recording is not enough: another must tell when to stop training")
-    return [take for i, take in enumerate(takes) if i % 10], takes[::10]
+    return [path for i, path in enumerate(paths) if i % 10], paths[::10]
 
 
 class Tape(NamedTuple):
@@ -157,7 +128,7 @@ class Tape(NamedTuple):
         relative: (N, 24, 3, 3) true global rotations in the root's frame.
         starts: first frame of each take; one more entry holds N.
         names: of the takes.
-        free: whether each take is CMU's, free for all use.
+        licenses: of each take's motion.
     """
 
     orientation: Tensor
@@ -165,7 +136,12 @@ class Tape(NamedTuple):
     relative: Tensor
     starts: Tensor
     names: list[str]
-    free: list[bool]
+    licenses: list[str]
+
+    @property
+    def free(self) -> list[bool]:
+        """Whether each take is CMU's, free for all use."""
+        return [text.startswith("CMU") for text in self.licenses]
 
 
 def tape(takes: list[Take]) -> Tape:
@@ -177,7 +153,7 @@ def tape(takes: list[Take]) -> Tape:
         torch.cat([root_relative_pose(torch.from_numpy(take.pose)) for take in takes]),
         torch.tensor([0, *np.cumsum(lengths)]),
         [take.name for take in takes],
-        [take.license.startswith("CMU") for take in takes],
+        [take.license for take in takes],
     )
 
 
@@ -189,12 +165,12 @@ def root_relative_pose(local: Tensor) -> Tensor:
     return torch.stack(result, dim=-3)
 
 
-def describe_takes(takes: list[Take]) -> dict[str, Any]:
+def describe(licenses: Iterable[str], takes: int, frames: int) -> dict[str, Any]:
     """What an archive's card says of the motion that it was trained on."""
-    licenses = sorted({take.license for take in takes})
+    licenses = sorted(set(licenses))
     return {
         "summary": " and ".join(text.split(",")[0].split(" (")[0] for text in licenses),
         "licenses": licenses,
-        "takes": len(takes),
-        "hours": sum(len(take.pose) for take in takes) / RATE / 3600.0,
+        "takes": takes,
+        "hours": frames / RATE / 3600.0,
     }

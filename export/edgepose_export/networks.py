@@ -13,16 +13,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from edgepose.features import (
-    ACCELERATIONS,
-    INPUTS,
-    local_rotations,
-    nearest_rotation,
-    network_input,
-    rotation_from_6d,
-)
-from edgepose.placements import BONES, ROOT
+from edgepose.features import ACCELERATIONS, local_rotations, nearest_rotation, rotation_from_6d
+from edgepose.placements import BONES, PLACEMENTS, ROOT
 from edgepose.skeleton import PARENTS, PREDICTED, UNOBSERVED
+from edgepose_export.normalisation import Inputs
 
 SIGMA_FLOOR = 0.02
 """Smallest standard deviation a network may claim, in normalised units.
@@ -35,18 +29,28 @@ class NetworkShape(NamedTuple):
     """What decides the weights' shapes and the meaning of the outputs.
 
     Attributes:
-        kind: "birnn" or "rnn".
-        hidden: units of the dense layer and of each LSTM direction; 512 in the paper.
+        kind: "birnn" or "rnn" (DIP 3.4), "feed-forward" or "wavenet" (DIP appendix A).
+        hidden: units of the dense layer and of each LSTM direction, or of the widest layer; 512 in the paper.
         targets: "local-matrix" (the paper: 9 numbers of each local rotation) or "global-6d" (6 numbers of
             each rotation in the root's frame).
         measured: "predicted" (the paper: all 15 joints come from the network) or "passed" (bones that carry a
             sensor take its orientation; the network predicts the other 10). "passed" needs "global-6d".
+        normalisation: of the inputs, one of `normalisation.SCHEMES`.
+        acceleration: whether accelerations are inputs (without: DIP appendix D).
     """
 
     kind: str = "birnn"
     hidden: int = 512
     targets: str = "local-matrix"
     measured: str = "predicted"
+    normalisation: str = "root"
+    acceleration: bool = True
+
+    @property
+    def inputs(self) -> int:
+        """Numbers of the input: 60 in the paper."""
+        sensors = len(PLACEMENTS) - (self.normalisation == "root")
+        return sensors * (9 + 3 * self.acceleration)
 
     @property
     def joints(self) -> tuple[int, ...]:
@@ -74,14 +78,14 @@ class PoseNetwork(nn.Module):
         both = shape.kind == "birnn"
         width = shape.hidden * (2 if both else 1)
         outputs = shape.pose_outputs + ACCELERATIONS
-        self.dense = nn.Linear(INPUTS, shape.hidden)
+        self.dense = nn.Linear(shape.inputs, shape.hidden)
         self.lstm1 = nn.LSTM(shape.hidden, shape.hidden, batch_first=True, bidirectional=both)
         self.lstm2 = nn.LSTM(width, shape.hidden, batch_first=True, bidirectional=both)
         self.mean = nn.Linear(width, outputs)
         self.deviation = nn.Linear(width, outputs)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Normalised means and standard deviations (B, T, outputs) of z-scored inputs (B, T, 60)."""
+        """Normalised means and standard deviations (B, T, outputs) of z-scored inputs (B, T, inputs)."""
         x = torch.relu(self.dense(x))
         x, _ = self.lstm1(x)
         x, _ = self.lstm2(x)
@@ -103,6 +107,7 @@ class PoseDecoder(nn.Module):
         self.register_buffer("source", torch.tensor(_sources(shape)))
         self.register_buffer("parents", torch.tensor(PARENTS[1:]))
         self.register_buffer("std_source", torch.tensor(_std_sources(shape)))
+        self.register_buffer("std_scale", torch.ones(len(PARENTS)))
         # A small rotation by d moves a matrix's entries by sqrt(2) d, those of its first two columns by
         # sqrt(4/3) d on average.
         self.spread = 2.0 if self.local else 4.0 / 3.0
@@ -124,6 +129,7 @@ class PoseDecoder(nn.Module):
         sigma = (deviation[..., :size] * self.target_std).unflatten(-1, (self.joints, self.numbers))
         std = torch.sqrt(sigma.square().sum(-1) / self.spread)
         std = torch.cat([torch.zeros_like(std[..., :1]), std], dim=-1).index_select(-1, self.std_source)
+        std = std * self.std_scale
         y = y.unflatten(-1, (self.joints, self.numbers))
         root = orientation[..., -1, :, :]
         identity = torch.eye(3, dtype=y.dtype).expand_as(root).unsqueeze(-3)
@@ -212,18 +218,17 @@ class Ends(nn.Module):
     def __init__(
         self, network: PoseNetwork, input_mean: Tensor, input_std: Tensor, decoder: PoseDecoder
     ) -> None:
-        """Takes the network's dense layers and the statistics of its inputs (60,)."""
+        """Takes the network's dense layers and the statistics of its inputs, 60 in the paper."""
         super().__init__()
-        self.register_buffer("input_mean", input_mean)
-        self.register_buffer("input_std", input_std)
+        shape = network.shape
+        self.inputs = Inputs(shape.normalisation, shape.acceleration, input_mean, input_std)
         self.dense, self.mean, self.deviation = network.dense, network.mean, network.deviation
         self.decoder = decoder
         self.floor = SIGMA_FLOOR
 
     def forward(self, orientation: Tensor, acceleration: Tensor) -> Tensor:
         """First hidden layer (..., hidden) of calibrated frames."""
-        x = (network_input(orientation, acceleration) - self.input_mean) / self.input_std
-        return torch.relu(self.dense(x))
+        return torch.relu(self.dense(self.inputs(orientation, acceleration)))
 
     @torch.jit.export
     def pose(self, orientation: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,14 @@ import torch
 from torch import Tensor, nn
 
 from edgepose.errors import EdgeposeError
-from edgepose.features import ACCELERATIONS, network_input, rotation_to_6d
+from edgepose.features import ACCELERATIONS, rotation_to_6d
 from edgepose.skeleton import PARENTS
-from edgepose_export.archive import Statistics
+from edgepose_export.archive import KINDS, Statistics, new_network
 from edgepose_export.augmentation import Augmentation, augment
-from edgepose_export.dataset import Tape
-from edgepose_export.networks import NetworkShape, PoseNetwork
+from edgepose_export.dataset import Tape, describe
+from edgepose_export.networks import NetworkShape
+from edgepose_export.normalisation import SCHEMES, network_inputs, seen_from_first
+from edgepose_export.processes import ALONE, Processes
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -40,14 +43,16 @@ class TrainConfig:
         augmentation: disturbances of the batches.
         beta: weight of the beta-likelihood (Seitzer et al. 2022); 0 is the paper's Gaussian likelihood, which
             lets entries that never move take all gradient.
+        acceleration_loss: whether the network shall give back the input accelerations too (DIP 3.4.2).
         steps: optimiser steps.
-        sequences: sequences a step.
+        sequences: sequences a step, of all processes together.
         window: frames a sequence.
         joined: sequences may run over the ends of takes: a network that is never reset learns to recover from
             a jump.
         free_share: share of the sequences taken from CMU's takes.
         input_dropout: share of the inputs set to zero (DIP: 0.2).
         learning_rate: of Adam.
+        warm_up: steps in which the learning rate rises to its first value.
         schedule: "exponential" (DIP: times 0.96 every 2000 steps) or "cosine" down to zero at the last step.
         averaging: decay of the exponential moving average of the weights; 0 for none.
         patience: stop after so many validations without a better likelihood; 0 never.
@@ -59,6 +64,7 @@ class TrainConfig:
     network: NetworkShape = field(default_factory=NetworkShape)
     augmentation: Augmentation = field(default_factory=Augmentation)
     beta: float = 0.0
+    acceleration_loss: bool = True
     steps: int = 100_000
     sequences: int = 64
     window: int = 120
@@ -66,6 +72,7 @@ class TrainConfig:
     free_share: float = 0.0
     input_dropout: float = 0.2
     learning_rate: float = 1e-3
+    warm_up: int = 200
     schedule: str = "exponential"
     averaging: float = 0.0
     patience: int = 10
@@ -77,15 +84,39 @@ class TrainConfig:
 def read_config(path: Path) -> TrainConfig:
     """A TOML file with TrainConfig's fields, `[network]` and `[augmentation]` tables.
 
+    With `base = "NAME"` it says only what differs from NAME.toml in the same folder.
+
     Raises:
         EdgeposeError: no file, not TOML, an unknown field, or a value of a wrong type or out of its range.
     """
+    values = _toml(path)
     try:
-        return config_from(tomllib.loads(path.read_text(encoding="utf-8")))
+        if "base" in values:
+            name = values.pop("base")
+            if not isinstance(name, str):
+                raise ValueError(f"base is {name!r}; it takes the name of a config beside this one")
+            values = _over(_toml(path.with_name(f"{name}.toml")), values)
+        return config_from(values)
+    except ValueError as error:
+        raise EdgeposeError(f"{path}: {error}") from error
+
+
+def _toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise EdgeposeError(f"{path}: {error.strerror}") from error
     except ValueError as error:
         raise EdgeposeError(f"{path}: {error}") from error
+
+
+def _over(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    """Values laid over those of a base, tables entry by entry."""
+    result = base | values
+    for name, table in values.items():
+        if isinstance(table, dict) and isinstance(base.get(name), dict):
+            result[name] = base[name] | table
+    return result
 
 
 def config_from(values: dict[str, Any]) -> TrainConfig:
@@ -108,11 +139,14 @@ def config_from(values: dict[str, Any]) -> TrainConfig:
     )
     if config.network.measured == "passed" and config.network.targets != "global-6d":
         raise ValueError('measured = "passed" needs targets = "global-6d"')
+    if config.acceleration_loss and not config.network.acceleration:
+        raise ValueError("a network without accelerations cannot give them back: acceleration_loss = false")
     return config
 
 
 _CHOICES = {
-    "kind": ("birnn", "rnn"),
+    "kind": tuple(KINDS),
+    "normalisation": SCHEMES,
     "targets": ("local-matrix", "global-6d"),
     "measured": ("predicted", "passed"),
     "schedule": ("exponential", "cosine"),
@@ -126,6 +160,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "validate_every": (1, 10**9),
     "seed": (0, 2**62),
     "learning_rate": (1e-12, 10.0),
+    "warm_up": (0, 10**9),
     "averaging": (0.0, 1.0),
     "input_dropout": (0.0, 0.99),
     "free_share": (0.0, 1.0),
@@ -174,18 +209,34 @@ def pose_targets(relative: Tensor, shape: NetworkShape) -> Tensor:
     return torch.matmul(parents, relative[..., joints, :, :]).flatten(-3)
 
 
-def statistics_of(tape: Tape, shape: NetworkShape) -> Statistics:
-    """Means and deviations over a training tape (DIP 4.4).
+def inputs_of(orientation: Tensor, acceleration: Tensor, shape: NetworkShape) -> Tensor:
+    """Inputs (..., T, inputs) of sequences, before z-scoring."""
+    if shape.normalisation == "sequence":
+        orientation, acceleration = seen_from_first(orientation, acceleration)
+    return network_inputs(orientation, acceleration, shape.normalisation, shape.acceleration)
+
+
+def statistics_of(tape: Tape, shape: NetworkShape, processes: Processes = ALONE) -> Statistics:
+    """Means and deviations over the training tapes of all processes (DIP 4.4).
 
     Local matrices are z-scored entry by entry as in the paper. Global rotations get one deviation for all
     entries, so that a degree weighs the same at every joint.
     """
-    inputs = network_input(tape.orientation, tape.acceleration)
-    targets = pose_targets(tape.relative, shape)
-    deviation = targets.std(0).clamp_min(1e-2)
+    moments = torch.zeros(2, shape.inputs + shape.pose_outputs, dtype=torch.float64)
+    # Take by take: a tape may be larger than the memory.
+    for start, end in pairwise(tape.starts.tolist()):
+        x = inputs_of(tape.orientation[start:end], tape.acceleration[start:end], shape)
+        numbers = torch.cat([x, pose_targets(tape.relative[start:end], shape)], dim=-1).double()
+        moments += torch.stack([numbers.sum(0), numbers.square().sum(0)])
+    count = float(processes.total(tape.starts[-1]))
+    mean, square = processes.total(moments) / count
+    deviation = ((square - mean.square()).clamp_min(0.0) * (count / (count - 1.0))).sqrt()
+    input_mean, target_mean = mean.float().split([shape.inputs, shape.pose_outputs])
+    input_std, target_std = deviation.float().split([shape.inputs, shape.pose_outputs])
+    target_std = target_std.clamp_min(1e-2)
     if shape.targets == "global-6d":
-        deviation = deviation.square().mean().sqrt().expand_as(deviation).clone()
-    return Statistics(inputs.mean(0), inputs.std(0).clamp_min(1e-3), targets.mean(0), deviation)
+        target_std = target_std.square().mean().sqrt().expand_as(target_std)
+    return Statistics(input_mean.clone(), input_std.clamp_min(1e-3), target_mean.clone(), target_std.clone())
 
 
 def likelihood_loss(mean: Tensor, deviation: Tensor, target: Tensor, beta: float) -> Tensor:
@@ -235,55 +286,84 @@ def windows(tape: Tape, starts: Tensor, length: int) -> tuple[Tensor, Tensor, Te
     return tape.orientation[index], tape.acceleration[index], tape.relative[index]
 
 
+def describe_tape(tape: Tape, processes: Processes = ALONE) -> dict[str, Any]:
+    """What an archive's card says of the takes of all processes."""
+    shares = processes.everywhere((tape.licenses, int(tape.starts[-1])))
+    licenses = [text for texts, _ in shares for text in texts]
+    return describe(licenses, len(licenses), sum(frames for _, frames in shares))
+
+
 # --- the run ------------------------------------------------------------------------------------------------
 
 
 class Trainer:
     """State of one run: network, averaged weights, optimiser, generator, step."""
 
-    def __init__(self, config: TrainConfig, train: Tape, validation: Tape, data: dict[str, Any]) -> None:
+    def __init__(
+        self,
+        config: TrainConfig,
+        train: Tape,
+        validation: Tape,
+        data: dict[str, Any],
+        processes: Processes = ALONE,
+    ) -> None:
         """Starts a run at step 0.
 
         Args:
             config: of the run.
-            train: takes to train on.
-            validation: takes that tell when to stop.
+            train: takes to train on, this process's share.
+            validation: takes that tell when to stop, this process's share.
             data: what the training takes are, for the archive's card: summary, takes, hours, licenses.
+            processes: that train together.
         """
         torch.manual_seed(config.seed)
         self.config, self.train_tape, self.validation_tape = config, train, validation
-        self.data = data
-        self.statistics = statistics_of(train, config.network)
-        self.network = PoseNetwork(config.network)
-        self.averaged = PoseNetwork(config.network)
-        self.averaged.load_state_dict(self.network.state_dict())
-        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate)
-        self.generator = torch.Generator().manual_seed(config.seed + 1)
+        self.data, self.processes = data, processes
         self.starts = window_starts(train, config.window, config.joined)
-        for part, starts in (
-            ("training", self.starts),
-            ("validation", window_starts(validation, config.window, False)),
-        ):
-            if not any(map(len, starts)):
-                raise EdgeposeError(f"no {part} take is as long as the window of {config.window} frames")
+        counts = processes.everywhere(len(torch.cat(self.starts)))
+        if not all(counts):
+            at = f"process {counts.index(0)} has " if processes.size > 1 else ""
+            raise EdgeposeError(f"{at}no training take is as long as the window of {config.window} frames")
+        if not any(processes.everywhere(len(self._validation_starts()))):
+            raise EdgeposeError(f"no validation take is as long as the window of {config.window} frames")
+        if config.sequences % processes.size:
+            raise EdgeposeError(
+                f"{config.sequences} sequences a step cannot be shared by {processes.size} processes equally"
+            )
+        self.statistics = self._placed(statistics_of(train, config.network, processes))
+        self.network = new_network(config.network).to(processes.device)
+        self.averaged = new_network(config.network).to(processes.device)
+        self.averaged.load_state_dict(self.network.state_dict())
+        self.parallel = processes.wrapped(self.network)
+        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate)
+        self._seed(0)
         self.step = 0
         self.best = math.inf
         self.worse = 0
 
+    def _seed(self, step: int) -> None:
+        """Random numbers of this process from a step on."""
+        number = self.config.seed + step * self.processes.size + self.processes.rank
+        self.generator = torch.Generator().manual_seed(number + 1)
+        if self.processes.rank:
+            torch.manual_seed(number)
+
+    def _placed(self, statistics: Statistics) -> Statistics:
+        return Statistics(*(numbers.to(self.processes.device) for numbers in statistics))
+
     def _loss(self, network: nn.Module, batch: tuple[Tensor, Tensor, Tensor], dropout: float) -> Tensor:
-        orientation, acceleration, relative = batch
-        s = self.statistics
-        x = (network_input(orientation, acceleration) - s.input_mean) / s.input_std
-        target = torch.cat(
-            [
-                (pose_targets(relative, self.config.network) - s.target_mean) / s.target_std,
-                x[..., -ACCELERATIONS:],
-            ],
-            dim=-1,
-        )
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.config.bf16):
+        config, s = self.config, self.statistics
+        orientation, acceleration, relative = (part.to(self.processes.device) for part in batch)
+        x = (inputs_of(orientation, acceleration, config.network) - s.input_mean) / s.input_std
+        target = (pose_targets(relative, config.network) - s.target_mean) / s.target_std
+        if config.acceleration_loss:
+            target = torch.cat([target, x[..., -ACCELERATIONS:]], dim=-1)
+        with torch.autocast(x.device.type, torch.bfloat16, enabled=config.bf16):
             mean, deviation = network(nn.functional.dropout(x, dropout, training=dropout > 0))
-        return likelihood_loss(mean.float(), deviation.float(), target, self.config.beta)
+        numbers = target.shape[-1]
+        return likelihood_loss(
+            mean[..., :numbers].float(), deviation[..., :numbers].float(), target, config.beta
+        )
 
     def train_step(self) -> float:
         """One optimiser step; gives its loss."""
@@ -294,10 +374,11 @@ class Trainer:
             else 0.5 * (1.0 + math.cos(math.pi * self.step / config.steps))
         )
         for group in self.optimiser.param_groups:
-            group["lr"] = rate * min(1.0, (self.step + 1) / 200)
-        starts = draw(self.starts, config.sequences, config.free_share, self.generator)
+            group["lr"] = rate * min(1.0, (self.step + 1) / (config.warm_up + 1))
+        count = config.sequences // self.processes.size
+        starts = draw(self.starts, count, config.free_share, self.generator)
         batch = augment(windows(self.train_tape, starts, config.window), config.augmentation, self.generator)
-        loss = self._loss(self.network, batch, config.input_dropout)
+        loss = self._loss(self.parallel, batch, config.input_dropout)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
@@ -308,30 +389,33 @@ class Trainer:
         with torch.no_grad():
             for mean, new in zip(self.averaged.parameters(), self.network.parameters(), strict=True):
                 mean.lerp_(new, 1.0 - decay)
-        return loss.item()
+        return self.processes.total(loss.detach()).item() / self.processes.size
+
+    def _validation_starts(self) -> Tensor:
+        window = self.config.window
+        return torch.cat(window_starts(self.validation_tape, window, False))[:: max(1, window // 2)]
 
     @torch.no_grad()
     def validate(self) -> float:
         """Loss of the averaged weights on undisturbed validation windows."""
-        config = self.config
-        pools = window_starts(self.validation_tape, config.window, False)
-        starts = torch.cat(pools)[:: max(1, config.window // 2)]
-        losses = [
-            self._loss(self.averaged, windows(self.validation_tape, part, config.window), 0.0) * len(part)
-            for part in starts.split(128)
-        ]
-        return float(torch.stack(losses).sum() / len(starts))
+        starts, total = self._validation_starts(), torch.zeros(2)
+        for part in starts.split(128) if len(starts) else ():
+            batch = windows(self.validation_tape, part, self.config.window)
+            total += torch.stack([self._loss(self.averaged, batch, 0.0).cpu(), torch.tensor(1.0)]) * len(part)
+        loss, count = self.processes.total(total)
+        return float(loss / count)
 
     def state(self) -> dict[str, Any]:
-        """Everything that `load` needs, as tensors and plain values."""
+        """Everything that `load` needs, as tensors and plain values; all processes have to ask together."""
+        generators = self.processes.everywhere((self.generator.get_state(), torch.get_rng_state()))
         return {
             "config": json.dumps(config_values(self.config)),
             "statistics": {name: value.clone() for name, value in self.statistics._asdict().items()},
             "network": self.network.state_dict(),
             "averaged": self.averaged.state_dict(),
             "optimiser": self.optimiser.state_dict(),
-            "generator": self.generator.get_state(),
-            "torch_generator": torch.get_rng_state(),
+            "generator": torch.stack([state for state, _ in generators]),
+            "torch_generator": torch.stack([state for _, state in generators]),
             "step": self.step,
             "best": self.best,
             "worse": self.worse,
@@ -339,7 +423,7 @@ class Trainer:
         }
 
     def load(self, state: dict[str, Any]) -> None:
-        """Goes on where a checkpoint stopped.
+        """Goes on where a checkpoint stopped, with the same random numbers if the processes are as many.
 
         Raises:
             EdgeposeError: the checkpoint is of another network, or holds weights only.
@@ -347,12 +431,16 @@ class Trainer:
         if "optimiser" not in state:
             raise EdgeposeError("the checkpoint holds weights only; begin a new run from it with --init")
         self._check_shape(state)
-        self.statistics = Statistics(**state["statistics"])
+        self.statistics = self._placed(Statistics(**state["statistics"]))
         self.network.load_state_dict(state["network"])
         self.averaged.load_state_dict(state["averaged"])
         self.optimiser.load_state_dict(state["optimiser"])
-        self.generator.set_state(state["generator"])
-        torch.set_rng_state(state["torch_generator"])
+        rank, states = self.processes.rank, torch.atleast_2d(state["generator"])
+        if len(states) == self.processes.size:
+            self.generator.set_state(states[rank])
+            torch.set_rng_state(torch.atleast_2d(state["torch_generator"])[rank])
+        else:
+            self._seed(state["step"])
         self.step, self.best, self.worse = state["step"], state["best"], state["worse"]
         self.data = state["data"]
 
@@ -365,7 +453,7 @@ class Trainer:
             EdgeposeError: the checkpoint is of another network.
         """
         self._check_shape(state)
-        self.statistics = Statistics(**state["statistics"])
+        self.statistics = self._placed(Statistics(**state["statistics"]))
         self.network.load_state_dict(state["averaged"])
         self.averaged.load_state_dict(state["averaged"])
         before = state["data"]
@@ -409,7 +497,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         EdgeposeError: missing or not a checkpoint.
     """
     try:
-        state = torch.load(path, weights_only=True)
+        state = torch.load(path, weights_only=True, map_location="cpu")
     except OSError as error:
         raise EdgeposeError(f"{path}: {error.strerror or error}") from error
     except Exception as error:
@@ -417,7 +505,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     if not isinstance(state, dict) or not set(_WEIGHTS_ONLY) <= set(state):
         raise EdgeposeError(f"{path}: not a checkpoint of edgepose train (entries are missing)")
     try:
-        network = PoseNetwork(config_from(json.loads(state["config"])).network)
+        network = new_network(config_from(json.loads(state["config"])).network)
         network.load_state_dict(state["averaged"])
         Statistics(**state["statistics"])
     except (TypeError, ValueError, RuntimeError, AttributeError) as error:
@@ -459,15 +547,18 @@ def fit(
             better = validation < trainer.best
             trainer.best, trainer.worse = (validation, 0) if better else (trainer.best, trainer.worse + 1)
             state = trainer.state()
-            save_checkpoint(state, folder / CHECKPOINT)
-            if better:
-                save_checkpoint({k: state[k] for k in _WEIGHTS_ONLY}, folder / "best.pt")
-            with (folder / "log.jsonl").open("a") as log:
-                log.write(
-                    json.dumps({"step": trainer.step, "train": total / count, "validation": validation})
-                    + "\n"
-                )
+            if trainer.processes.rank == 0:
+                line = {"step": trainer.step, "train": total / count, "validation": validation}
+                _write(state, better, line, folder)
             on_validation(trainer.step, total / count, validation)
             total, count = 0.0, 0
             if config.patience and trainer.worse >= config.patience:
                 return
+
+
+def _write(state: dict[str, Any], better: bool, line: dict[str, float], folder: Path) -> None:
+    save_checkpoint(state, folder / CHECKPOINT)
+    if better:
+        save_checkpoint({k: state[k] for k in _WEIGHTS_ONLY}, folder / "best.pt")
+    with (folder / "log.jsonl").open("a") as log:
+        log.write(json.dumps(line) + "\n")

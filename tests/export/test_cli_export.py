@@ -120,7 +120,7 @@ def test_metadata(made):
     assert about["revision"] is None or len(about["revision"]) == 40
     assert set(about["measures"]) == {"cmu-walk-run", "cmu-02", "bandai-styles"}
     for rows in about["measures"].values():
-        assert len(rows) == 6
+        assert len(rows) == 9
         for measures in rows.values():
             mean, deviation, frames = measures["sip_error_deg"]
             assert mean > 0
@@ -177,8 +177,11 @@ def test_models_and_evaluate(made):
         "online, stream (5 future)",
         "offline, whole take",
         "mean pose",
+        "frozen calibration pose",
+        "measured bones, others' mean local pose",
         "measured bones, others interpolated",
         "measured bones, others interpolated + mean offsets",
+        "8 nearest neighbours of the frame",
     ]
     # The archive's own figures come back.
     mean, deviation, _ = archive.inspect(path).metadata["measures"]["cmu-02"]["offline, whole take"][

@@ -11,10 +11,11 @@ from edgepose.errors import EdgeposeError
 from edgepose.placements import BONES
 from edgepose.skeleton import PREDICTED, UNOBSERVED, default_body, forward_kinematics
 from edgepose_export import baselines, evaluation
-from edgepose_export.dataset import HELD_OUT, Take, describe_takes, part_of, read_take
+from edgepose_export.dataset import Take, describe, read_take
 from edgepose_export.evaluation import Mode, run_archive
 from edgepose_export.mocap import read_motion, resample
 from edgepose_export.networks import NetworkShape
+from edgepose_export.splits import HELD_OUT, part_of
 from edgepose_export.synthesis import recording_arrays, virtual_imus
 
 WALK = Path(__file__).parents[1] / "data" / "mocap" / "dataset-2_walk_normal_001.bvh"
@@ -87,7 +88,8 @@ def test_modes():
 def test_measures_are_over_all_frames_of_all_takes(wearers):
     takes = [made_up(wearers, frames, seed) for frames, seed in ((20, 1), (9, 2))]
     guess = made_up(wearers, 20, 3).pose.astype(float)
-    table = evaluation.evaluate(takes, {"a guess": lambda takes: [guess[: len(take.pose)] for take in takes]})
+    methods = {"a guess": lambda takes: [guess[: len(take.pose)] for take in takes]}
+    table = evaluation.summarise(evaluation.collect(takes, methods))
     offsets = default_body().offsets
     parts = [metrics.per_frame(guess[: len(t.pose)], t.pose.astype(float), offsets, 60.0) for t in takes]
     assert set(table) == {"a guess"}
@@ -103,6 +105,10 @@ def errors(poses, take):
     return metrics.joint_angle_error(poses, take.pose.astype(float), PREDICTED).max()
 
 
+def all_baselines(take, learnt):
+    return {name: method(take, learnt) for name, method in baselines.METHODS.items()}
+
+
 def moving(wearers, frames=50):
     """A take whose poses a test still has to fill in."""
     rng = np.random.default_rng(3)
@@ -116,7 +122,7 @@ def test_mean_pose_is_right_for_who_never_moves(wearers):
     pose = np.tile(take.pose[:1], (50, 1, 1, 1)).astype(float)
     pose[:, 0] = take.orientation[:, 5]
     take = take._replace(pose=pose)
-    got = baselines.poses(take, baselines.learn([take]))["mean pose"]
+    got = baselines.METHODS["mean pose"](take, baselines.learn([take]))
     assert errors(got, take) < 1e-3
     np.testing.assert_allclose(got[:, 0], take.orientation[:, 5])
 
@@ -125,7 +131,7 @@ def test_interpolation_is_right_for_who_moves_so(wearers):
     take = moving(wearers)
     take = take._replace(pose=baselines.interpolated(take))
     learnt = baselines.learn([take])
-    got = baselines.poses(take, learnt)
+    got = all_baselines(take, learnt)
     assert errors(got["measured bones, others interpolated"], take) < 1e-5
     assert errors(got["measured bones, others interpolated + mean offsets"], take) < 1e-3
     np.testing.assert_allclose(learnt.offsets, np.tile(np.eye(3), (24, 1, 1)), atol=1e-6)
@@ -137,7 +143,7 @@ def test_interpolation_with_offsets_is_right_for_who_is_off_so(wearers):
     turns = np.random.default_rng(1).normal(scale=0.3, size=(10, 3))
     offsets[list(UNOBSERVED)] = Rotation.from_rotvec(turns).as_matrix()
     take = take._replace(pose=baselines.interpolated(take, offsets))
-    got = baselines.poses(take, baselines.learn([take]))
+    got = all_baselines(take, baselines.learn([take]))
     assert errors(got["measured bones, others interpolated + mean offsets"], take) < 1e-3
     assert errors(got["measured bones, others interpolated"], take) > 5
 
@@ -189,16 +195,19 @@ def test_tables_of_a_folder(tmp_path, tiny, walk):
     for name in ("01_01", "07_01", "02_01"):
         (tmp_path / name[:2]).mkdir()
         np.savez(tmp_path / name[:2] / f"{name}.npz", **arrays)
-    tables = evaluation.held_out_tables(tiny(RNN), [Mode("offline")], tmp_path, True, ("cmu-02", "all"))
+    methods = evaluation.archive_methods(tiny(RNN), [Mode("offline")])
+    methods |= evaluation.baseline_methods(baselines.learn(evaluation.takes_of(tmp_path, "train")))
+    columns = evaluation.columns_of_parts(methods, tmp_path, ("cmu-02", "all"))
+    tables = {part: evaluation.summarise(rows) for part, rows in columns.items()}
     assert list(tables) == ["cmu-02", "all"]
     for table, frames in zip(tables.values(), (119, 357), strict=True):
-        assert len(table) == 4
+        assert len(table) == 7
         for row in table.values():
             assert set(row) == set(metrics.LABELS)
             assert row["sip_error_deg"].frames == frames
             assert np.isfinite([value.mean for value in row.values()]).all()
     with pytest.raises(EdgeposeError, match="no recording of the part 'bandai-styles'"):
-        evaluation.held_out_tables(tiny(RNN), [Mode("offline")], tmp_path, False)
+        evaluation.columns_of_parts(methods, tmp_path, HELD_OUT)
 
 
 def test_description_of_takes(walk):
@@ -206,7 +215,7 @@ def test_description_of_takes(walk):
         "CMU Graphics Lab Motion Capture Database (mocap.cs.cmu.edu), free for all use",
         "Bandai-Namco Research Motiondataset, CC BY-NC 4.0",
     )
-    about = describe_takes([walk._replace(license=text) for text in (*licenses, licenses[0])])
+    about = describe((*licenses, licenses[0]), 3, 3 * len(walk.pose))
     assert about["summary"] == (
         "Bandai-Namco Research Motiondataset and CMU Graphics Lab Motion Capture Database"
     )

@@ -10,12 +10,13 @@ import pytest
 import torch
 
 from edgepose.errors import EdgeposeError
+from edgepose.features import network_input
 from edgepose.skeleton import PARENTS, PREDICTED, default_body
 from edgepose_export import training
 from edgepose_export.archive import Statistics
 from edgepose_export.augmentation import Augmentation
 from edgepose_export.cli.synthesize import LICENSES
-from edgepose_export.dataset import read_take, read_training_takes, tape
+from edgepose_export.dataset import read_take, tape, training_paths
 from edgepose_export.mocap import read_motion, resample
 from edgepose_export.networks import NetworkShape, PoseDecoder
 from edgepose_export.synthesis import recording_arrays, virtual_imus
@@ -148,7 +149,7 @@ def test_accelerations_are_reconstructed_too(takes):
     batch = training.windows(one.train_tape, torch.tensor([0]), 20)
     s = one.statistics
     targets = (training.pose_targets(batch[2], SMALL.network) - s.target_mean) / s.target_std
-    inputs = training.network_input(*batch[:2])[..., -15:]
+    inputs = network_input(*batch[:2])[..., -15:]
     accelerations = (inputs - s.input_mean[-15:]) / s.input_std[-15:]
     expected = 0.5 * torch.cat([targets, accelerations], -1).square().mean()
     torch.testing.assert_close(one._loss(zero, batch, 0.0), expected)
@@ -187,15 +188,15 @@ def test_takes_that_are_too_short(takes):
 
 
 def test_own_recordings_without_a_validation_part(files, tmp_path):
-    train, validation = read_training_takes(files)
-    assert [take.name for take in validation] == ["01_01"]
+    train, validation = training_paths(files)
+    assert [path.stem for path in validation] == ["01_01"]
     assert len(train) == 2
     (tmp_path / "a.npz").write_bytes((files / "01_01.npz").read_bytes())
     with pytest.raises(EdgeposeError, match="one recording is not enough"):
-        read_training_takes(tmp_path)
+        training_paths(tmp_path)
     (tmp_path / "03_01.npz").write_bytes((files / "01_01.npz").read_bytes())
-    train, validation = read_training_takes(tmp_path)
-    assert [[take.name for take in part] for part in (train, validation)] == [["a"], ["03_01"]]
+    train, validation = training_paths(tmp_path)
+    assert [[path.stem for path in part] for part in (train, validation)] == [["a"], ["03_01"]]
 
 
 def changed(files, path, **arrays):

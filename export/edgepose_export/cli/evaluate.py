@@ -1,17 +1,45 @@
-"""`edgepose evaluate`: measures of a model on takes with known poses."""
+"""`edgepose evaluate`: measures of models on takes with known poses."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+if TYPE_CHECKING:
+    import torch
+
+    from edgepose_export.evaluation import Columns, Mode
+
 MODES = click.Choice(["window", "stream", "offline"])
+PICTURE = click.Path(path_type=Path, dir_okay=False)
+
+NO_WINDOW = {
+    "rnn": "is unidirectional",
+    "feed-forward": "sees a fixed number of frames",
+    "wavenet": "sees a fixed number of frames",
+}
+
+HEAT_MAP_FRAMES = [0, 1, 5, 10, 20, 50, 100, 200]
+"""Past and future frames of DIP's figure 6."""
 
 
-@click.command(short_help="Measure a model against true poses.")
+class _Model(NamedTuple):
+    name: str
+    metadata: dict[str, Any]
+    module: torch.jit.ScriptModule
+    modes: list[Mode]
+
+
+@click.command(short_help="Measure models against true poses.")
 @click.option(
-    "--model", "name", default="birnn", show_default=True, help="Shipped model or an archive's path."
+    "--model",
+    "names",
+    multiple=True,
+    default=["birnn"],
+    show_default=True,
+    help="Shipped model or an archive's path; may be repeated.",
 )
 @click.option(
     "--trust", is_flag=True, help="Load --model although its sum is not known: you vouch for the code in it."
@@ -26,16 +54,15 @@ MODES = click.Choice(["window", "stream", "offline"])
     "--part",
     "parts",
     multiple=True,
-    type=click.Choice(["cmu-walk-run", "cmu-02", "bandai-styles", "all"]),
-    help="Held-out part of the split, or all takes below --data; may be repeated  "
-    "[default: the three held-out parts]",
+    type=click.Choice(["cmu-walk-run", "cmu-02", "bandai-styles", "validation", "all"]),
+    help="Part of the split, or all takes below --data; may be repeated  [default: the three held-out parts]",
 )
 @click.option(
     "--online",
     "modes",
     multiple=True,
     type=MODES,
-    help="How the model runs: as `run` runs it, or over whole takes; may be repeated  "
+    help="How a model runs: as `run` runs it, or over whole takes; may be repeated  "
     "[default: all that apply]",
 )
 @click.option("--past", type=click.IntRange(0, 600), help="Past frames of a window  [default: the model's]")
@@ -43,8 +70,33 @@ MODES = click.Choice(["window", "stream", "offline"])
 @click.option(
     "--baselines", is_flag=True, help="Add trivial baselines, learnt from the training takes below --data."
 )
+@click.option(
+    "--table",
+    type=click.Choice(["2", "3", "4", "5"]),
+    help="Print a table of the Deep Inertial Poser paper: 2 offline; 3 online, windows (20, 5) and (50, 5); "
+    "4 networks without recurrence, online; 5 with and without accelerations, offline.",
+)
+@click.option("--histogram", type=PICTURE, help="Draw the distribution of errors (the paper's figure 5).")
+@click.option(
+    "--heat-map",
+    type=PICTURE,
+    help="Draw the error against past and future frames (the paper's figure 6) of the one bidirectional "
+    "model, instead of tables.",
+)
+@click.option(
+    "--every",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="Frames from one that the heat map measures to the next; all of them take long.",
+)
+@click.option(
+    "--reliability",
+    type=PICTURE,
+    help="Draw actual errors against predicted standard deviations, and print them.",
+)
 def evaluate(
-    name: str,
+    names: tuple[str, ...],
     trust: bool,
     data: Path,
     parts: tuple[str, ...],
@@ -52,32 +104,145 @@ def evaluate(
     past: int | None,
     future: int | None,
     baselines: bool,
+    table: str | None,
+    histogram: Path | None,
+    heat_map: Path | None,
+    every: int,
+    reliability: Path | None,
 ) -> None:
-    """Measure a model against true poses. Every frame counts, those at the start and end of a take too.
+    """Measure models against true poses. Every frame counts, those at the start and end of a take too.
 
     \b
     Examples:
       edgepose evaluate --data recordings/ --baselines
-      edgepose evaluate --data recordings/ --model rnn --part cmu-walk-run
+      edgepose evaluate --data recordings/ --model birnn --model rnn --part cmu-walk-run
       edgepose evaluate --data recordings/ --online window --past 50 --future 5
+      edgepose evaluate --data recordings/ --table 3 --histogram errors.png
+      edgepose evaluate --data recordings/ --part cmu-walk-run --heat-map window.png --every 10
     """
-    from edgepose import archive
-    from edgepose.metrics import format_table
-    from edgepose_export import evaluation
-    from edgepose_export.cli.progress import labelled
+    if table and (modes or past is not None or future is not None):
+        raise click.UsageError("--table says how models run: leave --online, --past and --future out")
+    if heat_map and len(names) > 1:
+        raise click.UsageError("--heat-map is of one model")
+    from edgepose_export.plots import check_picture
+    from edgepose_export.splits import HELD_OUT
 
-    info = archive.inspect(archive.find(name))
+    for picture in (histogram, heat_map, reliability):
+        if picture:
+            check_picture(picture)
+    models = [_model(name, trust, modes, past, future, table) for name in names]
+    chosen = parts or HELD_OUT
+    if heat_map:
+        _heat_map(models[0], data, chosen, every, heat_map)
+    else:
+        _tables(models, data, chosen, baselines, table, histogram)
+    if reliability:
+        _reliability(models, data, chosen, reliability)
+
+
+def _model(
+    name: str, trust: bool, modes: tuple[str, ...], past: int | None, future: int | None, table: str | None
+) -> _Model:
+    from edgepose import archive
+    from edgepose_export.evaluation import modes_of
+    from edgepose_export.paper_tables import TABLES
+
+    path = archive.find(name)
+    info = archive.inspect(path)
     module = archive.load(info, trust)
     about = dict(info.metadata)
-    if about["kind"] == "rnn":
+    if about["kind"] != "birnn":
         if future or past or set(modes) - {"stream", "offline"}:
-            raise click.UsageError(f"{name} is unidirectional: it has no window; use --online stream")
+            raise click.UsageError(
+                f"{name} {NO_WINDOW[about['kind']]}: it has no window; use --online stream"
+            )
     else:
         about["past"] = about["past"] if past is None else past
         about["future"] = about["future"] if future is None else future
-    chosen = [mode for mode in evaluation.modes_of(about) if not modes or mode.name in modes]
-    tables = evaluation.held_out_tables(
-        module, chosen, data, baselines, parts or evaluation.HELD_OUT, labelled("measuring")
-    )
-    for part, table in tables.items():
-        click.echo(f"\n{part}\n{format_table(table)}")
+    if table:
+        ways = TABLES[table].modes(about)
+    else:
+        ways = [mode for mode in modes_of(about) if not modes or mode.name in modes]
+    return _Model(path.stem, about, module, ways)
+
+
+def _named(models: list[_Model], model: _Model, mode: Mode) -> str:
+    return f"{model.name}, {mode}" if len(models) > 1 else str(mode)
+
+
+def _tables(
+    models: list[_Model],
+    data: Path,
+    parts: tuple[str, ...],
+    baselines: bool,
+    table: str | None,
+    histogram: Path | None,
+) -> None:
+    from edgepose.metrics import format_table
+    from edgepose_export import evaluation, plots
+    from edgepose_export.baselines import learn
+    from edgepose_export.cli.progress import labelled
+    from edgepose_export.paper_tables import TABLES, format_paper_table
+
+    methods: dict[str, evaluation.Method] = {}
+    for model in models:
+        ways = evaluation.archive_methods(model.module, model.modes)
+        named = zip(model.modes, ways.values(), strict=True)
+        methods |= {_named(models, model, mode): method for mode, method in named}
+    if baselines:
+        learnt = learn(evaluation.takes_of(data, "train", labelled("learning baselines")))
+        methods |= evaluation.baseline_methods(learnt)
+    columns: dict[str, Columns] = evaluation.columns_of_parts(methods, data, parts, labelled("measuring"))
+    tables = {part: evaluation.summarise(rows) for part, rows in columns.items()}
+    if table:
+        click.echo(format_paper_table(tables, TABLES[table].positions))
+    else:
+        for part, rows in tables.items():
+            click.echo(f"\n{part}\n{format_table(rows)}")
+    if histogram:
+        errors = {
+            part: {name: row["sip_error_deg"] for name, row in rows.items()} for part, rows in columns.items()
+        }
+        plots.histogram(histogram, errors)
+        click.echo(f"wrote {histogram}", err=True)
+
+
+def _heat_map(model: _Model, data: Path, parts: tuple[str, ...], every: int, path: Path) -> None:
+    if model.metadata["kind"] != "birnn":
+        raise click.UsageError(
+            f"{model.name} {NO_WINDOW[model.metadata['kind']]}: it has no window to draw a heat map of"
+        )
+    from edgepose_export import plots
+    from edgepose_export.cli.progress import labelled
+    from edgepose_export.evaluation import takes_of, window_errors
+
+    maps = {}
+    for part in parts:
+        takes = takes_of(data, part, labelled(f"measuring {part}"))
+        means, frames = window_errors(model.module, takes, HEAT_MAP_FRAMES, HEAT_MAP_FRAMES, every)
+        maps[part] = means
+        click.echo(f"\n{part}: SIP error, deg, {frames} frames; rows future, columns past frames")
+        for future, row in zip(HEAT_MAP_FRAMES[::-1], means[::-1], strict=True):
+            click.echo(f"{future:>6}  " + "  ".join(f"{mean:6.2f}" for mean in row))
+        click.echo("        " + "  ".join(f"{past:>6}" for past in HEAT_MAP_FRAMES))
+    plots.heat_map(path, maps, HEAT_MAP_FRAMES, HEAT_MAP_FRAMES)
+    click.echo(f"wrote {path}", err=True)
+
+
+def _reliability(models: list[_Model], data: Path, parts: tuple[str, ...], path: Path) -> None:
+    from edgepose_export import plots
+    from edgepose_export import reliability as rel
+    from edgepose_export.cli.progress import labelled
+    from edgepose_export.evaluation import takes_of
+
+    results: dict[str, dict[str, rel.Reliability]] = {}
+    for part in parts:
+        for model in models:
+            for mode in model.modes:
+                name = _named(models, model, mode)
+                takes = takes_of(data, part, labelled("measuring deviations"))
+                pair = rel.errors_and_deviations(model.module, model.metadata, takes, mode)
+                result = results.setdefault(part, {})[name] = rel.reliability(*pair)
+                click.echo(f"\n{part}: {name}\n{rel.describe(result)}")
+    plots.reliability_plot(path, results)
+    click.echo(f"wrote {path}", err=True)

@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
+
+from edgepose.skeleton import JOINTS
+
+if TYPE_CHECKING:
+    import numpy as np
+    import torch
+    from numpy.typing import NDArray
 
 
 @click.command(short_help="Make an archive of a trained network.")
@@ -35,8 +42,8 @@ import click
     "--measure",
     "data",
     type=click.Path(path_type=Path, exists=True, file_okay=False),
-    help="Folder that `edgepose synthesize` wrote: measure the archive on its held-out takes and put the "
-    "figures into the card.",
+    help="Folder that `edgepose synthesize` wrote: fit the standard deviations to the errors on its "
+    "validation takes, measure the archive on its held-out takes and put the figures into the card.",
 )
 def export(checkpoint: Path, out: Path, past: int, future: int, data: Path | None) -> None:
     """Turn a checkpoint of `edgepose train` into a TorchScript archive for `edgepose run --model FILE
@@ -48,38 +55,73 @@ def export(checkpoint: Path, out: Path, past: int, future: int, data: Path | Non
     """
     if out.suffix != ".pt":
         raise click.UsageError("--out is the name of a .pt file")
+    import torch
+
     from edgepose_export import archive, training
     from edgepose_export.card import card
-    from edgepose_export.networks import PoseNetwork
 
     state = training.read_checkpoint(checkpoint)
     config = training.config_from(json.loads(state["config"]))
-    network = PoseNetwork(config.network)
+    network = archive.new_network(config.network)
     network.load_state_dict(state["averaged"])
-    module = archive.script(network, archive.Statistics(**state["statistics"]))
-    if config.network.kind == "rnn":
-        past, future = 0, 0
+    statistics = archive.Statistics(**state["statistics"])
     metadata = archive.describe(out.stem, network, state, past, future)
+    module = archive.script(network, statistics)
+    if data:
+        fitted = _std_scale(module, metadata, data)
+        metadata["std_scale"] = dict(zip(JOINTS, fitted.tolist(), strict=True))
+        module = archive.script(network, statistics, torch.tensor(fitted))
     archive.save(module, out, metadata)
     if data:
-        metadata["measures"] = _measure(out, data)
+        metadata |= _measures(out, data)
         archive.save(module, out, metadata)
     out.with_suffix(".md").write_text(card(metadata), encoding="utf-8")
     click.echo(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB) and {out.with_suffix('.md')}", err=True)
 
 
-def _measure(path: Path, data: Path) -> dict[str, Any]:
-    """Measures of the archive as a run loads it, with one thread."""
-    from edgepose.archive import inspect, load
+def _std_scale(module: torch.jit.ScriptModule, metadata: dict[str, Any], data: Path) -> NDArray[np.float64]:
+    """Factors (24,) of the joints' standard deviations, from the validation takes."""
+    import numpy as np
+
     from edgepose_export.cli.progress import labelled
-    from edgepose_export.evaluation import held_out_tables, modes_of
+    from edgepose_export.evaluation import modes_of, takes_of
+    from edgepose_export.reliability import errors_and_deviations, scales
+
+    takes = takes_of(data, "validation", labelled("fitting deviations"))
+    (mode,) = (mode for mode in modes_of(metadata) if mode.name == "stream")
+    factors = np.ones(len(JOINTS))
+    rows = [JOINTS.index(name) for name in metadata["joints"]]
+    factors[rows] = scales(*errors_and_deviations(module, metadata, takes, mode))
+    return factors
+
+
+def _measures(path: Path, data: Path) -> dict[str, Any]:
+    """Measures and reliability of the archive as a run loads it, with one thread."""
+    from edgepose.archive import inspect, load
+    from edgepose_export import evaluation
+    from edgepose_export.baselines import learn
+    from edgepose_export.cli.progress import labelled
+    from edgepose_export.reliability import errors_and_deviations, reliability
+    from edgepose_export.splits import HELD_OUT
 
     info = inspect(path)
-    module = load(info, trust=True)
-    tables = held_out_tables(
-        module, modes_of(info.metadata), data, with_baselines=True, progress=labelled("measuring")
-    )
+    module, modes = load(info, trust=True), evaluation.modes_of(info.metadata)
+    learnt = learn(evaluation.takes_of(data, "train", labelled("learning baselines")))
+    methods = evaluation.archive_methods(module, modes) | evaluation.baseline_methods(learnt)
+    columns = evaluation.columns_of_parts(methods, data, HELD_OUT, labelled("measuring"))
+    (mode,) = (mode for mode in modes if mode.name == "stream")
+    deviations = {}
+    for part in HELD_OUT:
+        takes = evaluation.takes_of(data, part, labelled("measuring deviations"))
+        result = reliability(*errors_and_deviations(module, info.metadata, takes, mode))
+        deviations[part] = {"within": list(result.within), "scale": result.scale, "values": result.values}
     return {
-        part: {row: {key: list(m) for key, m in columns.items()} for row, columns in table.items()}
-        for part, table in tables.items()
+        "measures": {
+            part: {
+                row: {key: list(m) for key, m in measures.items()}
+                for row, measures in evaluation.summarise(rows).items()
+            }
+            for part, rows in columns.items()
+        },
+        "deviations": deviations,
     }
