@@ -1,4 +1,7 @@
-"""Make `edgepose/body.json`, the table behind `default_body`, from the open body model Anny.
+"""Make the tables of bodies from the open body model Anny.
+
+`edgepose/body.json` is behind `default_body`; `edgepose/offline/shapes.json` says how a body changes with
+weight and with words such as "long-legged".
 
 Run by a developer, seldom; edgepose itself never needs Anny:
 
@@ -32,6 +35,22 @@ SOURCE = (
     "laid out by tools/make_body.py"
 )
 
+LOCAL_CHANGES = {
+    "long-legged": ("measure-upperleg-height-incr", "measure-lowerleg-height-incr"),
+    "long-armed": ("measure-upperarm-length-incr", "measure-lowerarm-length-incr"),
+    "broad-shouldered": ("measure-shoulder-dist-incr",),
+    "broad-hipped": ("hip-scale-horiz-incr",),
+    "long-necked": ("measure-neck-height-incr",),
+}
+"""Words for a shape and the targets of Anny that make it; the opposites are taken by the negative."""
+STEP = 0.3
+"""How far a word goes, of Anny's 1: some percent of a limb, as one notices."""
+SHAPE_STATURE = 1.75
+BMI_RANGE = (20.0, 32.0)
+"""kg/m^2, between which bodies are taken to change in proportion to their weight."""
+DENSITY = 985.0
+"""kg/m^3 of a whole body, lungs half full."""
+
 FORWARD, UP, LEFT = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])
 WRIST_SENSOR = 0.88
 """Place of the forearm sensor, as a fraction of the way from elbow to wrist."""
@@ -46,19 +65,35 @@ class Anny:
 
     def __init__(self) -> None:
         """Load the model, which takes most of a minute the first time."""
-        self.model = anny.Anny(rig="makehuman", topology="anny").to(dtype=torch.float64)
+        changes = [label for labels in LOCAL_CHANGES.values() for label in labels]
+        self.model = anny.Anny(rig="makehuman", topology="anny", local_changes=changes)
+        self.model = self.model.to(dtype=torch.float64)
         self.faces = self.model.get_triangular_faces().numpy()
 
-    def __call__(self, heights: np.ndarray, gender: float) -> list[tuple[dict[str, np.ndarray], np.ndarray]]:
-        """Bone heads by name and vertices (V, 3), metres, of a body for each of Anny's height values (N,)."""
+    def __call__(
+        self,
+        heights: np.ndarray,
+        gender: float,
+        weight: float = 0.5,
+        muscle: float = 0.5,
+        changes: tuple[str, ...] = (),
+        step: float = 0.0,
+    ) -> list[tuple[dict[str, np.ndarray], np.ndarray]]:
+        """Bone heads by name and vertices (V, 3), metres, of a body for each of Anny's height values (N,).
+
+        The other values are Anny's too: from 0 to 1, `step` of the local `changes` from -1 to 1.
+        """
         n = len(heights)
         values = {label: torch.full((n,), 0.5, dtype=torch.float64) for label in self.model.phenotype_labels}
         values["height"] = torch.as_tensor(heights, dtype=torch.float64)
         values["gender"] = torch.full((n,), gender, dtype=torch.float64)
         values["age"] = torch.full((n,), AGE, dtype=torch.float64)
+        values["weight"] = torch.full((n,), weight, dtype=torch.float64)
+        values["muscle"] = torch.full((n,), muscle, dtype=torch.float64)
+        local = {label: torch.full((n,), step, dtype=torch.float64) for label in changes}
         pose = torch.eye(4, dtype=torch.float64).repeat(n, self.model.bone_count, 1, 1)
         with torch.no_grad():
-            out = self.model(pose_parameters=pose, phenotype_kwargs=values)
+            out = self.model(pose_parameters=pose, phenotype_kwargs=values, local_changes_kwargs=local)
         heads, skin = out["rest_bone_heads"].numpy(), out["rest_vertices"].numpy()
         to_smpl = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
         heads, skin = heads @ to_smpl.T, skin @ to_smpl.T
@@ -185,19 +220,73 @@ def make() -> dict[str, object]:
     return {"format": 1, "source": SOURCE, "units": "m", "statures": list(STATURES), "sexes": sexes}
 
 
-def _rounded(a: np.ndarray) -> list[list[float]]:
+def mass(skin: np.ndarray, faces: np.ndarray) -> float:
+    """Kilograms of a body with this closed skin."""
+    a, b, c = (skin[faces[:, i]] for i in range(3))
+    return DENSITY * abs(float(np.sum(a * np.cross(b, c)))) / 6.0
+
+
+def make_shapes() -> dict[str, object]:
+    """How bodies of one stature change, ready for JSON: with weight for each sex, and with words."""
+    body = Anny()
+
+    def shaped(gender: float, **values: object) -> tuple[np.ndarray, np.ndarray, float]:
+        """Offsets, sensor points and mass of a body, brought to the stature."""
+        grid = np.linspace(0.3, 0.9, 13)
+        reached = [stature(*one) for one in body(grid, gender, **values)]
+        bones, skin = body(np.interp([SHAPE_STATURE], reached, grid), gender, **values)[0]
+        return *lay_out(bones, skin, body.faces), mass(skin, body.faces)
+
+    weights: dict[str, object] = {}
+    for sex, gender in SEXES.items():
+        steps = [(w, shaped(gender, weight=w)) for w in np.linspace(0.1, 0.9, 9)]
+        bmi = [one[2] / SHAPE_STATURE**2 for _, one in steps]
+        light, heavy = (
+            shaped(gender, weight=float(np.interp(b, bmi, [w for w, _ in steps]))) for b in BMI_RANGE
+        )
+        span = (heavy[2] - light[2]) / SHAPE_STATURE**2
+        weights[sex] = {
+            "bmi": round(shaped(gender)[2] / SHAPE_STATURE**2, 2),
+            "offsets": _rounded((heavy[0] - light[0]) / span, 5),
+            "sensors": _rounded((heavy[1] - light[1]) / span, 5),
+        }
+    neutral = SEXES["neutral"]
+    words = {}
+    ways: dict[str, tuple[dict[str, object], dict[str, object]]] = {
+        word: ({"changes": changes, "step": STEP}, {"changes": changes, "step": -STEP})
+        for word, changes in LOCAL_CHANGES.items()
+    }
+    ways["muscular"] = ({"muscle": 0.5 + STEP}, {"muscle": 0.5 - STEP})
+    for word, (more, less) in ways.items():
+        plus, minus = shaped(neutral, **more), shaped(neutral, **less)
+        words[word] = {
+            "offsets": _rounded((plus[0] - minus[0]) / 2.0),
+            "sensors": _rounded((plus[1] - minus[1]) / 2.0),
+        }
+        print(word, *(f"{np.abs(plus[0] - minus[0]).max() / 2.0:.4f} m at most".split()))
+    return {
+        "format": 1,
+        "source": SOURCE,
+        "units": "m; weights: m a kg/m^2",
+        "stature": SHAPE_STATURE,
+        "weights": weights,
+        "words": words,
+    }
+
+
+def _rounded(a: np.ndarray, digits: int = 4) -> list[list[float]]:
     """Tenths of a millimetre, whole numbers without a fraction, which keeps the file small."""
-    return [[int(x) if x == int(x) else float(x) for x in row] for row in np.round(a, 4)]
+    return [[int(x) if x == int(x) else float(x) for x in row] for row in np.round(a, digits)]
 
 
 def main() -> None:
-    """Write the table and print one body of it."""
-    parser = argparse.ArgumentParser(description="make edgepose/body.json from Anny")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "edgepose" / "body.json")
+    """Write both tables."""
+    parser = argparse.ArgumentParser(description="make edgepose's tables of bodies from Anny")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "edgepose")
     out = parser.parse_args().out
-    table = make()
-    out.write_text(json.dumps(table, separators=(",", ":")) + "\n", encoding="utf-8")
-    print(f"{out}: {out.stat().st_size} bytes")
+    for path, table in ((out / "body.json", make()), (out / "offline" / "shapes.json", make_shapes())):
+        path.write_text(json.dumps(table, separators=(",", ":")) + "\n", encoding="utf-8")
+        print(f"{path}: {path.stat().st_size} bytes")
 
 
 if __name__ == "__main__":

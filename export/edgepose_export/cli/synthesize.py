@@ -105,7 +105,7 @@ def synthesize(
       edgepose synthesize mocap/ --out recordings/seated --seated 1
     """
     from edgepose.skeleton import default_body
-    from edgepose_export.body import read_smpl
+    from edgepose.smpl_file import read_smpl
     from edgepose_export.cli.progress import progress
 
     if body_path and height:

@@ -9,7 +9,7 @@ import scipy.sparse
 
 from edgepose.errors import EdgeposeError
 from edgepose.skeleton import PARENTS, default_body, forward_kinematics
-from edgepose_export.body import read_smpl
+from edgepose.smpl_file import read_smpl
 
 
 def made_up(height=1.8):
