@@ -6,6 +6,7 @@
     simulate.py walk.bvh --protocol xsens             six ptys with one device on each
     simulate.py walk.bvh --protocol native-can        CAN frames of a slcan adapter on a pty
     simulate.py walk.bvh --protocol native-can --can socketcan:can0
+    simulate.py walk.bvh --exercises --mounting 7 --raw 6    sensors without a filter, strapped on anyhow
 
 Prints `port NAME[,NAME...]` ready for --port (or `can NAME` ready for --can), `started UNIX_TIME` and
 `ended UNIX_TIME`. A clip stands straight for 6 s first. Ends when standard input closes, though not in the
@@ -25,7 +26,6 @@ import tty
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple, Protocol
 
 import can
@@ -34,7 +34,7 @@ import numpy as np
 
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
-from edgepose.recording import Recording, SensorData, read_recording
+from edgepose.recording import Recording, SensorData, read_recording, write_npz
 from edgepose.skeleton import default_body
 from firmware_protocols.registry import PROTOCOLS, Frame
 from firmware_protocols.registry import Protocol as Format
@@ -63,28 +63,68 @@ class Faults(NamedTuple):
 # --- input --------------------------------------------------------------------------------------------------
 
 
-def read_input(path: Path) -> Recording:
+class Rig(NamedTuple):
+    """What is simulated; fields are the command's flags.
+
+    Attributes:
+        exercises: the wearer of a clip does those of `edgepose calibrate --heading-reset motion` before it.
+        mounting: seed of the angles at which the sensors of a clip are strapped on; None is along the bones.
+        raw: axes of a chip without a filter, 6 or 9; None is an ideal sensor with orientation.
+        seed: of that chip's errors.
+    """
+
+    exercises: bool = False
+    mounting: int | None = None
+    raw: int | None = None
+    seed: int = 0
+
+
+IDEAL = Rig()
+"""Ideal sensors with orientation, along the bones."""
+
+
+def read_input(path: Path, rig: Rig = IDEAL) -> Recording:
     """A recording, or what sensors on the body of a motion-capture clip would have recorded.
 
     Raises:
         EdgeposeError: the file is neither, or the clip jumps in the middle.
     """
-    if not is_motion(path):
-        return read_recording(path)
-    from edgepose_export.cli.synthesize import Job, convert
+    recording = of_clip(path, rig) if is_motion(path) else read_recording(path)
+    if rig.raw is None:
+        return recording
+    from edgepose_export.chip import BMI270, raw
 
-    with TemporaryDirectory() as folder:
-        out = Path(folder)
-        job = Job(out, path.parent, CLIP_RATE, default_body(), CLIP_HOLD_S, None)
-        problem = convert(path, job)
-        if problem is not None:
-            raise EdgeposeError(problem)
-        takes = sorted(out.iterdir())
-        if len(takes) > 1:
-            raise EdgeposeError(
-                f"{path}: jumps; make recordings of its {len(takes)} parts with edgepose synthesize"
-            )
-        return read_recording(takes[0])
+    sensors = {}
+    for i, (name, data) in enumerate(recording.sensors.items()):
+        try:
+            sensors[name] = raw(data, BMI270, rig.seed + i, magnetometer=rig.raw == 9)
+        except ValueError as error:
+            raise EdgeposeError(f"{path}: {name}: {error}") from None
+    return recording._replace(sensors=sensors)
+
+
+def of_clip(path: Path, rig: Rig) -> Recording:
+    """What ideal sensors would have recorded; the wearer stands straight first."""
+    from edgepose_export.exercises import with_exercises
+    from edgepose_export.mocap import pieces, read_motion, resample
+    from edgepose_export.synthesis import random_mounting, recording_arrays, virtual_imus, with_hold
+
+    takes = pieces(read_motion(path))
+    if len(takes) != 1:
+        raise EdgeposeError(
+            f"{path}: jumps; make recordings of its {len(takes)} parts with edgepose synthesize"
+        )
+    motion = resample(takes[0], CLIP_RATE)
+    motion = (with_exercises if rig.exercises else with_hold)(motion, CLIP_HOLD_S)
+    mounting = None if rig.mounting is None else random_mounting(rig.mounting)
+    arrays = recording_arrays(motion, virtual_imus(motion, default_body(), mounting), path.name)
+    sensors = {
+        name: SensorData(
+            arrays["t"], *(arrays[f"{name}_{key}"].astype(float) for key in ("quat", "acc", "gyr"))
+        )
+        for name in PLACEMENTS
+    }
+    return Recording(sensors, {"source": path.name})
 
 
 def is_motion(path: Path) -> bool:
@@ -417,9 +457,8 @@ def parse_kill(ctx: click.Context, param: click.Parameter, values: Sequence[str]
     return tuple(result)
 
 
-def simulate(path: Path, spoken: Format, bus: str | None, stand: bool, faults: Faults) -> None:
-    """Opens the lines and plays the file on them."""
-    recording = read_input(path)
+def simulate(recording: Recording, spoken: Format, bus: str | None, stand: bool, faults: Faults) -> None:
+    """Opens the lines and plays the recording on them."""
     start_s = min(float(data.time_s[0]) for data in recording.sensors.values())
     ids = [0] * len(PLACEMENTS) if spoken.alone else list(spoken.ids)
     if faults.duplicate_id:
@@ -467,6 +506,25 @@ def simulate(path: Path, spoken: Format, bus: str | None, stand: bool, faults: F
     metavar="SENSOR@T..T",
     help="Silent from .. to, s since started.",
 )
+@click.option("--exercises", is_flag=True, help="Before a clip, those of calibrate --heading-reset motion.")
+@click.option(
+    "--mounting",
+    type=int,
+    metavar="SEED",
+    help="Sensors of a clip sit at random angles.",
+)
+@click.option(
+    "--raw",
+    type=click.Choice(["6", "9"]),
+    help="No orientations: rates and forces of a BMI270 with its noise and bias; 9 is with a magnetometer.",
+)
+@click.option("--seed", type=int, default=0, help="Of those errors.")
+@click.option(
+    "--write",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write an .npz and send nothing.",
+)
 @click.option("--duplicate-id", is_flag=True, help="The second sensor has the id of the first.")
 def main(
     recording: Path,
@@ -478,6 +536,11 @@ def main(
     jitter: float,
     drift: float,
     kill: tuple[tuple[int, float, float], ...],
+    exercises: bool,
+    mounting: int | None,
+    raw: str | None,
+    seed: int,
+    write: Path | None,
     duplicate_id: bool,
 ) -> None:
     """The command line."""
@@ -491,7 +554,11 @@ def main(
     # A shell starts what runs in the background deaf to Ctrl-C.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        simulate(recording, spoken, bus, stand, Faults(loss, corrupt, jitter, drift, kill, duplicate_id))
+        played = read_input(recording, Rig(exercises, mounting, None if raw is None else int(raw), seed))
+        if write is not None:
+            write_npz(write, played)
+            return
+        simulate(played, spoken, bus, stand, Faults(loss, corrupt, jitter, drift, kill, duplicate_id))
     except EdgeposeError as error:
         raise click.ClickException(str(error)) from error
     except KeyboardInterrupt:

@@ -1,8 +1,8 @@
 """Heading reset from motion: segments that are flexed show which way their wearer faces.
 
 What was the vertical of a segment in the straight pose leans forward when a trunk bows or a heel is lifted
-behind, and back when a forearm is lifted forward. Turns about that axis, which are larger at arms and legs
-than those of flexion look, do not show in where it points.
+behind, and back when a forearm is lifted forward. Turns of a limb about that axis, which would spoil the
+direction of its angular rate, do not show in where it points.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from edgepose.rotations import Array
 MIN_LEAN_DEG = 6.0
 """Less than this is swaying; walkers' pelves lean by 8 to 10."""
 
-SPREAD_WARNING_DEG, SPREAD_LIMIT_DEG = 15.0, 35.0
-ONE_WAY = 0.2
+SPREAD_WARNING_DEG, SPREAD_LIMIT_DEG = 30.0, 40.0
+ONE_WAY = 0.4
 """Least surplus of lean to one side, as a share: without it forward cannot be told from back."""
 
 
@@ -100,11 +100,14 @@ def _leans(quat: Array, upright: Array) -> Array:
 def _direction(lean: Array) -> tuple[Array, float, float]:
     """Direction (2,) to which it leant most, spread about that line in degrees, surplus over the other way.
 
-    Weighted with the square of the lean.
+    Weighted with the square of the speed, and of the lean where it is about the side.
     """
-    squares, axes = np.linalg.eigh(lean.T @ lean)
+    # How it leans on average is posture, of which little is straight ahead; how that changes is movement.
+    change = np.diff(lean, axis=0)
+    squares, axes = np.linalg.eigh(change.T @ change)
     direction = axes[:, 1]
-    along = float(np.sum(np.linalg.norm(lean, axis=-1) * (lean @ direction)) / max(squares.sum(), 1e-12))
+    size = np.linalg.norm(lean, axis=-1)
+    along = float(size @ (lean @ direction) / max(size @ size, 1e-12))
     spread = np.degrees(np.arctan2(np.sqrt(max(squares[0], 0.0)), np.sqrt(max(squares[1], 1e-12))))
     return (-direction if along < 0 else direction), float(spread), abs(along)
 

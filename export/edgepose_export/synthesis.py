@@ -52,6 +52,11 @@ def with_hold(motion: Motion, seconds: float) -> Motion:
     )
 
 
+def random_mounting(seed: int) -> Array:
+    """R_BS (6, 3, 3) of sensors that are strapped on at random angles."""
+    return rot.rotvec_to_matrix(np.random.default_rng(seed).uniform(-np.pi, np.pi, (6, 3)))
+
+
 class VirtualImus(NamedTuple):
     """What six virtual sensors measure.
 
@@ -91,10 +96,12 @@ def virtual_imus(motion: Motion, body: Body, mounting: Array | None = None) -> V
         sensors = sensors @ mounting
     force_inertial = acceleration @ INERTIAL_FROM_BODY.T + [0.0, 0.0, GRAVITY]
     turns = rot.matrix_to_rotvec(rot.transpose(sensors[:-1]) @ sensors[1:]) * motion.rate
+    # The rate at a frame is between that before and that after it.
+    turns = np.concatenate([turns[:1], 0.5 * (turns[:-1] + turns[1:]), turns[-1:]])
     return VirtualImus(
         orientation=rot.quat_continuous(rot.matrix_to_quat(sensors)),
         force=np.einsum("tsji,tsj->tsi", sensors, force_inertial),
-        rate_of_turn=np.concatenate([turns, turns[-1:]]),
+        rate_of_turn=turns,
     )
 
 

@@ -159,17 +159,12 @@ def convert(path: Path, job: Job) -> str | None:
     """Converts one file, in parts where its source jumps; what was wrong with it, or None."""
     import numpy as np
 
-    from edgepose.rotations import rotvec_to_matrix
     from edgepose_export.mocap import pieces, read_motion, resample
     from edgepose_export.seating import seated
-    from edgepose_export.synthesis import recording_arrays, virtual_imus, with_hold
+    from edgepose_export.synthesis import random_mounting, recording_arrays, virtual_imus, with_hold
 
     try:
-        mounting = None
-        if job.mounting_seed is not None:
-            mounting = rotvec_to_matrix(
-                np.random.default_rng(job.mounting_seed).uniform(-np.pi, np.pi, (6, 3))
-            )
+        mounting = None if job.mounting_seed is None else random_mounting(job.mounting_seed)
         takes = pieces(read_motion(path))
         if not takes:
             return f"{path}: shorter than a second between jumps"

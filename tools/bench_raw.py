@@ -1,0 +1,154 @@
+"""What orientations made here cost in accuracy: a clip on ideal sensors, and on chips without a filter.
+
+Simulated sensors sit at random angles on a body that stands, does the exercises of `edgepose calibrate
+--heading-reset motion`, and then moves as a clip does. Each row changes one thing; errors are those of the
+poses against the clip's own. Of the filters only the heading and the tilt of the measured bones are shown.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import click
+import numpy as np
+
+from edgepose import archive, calibration
+from edgepose import rotations as rot
+from edgepose.metrics import format_table, summary
+from edgepose.placements import BONES, PLACEMENTS
+from edgepose.recording import Recording, SensorData, samples
+from edgepose.rotations import Array
+from edgepose.skeleton import default_body, forward_kinematics, local_from_global
+from edgepose_export.chip import BMI270, Chip, raw
+from edgepose_export.exercises import with_exercises
+from edgepose_export.mocap import Motion, read_motion, resample
+from edgepose_export.synthesis import random_mounting, virtual_imus
+
+CLIP = Path(__file__).parent / "data" / "09_12.bvh"
+RATE, STAND_S, HOLD = 100.0, 6.0, (1.0, 5.0)
+EXERCISES_S = len(calibration.ROUTINE) * calibration.EXERCISE_S
+QUIET = Chip(0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class Way(NamedTuple):
+    """How orientations are made and headings come together: a chip, a filter, a magnetometer, a reset."""
+
+    chip: Chip | None = None
+    filter: str = "none"
+    magnetometer: bool = False
+    reset: str | None = None
+
+
+WAYS = {
+    "ideal orientations": Way(),
+    "ideal, headings from motion": Way(reset="motion"),
+    "kalman, ideal chip, true headings": Way(QUIET, "kalman", reset="true"),
+    "kalman, BMI270, true headings": Way(BMI270, "kalman", reset="true"),
+    "kalman, BMI270, headings from motion": Way(BMI270, "kalman", reset="motion"),
+    "vqf, BMI270, headings from motion": Way(BMI270, "vqf", reset="motion"),
+    "kalman, BMI270 and magnetometer": Way(BMI270, "kalman", magnetometer=True),
+}
+
+
+def ideal(motion: Motion, mounting: Array) -> Recording:
+    """What perfect sensors record."""
+    imus = virtual_imus(motion, default_body(), mounting)
+    time_s = np.arange(len(motion.rotations)) / motion.rate
+    sensors = {
+        name: SensorData(time_s, imus.orientation[:, i], imus.force[:, i], imus.rate_of_turn[:, i])
+        for i, name in enumerate(PLACEMENTS)
+    }
+    return Recording(sensors, {})
+
+
+def oriented(recording: Recording, way: Way, seed: int) -> Recording:
+    """What is left of it after the chip and the filter."""
+    from edgepose.orientation import Orienter
+    from edgepose.recording import from_samples
+
+    if way.chip is None:
+        return recording
+    chips = {
+        name: raw(data, way.chip, seed + i, way.magnetometer)
+        for i, (name, data) in enumerate(recording.sensors.items())
+    }
+    orienter = Orienter(way.filter, way.magnetometer)
+    return from_samples(orienter.orient(list(samples(Recording(chips, {})))))
+
+
+def calibrated(recording: Recording, way: Way, truth: Recording) -> calibration.Calibration:
+    """The calibration from the standing and the exercises."""
+    everything = calibration.hold_from_recording(recording)
+    held = calibration.check_hold(calibration.cut(everything, *HOLD))
+    offset = None
+    if way.reset == "motion":
+        moving = calibration.cut(everything, STAND_S, STAND_S + EXERCISES_S)
+        offset = calibration.headings_from_motion(moving, held.orientation).offset
+    elif way.reset == "true":
+        true = calibration.check_hold(calibration.cut(calibration.hold_from_recording(truth), *HOLD))
+        offset = rot.heading(rot.quat_multiply(true.orientation, rot.quat_conjugate(held.orientation)))
+    elif way.magnetometer:  # the field points along Y of the inertial frame, as headings count here
+        offset = np.zeros(len(PLACEMENTS))
+    return calibration.calibrate(
+        held, pose="straight", body_frame="heading:0", created="", heading_offset=offset
+    )
+
+
+def run(recording: Recording, found: calibration.Calibration, model: str) -> tuple[Array, Array, Array]:
+    """Times (T,), poses (T, 24, 3, 3) and measured bones (T, 6, 3, 3)."""
+    from edgepose.engine import StreamEngine
+    from edgepose.sync import FrameClock
+
+    info = archive.inspect(archive.find(model))
+    engine = StreamEngine(archive.load(info), info.metadata["past"], info.metadata["future"])
+    clock = FrameClock()
+    clock.push(samples(recording), 0.0)
+    bones, outputs, frames = [], [], clock.flush()
+    for frame in frames:
+        r_tb, force = calibration.apply(found, frame.orientation, frame.force)
+        bones.append(r_tb)
+        outputs += engine.push(frame, r_tb.astype(np.float32), force.astype(np.float32))
+    outputs += engine.finish()
+    times = np.array([frame.time_s for frame in frames])
+    return times, np.array([output.rotations for output in outputs], float), np.array(bones)
+
+
+@click.command(help=__doc__)
+@click.option("--model", default="birnn", show_default=True, help="Shipped model.")
+@click.option("--rigs", default=3, show_default=True, help="Mountings and chips to take the mean over.")
+def main(model: str, rigs: int) -> None:
+    """The command line."""
+    motion = with_exercises(resample(read_motion(CLIP), RATE), STAND_S)
+    clip_s = STAND_S + EXERCISES_S + 3.0  # from there on it is the clip
+    offsets = default_body().offsets
+    summaries, bone_lines = {}, []
+    for name, way in WAYS.items():
+        poses, true, apart = [], [], []
+        for seed in range(rigs):
+            truth = ideal(motion, random_mounting(7 + seed))
+            recording = oriented(truth, way, 100 * seed)
+            times, found, bones = run(recording, calibrated(recording, way, truth), model)
+            rows = times >= clip_s
+            nearest = np.round(times[rows] * RATE).astype(int).clip(max=len(motion.rotations) - 1)
+            poses.append(found[rows])
+            true.append(local_from_global(motion.rotations[nearest]))
+            apart.append(np.degrees(errors(bones[rows], forward_kinematics(true[-1], offsets)[0])))
+        summaries[name] = summary(np.concatenate(poses), np.concatenate(true), offsets, 60.0)
+        mean = np.concatenate(apart).mean(axis=0)
+        bone_lines.append(f"{name:38}" + "".join(f"{h:7.1f}/{t:4.1f}" for h, t in mean))
+    click.echo(format_table(summaries))
+    click.echo(f"\nmeasured bones, mean error of heading / tilt, deg: {', '.join(PLACEMENTS)}")
+    click.echo("\n".join(bone_lines))
+
+
+def errors(bones: Array, true: Array) -> Array:
+    """Heading and tilt errors (T, 6, 2) of measured bones (T, 6, 3, 3), rad, against all true ones."""
+    between = rot.matrix_to_quat(bones @ rot.transpose(true[:, list(BONES)]))
+    w, x, y, z = np.moveaxis(between, -1, 0)
+    heading = 2.0 * np.arctan2(np.abs(y), np.abs(w))  # Y of T is up
+    return np.stack([heading, 2.0 * np.arctan2(np.hypot(x, z), np.hypot(w, y))], axis=-1)
+
+
+if __name__ == "__main__":
+    main()
