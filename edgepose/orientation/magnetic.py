@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import atan2, degrees, hypot
+from math import atan2, degrees, hypot, tan
 
 from edgepose.orientation.settings import FilterSettings
-
 
 class _Field:
     """Strength and dip of a field, averaged."""
@@ -37,22 +36,28 @@ class MagneticReference:
         self._other = _Field(0.0, 0.0)
         self._good_s = settings.mag_good_s
         self._rejected_s = 0.0
+        self._settled = False
 
-    def heading(self, field: Sequence[float], duration_s: float, rate: float) -> tuple[float, float] | None:
+    def heading(
+        self, field: Sequence[float], duration_s: float, rate: float, tilt_var: float
+    ) -> tuple[float, float] | None:
         """Heading error, rad, that the mean field of a block shows, and its variance; None if not to be used.
 
         Args:
             field: as the present orientation turns it to the inertial frame.
             duration_s: since the last field.
             rate: mean magnitude of the rotation, rad/s.
+            tilt_var: variance of the present tilt about one axis, rad^2.
         """
         s = self._settings
         x, y, z = field
         level = hypot(x, y)
         norm, dip = hypot(level, z), atan2(-z, level)
-        if self._usual is None:
-            self._usual = _Field(norm, dip)
         usual = self._usual
+        # At first the tilt, and with it the dip, may be so wrong that no field can be told from another.
+        self._settled |= usual is not None and usual.time_s >= s.mag_first_s
+        if usual is None or not (self._settled or self._is_like(usual, norm, dip)):
+            usual = self._usual = _Field(norm, dip)
         if self._is_like(usual, norm, dip):
             self._good_s += duration_s
             self.disturbed = self._good_s < s.mag_good_s
@@ -68,9 +73,13 @@ class MagneticReference:
                 return None
         else:
             self._rejected_s = max(self._rejected_s - duration_s, 0.0)
-        percent = 100.0 * (norm / usual.norm - 1.0)
-        soft = 1.0 + s.mag_soft * (percent**2 + degrees(dip - usual.dip) ** 2)
-        return atan2(x, y), s.mag_heading**2 * max(1.0, s.mag_time / duration_s) * soft
+        soft = 1.0
+        if self._settled:
+            percent = 100.0 * (norm / usual.norm - 1.0)
+            soft += s.mag_soft * (percent**2 + degrees(dip - usual.dip) ** 2)
+        # Errors of fields are alike for a long time: many fields say little more than one.
+        repeats = max(1.0, s.mag_time / duration_s)
+        return atan2(x, y), s.mag_heading**2 * repeats * soft + tilt_var * tan(dip) ** 2
 
     def _follow_other(self, norm: float, dip: float, duration_s: float, rate: float) -> None:
         """Watch the present field, and take it as the usual one if it lasts."""

@@ -40,6 +40,7 @@ class FilterSettings:
             per degree of dip.
         mag_good_s: time without a disturbance before a field is trusted again, s.
         mag_reference_s: time constant of the undisturbed field's strength and dip, s.
+        mag_first_s: time that a field must have stayed what it is to be the first reference, s.
         mag_new_s: time after which a field that stays what it is while the sensor turns is the new
             reference, s.
         mag_new_rate: how fast a sensor must turn for that, rad/s.
@@ -57,14 +58,14 @@ class FilterSettings:
     gyr_noise: float = radians(0.2)
     gyr_noise_per_rate: float = 0.01
     vel_noise: float = 0.03
-    bias_start: float = radians(1.0)
+    bias_start: float = radians(3.0)
     bias_walk: float = radians(0.002)
     scale_start: float = 0.005
     scale_walk: float = 2e-5
     acc_bias_start: float = 0.1
     acc_bias_walk: float = 1e-3
     tilt_start: float = radians(10.0)
-    heading_start: float = radians(30.0)
+    heading_start: float = radians(60.0)
     vel: float = 1.0
     vel_time: float = 1.0
     rest_gyr: float = radians(2.0)
@@ -81,6 +82,7 @@ class FilterSettings:
     mag_soft: float = 0.5
     mag_good_s: float = 0.5
     mag_reference_s: float = 40.0
+    mag_first_s: float = 2.0
     mag_new_s: float = 20.0
     mag_new_rate: float = radians(20.0)
     mag_reject_s: float = 60.0
