@@ -12,6 +12,7 @@ from edgepose.health import POSE_TILT_DEG, REST_ACC, REST_S, SensorHealth
 
 SILENT_S = 1.0
 LOWEST_RATE_HZ = 50.0
+LOSS_LEAST = 20  # where devices send no time, the first ones are guessed
 INVALID_LIMIT_PERCENT = LOSS_LIMIT_PERCENT = 2.0
 INCOMPLETE_LIMIT_PERCENT = 5.0
 JITTER_LIMIT_PERIODS = 0.3
@@ -56,7 +57,7 @@ def judge(sensor: SensorHealth) -> Finding:
 def _no_packets(s: SensorHealth) -> str | None:
     if s.samples:
         return None
-    return "nothing came: switch it on, check its link, and its id or entry in the map of --sensors"
+    return "nothing came: switch it on, check its link, and that its id is right and no other sensor's"
 
 
 def _silent(s: SensorHealth) -> str | None:
@@ -66,7 +67,7 @@ def _silent(s: SensorHealth) -> str | None:
 
 
 def _nothing_to_fuse(s: SensorHealth) -> str | None:
-    if s.acceleration and (s.orientation or s.gyroscope):
+    if math.isnan(s.rate_hz) or (s.acceleration and (s.orientation or s.gyroscope)):
         return None
     missing = "acceleration" if not s.acceleration else "orientation and no rate of turn"
     return f"it sends no {missing}: switch it on in the device's settings"
@@ -178,13 +179,15 @@ def _gyro_scale(s: SensorHealth) -> str | None:
 
 
 def _slow(s: SensorHealth) -> str | None:
+    if math.isnan(s.rate_hz):
+        return f"only {s.samples} samples came: check its settings and its link"
     if s.rate_hz < 0.96 * LOWEST_RATE_HZ:
         return f"{s.rate_hz:.0f} samples a second: set 100, at least {LOWEST_RATE_HZ:g}, and the baud for it"
     return None
 
 
 def _loss(s: SensorHealth) -> str | None:
-    if s.lost_percent > LOSS_LIMIT_PERCENT:
+    if s.lost >= LOSS_LEAST and s.lost_percent > LOSS_LIMIT_PERCENT:
         return (
             f"{s.lost_percent:.1f} % of its samples are missing: "
             "check cable, radio and baud, or send less on this line"

@@ -16,7 +16,7 @@ import numpy as np
 
 from edgepose import rotations as rot
 from edgepose.calibration.bones import Calibration
-from edgepose.calibration.checks import GRAVITY, tilt_deg, two_sensors, why_not_up
+from edgepose.calibration.checks import GRAVITY, GRAVITY_TILT_LIMIT_DEG, tilt_deg, two_sensors, why_not_up
 from edgepose.calibration.headings import RESET_TILT_LIMIT_DEG, headings_from_pose, turn_about_z
 from edgepose.clock import DeviceClock
 from edgepose.imu import ImuSample
@@ -37,6 +37,7 @@ _MOST_PENDING = 5000
 _MOST_ROWS = 10_240  # of a window
 _FEWEST = 20  # samples that tell a period
 _GAP = 1.5  # periods
+_SETTLE_S, _LATE_LEAST_S = 2.0, 3.0  # what has waited in the system comes first
 _RESTS = 8  # attitudes that are kept
 _OTHER_ATTITUDE_DEG = 10.0
 _FROZEN_S = 1.0
@@ -63,7 +64,7 @@ class SensorHealth:
         age_s: of the newest one.
         rate_hz: samples a second, gaps left out.
         jitter_ms: deviation of the intervals, gaps left out.
-        lost_percent: samples missing in the times of the sensor.
+        lost: samples missing in the times of the sensor, lost_percent of all.
         late_ms: 95 % of the packets come no later than this after the fastest ones.
         invalid: samples with a NaN or with a quaternion that is no rotation.
         orientation: whether it sends one; acceleration, gyroscope and magnetometer alike.
@@ -98,6 +99,7 @@ class SensorHealth:
     age_s: float = math.nan
     rate_hz: float = math.nan
     jitter_ms: float = math.nan
+    lost: int = 0
     lost_percent: float = math.nan
     late_ms: float = math.nan
     invalid: int = 0
@@ -193,11 +195,11 @@ class Health:
         for (i, own), (j, other) in combinations(enumerate(values), 2):
             if _FEWEST < len(own) * 0.8 <= len(own & other):
                 result[i].same_as, result[j].same_as = PLACEMENTS[j], PLACEMENTS[i]
-        constant = [sensor.is_constant() for sensor in self._sensors]
-        going_on = sum(own is False for own in constant)
-        for sensor, is_constant in zip(result, constant, strict=True):
-            if is_constant and going_on >= 2:
-                sensor.frozen = "everything"
+        # A simulated rig at rest is constant as a whole, and not quite from the same time on.
+        if sum(sensor.is_constant(_FROZEN_S) is False for sensor in self._sensors) >= 2:
+            for own, sensor in zip(result, self._sensors, strict=True):
+                if sensor.is_constant(2.0 * _FROZEN_S):
+                    own.frozen = "everything"
 
     def _compare_headings(self) -> None:
         """Headings of sensors that are all at rest, if they lie side by side or the wearer stands in the
@@ -241,6 +243,7 @@ class _Sensor:
     def __init__(self) -> None:
         self.pending: list[tuple[float, ...]] = []
         self.window = np.empty((0, _WIDTH))
+        self._first_s = math.nan
         self._fresh = 0  # rows at the end of the window that have not been counted
         self._samples = self._invalid = self._lost = self._counted = 0
         self._moved = self._repeated = self._incomplete = 0
@@ -259,6 +262,8 @@ class _Sensor:
         if self.pending:
             new = np.array(self.pending)
             self.pending = []
+            if not self._samples:
+                self._first_s = float(new[0, _TIME])
             self._samples += len(new)
             self._fresh += len(new)
             rows = np.concatenate([self.window, new])
@@ -294,16 +299,16 @@ class _Sensor:
         """Period, its deviation, and what is missing."""
         intervals = np.diff(self.window[:, _TIME])
         middle = float(np.median(intervals))
-        usual = intervals[intervals < _GAP * middle]
-        if not middle > 0.0 or not len(usual):
+        if not middle > 0.0:
             return
-        # Where much is missing, most of the intervals are multiples.
         steps = intervals / middle
-        if len(usual) < 0.75 * len(intervals) and np.mean(np.abs(steps - np.round(steps)) < 0.2) < 0.9:
-            usual = intervals
+        # Only where nearly all intervals are multiples of one does a long one mean that something is missing.
+        regular = np.mean(np.abs(steps - np.round(steps)) < 0.2) > 0.9
+        usual = intervals[steps < _GAP] if regular else intervals
         self._period_s, self._jitter_s = float(usual.mean()), float(usual.std())
-        steps = np.diff(fresh_s) / self._period_s
-        self._lost += int(np.round(steps[steps > _GAP] - 1.0).sum())
+        if regular:
+            steps = np.diff(fresh_s) / self._period_s
+            self._lost += int(np.round(steps[steps > _GAP] - 1.0).sum())
 
     def _find_rests(self, rows: Array) -> Array:
         """Which rows are at rest; rests of the window become known."""
@@ -378,11 +383,11 @@ class _Sensor:
         """The newest different samples."""
         return {row.tobytes() for row in self.window[-300:, _QUAT.start : _GYR.stop]}
 
-    def is_constant(self) -> bool | None:
-        """Whether all samples of the last two seconds are the same; None if there are too few."""
+    def is_constant(self, seconds: float) -> bool | None:
+        """Whether all samples of the last seconds are the same; None if there are too few."""
         if not len(self.window):
             return None
-        rows = self.window[self.window[:, _TIME] > self.window[-1, _TIME] - 2.0 * _FROZEN_S]
+        rows = self.window[self.window[:, _TIME] > self.window[-1, _TIME] - seconds]
         values = rows[:, _QUAT.start : _GYR.stop]
         if len(values) < _FEWEST:
             return None
@@ -396,8 +401,8 @@ class _Sensor:
         rows = self.window
         result.age_s = max(0.0, now_s - float(rows[-1, _TIME]))
         result.rate_hz, result.jitter_ms = 1.0 / self._period_s, 1e3 * self._jitter_s
-        late_s = rows[:, _ARRIVAL] - rows[:, _TIME]
-        result.late_ms = 1e3 * float(np.percentile(late_s, 95) - np.percentile(late_s, 5))
+        result.late_ms = 1e3 * self._late_s()
+        result.lost = self._lost
         result.lost_percent = 100.0 * self._lost / (self._lost + self._samples)
         for name, has in self._has.items():
             setattr(result, name, has)
@@ -416,6 +421,14 @@ class _Sensor:
         self._report_field(result)
         return result
 
+    def _late_s(self) -> float:
+        """How much later than the fastest packets most come, once the device's clock is known."""
+        rows = self.window[self.window[:, _TIME] > self._first_s + _SETTLE_S]
+        if not len(rows) or rows[-1, _TIME] - rows[0, _TIME] < _LATE_LEAST_S:
+            return math.nan
+        low, high = np.percentile(rows[:, _ARRIVAL] - rows[:, _TIME], [5, 95])
+        return float(high - low)
+
     def _report_rests(self, result: SensorHealth) -> None:
         result.rests = len(self._rests)
         if not self._rests:
@@ -430,8 +443,9 @@ class _Sensor:
         forces = np.stack([own.force for own in self._rests])
         result.gravity_error_m_s2 = float(np.linalg.norm(forces - [0.0, 0.0, GRAVITY], axis=1).max())
         result.tilt_deg = max(map(tilt_deg, forces))
-        quats, accs = (np.stack([getattr(own, name) for own in self._rests]) for name in ("quat", "acc"))
-        result.convention = why_not_up(quats, accs)
+        if result.tilt_deg > GRAVITY_TILT_LIMIT_DEG:
+            quats = np.stack([own.quat for own in self._rests])
+            result.convention = why_not_up(quats, np.stack([own.acc for own in self._rests]))
 
     def _report_turns(self, result: SensorHealth) -> None:
         if self._steps < 10 or not self._turn_squares.all():
@@ -510,6 +524,8 @@ def _frozen(rows: Array) -> str | None:
         "acceleration": _deviation(rows[:, _ACC]) > 1.0,
         "gyroscope": math.degrees(_deviation(rows[:, _GYR])) > 10.0,
     }
+    if np.isfinite(rows[:, _QUAT]).all():
+        del moving["gyroscope"]  # in a wrong unit, its noise looks like movement
     for name, columns in _NAMES.items():
         values = rows[:, columns]
         others = any(is_moving for other, is_moving in moving.items() if other != name)

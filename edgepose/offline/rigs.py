@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from edgepose.offline.kinematics import JOINT_COUNT, TURNS
 from edgepose.offline.prior import Prior
@@ -45,13 +45,13 @@ class Rig(NamedTuple):
     rest: Array
 
 
-def smpl_rig(prior: Prior, bones: Sequence[int]) -> Rig:
+def smpl_rig(prior: Prior, bones: ArrayLike) -> Rig:
     """SMPL's joints with three degrees of freedom each, for sensors on some bones.
 
     A joint that turns none of these bones moves no residual but the prior's, which is Gaussian: its best
     value follows from the other joints and it need not be searched for.
     """
-    seen = np.asarray(TURNS[list(bones)].any(axis=0))
+    seen = np.asarray(TURNS[np.asarray(bones)].any(axis=0))
     seen[0] = True
     chosen = np.flatnonzero(np.repeat(seen, 3))
     inner, others = chosen[3:] - 3, np.flatnonzero(np.repeat(~seen, 3)) - 3

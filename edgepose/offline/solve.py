@@ -57,7 +57,7 @@ class Solution(NamedTuple):
         costs: (T, 4) weighted cost of the terms, as in `edgepose.offline.terms.Costs`.
         turn_rad: (T, N) angle between estimated and measured orientation of each sensor, rad.
         pull: (T, N) length of each sensor's acceleration residual, m/s^2; 0 where none was measured.
-        acceleration: (T, 3) of the pelvis in T, m/s^2.
+        acceleration: (T, 3) of the pelvis in T, m/s^2; NaN where no sensor measured any.
         evaluations: of the cost.
     """
 
@@ -167,7 +167,8 @@ def _problem(measurements: Measurements, part: slice, settings: Settings) -> Pro
 def _solution(problem: Problem, minimum: Minimum, evaluations: int) -> Solution:
     here, valid = minimum.evaluation, problem.valid[..., None]
     left = problem.acceleration - second_difference(here.posed.position, problem.rate)
-    acceleration = (valid * left).sum(axis=1) / np.maximum(valid.sum(axis=1), 1.0)
+    with np.errstate(invalid="ignore"):
+        acceleration = (valid * left).sum(axis=1) / valid.sum(axis=1)
     return Solution(
         rot.rotvec_to_matrix(coordinates(problem.rig, minimum.parameters)),
         np.stack(here.costs, axis=1),
@@ -192,6 +193,6 @@ def _passed_over(before: Solution, after: Solution) -> Solution:
     rotations = after.rotations.copy()
     rotations[:frames] = rot.quat_to_matrix(rot.slerp(first, last, share[:, None]))
     acceleration = after.acceleration.copy()
-    weight = share[:, None]
-    acceleration[:frames] = (1.0 - weight) * before.acceleration + weight * after.acceleration[:frames]
+    # The ends of a chunk have none of their own.
+    acceleration[:frames] = np.where(share[:, None] < 0.5, before.acceleration, acceleration[:frames])
     return after._replace(rotations=rotations, acceleration=acceleration)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from edgepose.skeleton import JOINTS, forward_kinematics
+from edgepose.offline.solve import Solution
+from edgepose.skeleton import JOINTS, forward_kinematics, standing_place
 
 Array = NDArray[np.float64]
 
@@ -22,40 +23,39 @@ _ANKLES = [JOINTS.index("left_ankle"), JOINTS.index("right_ankle")]
 _FLYING = 1e-3  # how much the lower foot counts then
 
 
-def pelvis_path(
-    rotations: Array, offsets: Array, acceleration: Array, valid: NDArray[np.bool_], rate: float
-) -> Array:
-    """Path (T, 3), metres, from the origin: the likeliest for the acceleration and the supporting foot.
+def pelvis_path(solution: Solution, offsets: Array, rate: float) -> Array:
+    """Path (T, 3) in T, metres: the likeliest for the acceleration and the supporting foot.
 
     Integrated twice, an error of the acceleration grows without bound. That the lower foot stands gives the
     speed, except in flight. The path still drifts, by some hundredths of the way; there is no ground in it.
+    It begins over the origin, as high as the pelvis is of someone who stands straight.
 
     Args:
-        rotations: (T, 24, 3, 3) local rotations.
+        solution: poses, and the acceleration that they leave to the pelvis.
         offsets: (24, 3) of the body, metres.
-        acceleration: (T, 3) of the pelvis in T, m/s^2.
-        valid: (T,) whether it was measured.
         rate: frames a second.
     """
+    acceleration = solution.acceleration
     frames = len(acceleration)
     if frames < 3:
-        return np.zeros((frames, 3))
+        return np.tile(standing_place(offsets), (frames, 1))
     from scipy.linalg import solveh_banded
 
     # Speeds v between frames, by least squares: v[t] - v[t-1] is the acceleration over a frame, v is the
     # supporting foot's. Errors last for many frames, so that one of a single frame counts `rate` times less.
-    flies = np.minimum(acceleration[1:, 1], acceleration[:-1, 1]) < FLIGHT
+    flies = np.fmin(acceleration[1:, 1], acceleration[:-1, 1]) < FLIGHT
     stands = np.where(flies, _FLYING, 1.0) / SLIP**2 / rate
-    pushes = np.where(valid[1:-1], rate / ACCELERATION_ERROR**2, 0.0)
+    measured = np.isfinite(acceleration[1:-1, 0])
+    pushes = np.where(measured, rate / ACCELERATION_ERROR**2, 0.0)
     diagonal = stands.copy()
     diagonal[1:] += pushes
     diagonal[:-1] += pushes
-    right = stands[:, None] * _support_speed(rotations, offsets, rate)
-    push = pushes[:, None] * acceleration[1:-1] / rate
+    right = stands[:, None] * _support_speed(solution.rotations, offsets, rate)
+    push = pushes[:, None] * np.nan_to_num(acceleration[1:-1]) / rate
     right[1:] += push
     right[:-1] -= push
     speed = solveh_banded(np.stack([diagonal, np.append(-pushes, 0.0)]), right, lower=True)
-    return np.concatenate([np.zeros((1, 3)), np.cumsum(speed, axis=0) / rate])
+    return standing_place(offsets) + np.concatenate([np.zeros((1, 3)), np.cumsum(speed, axis=0) / rate])
 
 
 def _support_speed(rotations: Array, offsets: Array, rate: float) -> Array:

@@ -111,7 +111,7 @@ def synthesize(
     if body_path and height:
         raise click.UsageError("--body has a height of its own: leave --height out")
     body = read_smpl(body_path) if body_path else default_body(height or 1.75)
-    files = [(root, path) for root in inputs for path in _motion_files(root)]
+    files = [(root, path) for root in inputs for path in motion_files(root)]
     if not files:
         raise EdgeposeError(f"no motion files ({', '.join(KINDS)}) in {', '.join(map(str, inputs))}")
     tasks = [
@@ -149,7 +149,8 @@ def _check_targets(tasks: list[tuple[Path, Job]]) -> None:
         seen[target] = path
 
 
-def _motion_files(root: Path) -> list[Path]:
+def motion_files(root: Path) -> list[Path]:
+    """The motion files below a folder, or the file itself."""
     if root.is_file():
         return [root]
     return sorted(path for path in root.rglob("*") if path.suffix.lower() in KINDS)
