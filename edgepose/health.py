@@ -197,9 +197,9 @@ class Health:
                 result[i].same_as, result[j].same_as = PLACEMENTS[j], PLACEMENTS[i]
         # A simulated rig at rest is constant as a whole, and not quite from the same time on.
         if sum(sensor.is_constant(_FROZEN_S) is False for sensor in self._sensors) >= 2:
-            for own, sensor in zip(result, self._sensors, strict=True):
+            for report, sensor in zip(result, self._sensors, strict=True):
                 if sensor.is_constant(2.0 * _FROZEN_S):
-                    own.frozen = "everything"
+                    report.frozen = "everything"
 
     def _compare_headings(self) -> None:
         """Headings of sensors that are all at rest, if they lie side by side or the wearer stands in the

@@ -245,7 +245,7 @@ def test_the_page_is_drawn_in_place_until_it_is_stopped(stop):
     assert before.startswith("\033[?1049h\033[?25l")
     pages = before.split("\033[H")[1:]
     assert all(page.endswith("\033[J") for page in pages[:-1])
-    title, headline, *_ = plain(pages[-2]).splitlines()
+    title, headline, *_ = plain(pages[-1]).splitlines()
     assert title == f"edgepose check  {port}; Ctrl-C ends"
     assert re.match(r"\d+ s: 6 of 6 sensors fine; packets \d+ good, 0 lost", headline)
     # The table stays when the page has gone, and the cursor is back.
