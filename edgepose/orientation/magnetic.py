@@ -7,6 +7,7 @@ from math import atan2, degrees, hypot, tan
 
 from edgepose.orientation.settings import FilterSettings
 
+
 class _Field:
     """Strength and dip of a field, averaged."""
 
@@ -65,8 +66,7 @@ class MagneticReference:
                 usual.follow(norm, dip, duration_s, s.mag_reference_s)
         else:
             self._good_s, self.disturbed = 0.0, True
-        self._follow_other(norm, dip, duration_s, rate)
-        usual = self._usual
+        usual = self._usual = self._follow_other(usual, norm, dip, duration_s, rate)
         if self.disturbed:
             self._rejected_s = min(self._rejected_s + duration_s, s.mag_reject_s)
             if self._rejected_s < s.mag_reject_s:
@@ -81,8 +81,8 @@ class MagneticReference:
         repeats = max(1.0, s.mag_time / duration_s)
         return atan2(x, y), s.mag_heading**2 * repeats * soft + tilt_var * tan(dip) ** 2
 
-    def _follow_other(self, norm: float, dip: float, duration_s: float, rate: float) -> None:
-        """Watch the present field, and take it as the usual one if it lasts."""
+    def _follow_other(self, usual: _Field, norm: float, dip: float, duration_s: float, rate: float) -> _Field:
+        """Watch the present field; it becomes the usual one if it lasts. Returns the usual one."""
         s = self._settings
         if not self._is_like(self._other, norm, dip):
             self._other = _Field(norm, dip)
@@ -90,8 +90,9 @@ class MagneticReference:
             # A sensor that lies beside a magnet would see the same field for ever.
             self._other.follow(norm, dip, duration_s, s.mag_reference_s)
         if self.disturbed and self._other.time_s >= s.mag_new_s:
-            self._usual, self._other = self._other, _Field(norm, dip)
+            usual, self._other = self._other, _Field(norm, dip)
             self._good_s, self.disturbed, self._rejected_s = s.mag_good_s, False, 0.0
+        return usual
 
     def _is_like(self, field: _Field, norm: float, dip: float) -> bool:
         s = self._settings
