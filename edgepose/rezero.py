@@ -28,6 +28,9 @@ SPREAD_LIMIT_DEG = 3.0
 TILT_LIMIT_DEG = 20.0
 """Gravity shows that the pose is another one, or that a sensor has slipped."""
 
+HELD_LIMIT = 0.5
+"""Largest share of a hold in which a sensor may have been silent."""
+
 BLEND_S = 1.0
 """Seconds in which new headings replace the old ones: networks know limbs that turn, none that jump."""
 
@@ -135,7 +138,8 @@ def _from_hold(calibration: Calibration, frames: list[ImuFrame]) -> HeadingReset
     Raises:
         EdgeposeError: the wearer moved, or gravity says that it is another pose; names the sensors.
     """
-    if silent := _names(np.any([frame.held for frame in frames], axis=0)):
+    # What a short loss repeats is no other pose.
+    if silent := _names(np.mean([frame.held for frame in frames], axis=0) > HELD_LIMIT):
         raise EdgeposeError(f"nothing new from {silent}")
     orientation = np.stack([frame.orientation for frame in frames])
     mean = np.stack([rot.mean_rotation(own) for own in orientation.swapaxes(0, 1)])

@@ -78,14 +78,22 @@ def recorded(
 
 
 def _side_by_side(source: SourceFlags, plan: Plan, orient: Orientations, say: Guide) -> HeadingReset | None:
-    """Heading reset from a recording of the sensors lying side by side, if there is one."""
+    """Heading reset from a recording of the sensors lying side by side, if there is one.
+
+    Raises:
+        EdgeposeError: they do not lie so, or their headings mean nothing in another recording.
+    """
     if plan.lying is None:
         return None
     say(f"Heading reset from {plan.lying}.")
-    lying = source._replace(file=plan.lying, port=None, can=None)
-    return calibration.heading_offsets(
-        _window(str(plan.lying), _read(lying, orient.anew()), None, plan.hold_s, say)[0]
-    )
+    own = orient.anew()
+    everything = _read(source._replace(file=plan.lying, port=None, can=None), own)
+    if not own.north:
+        raise EdgeposeError(
+            "the filter's headings begin anew in each recording, so another one cannot reset them: "
+            "use --heading-reset motion, live or mounting"
+        )
+    return calibration.heading_offsets(_window(str(plan.lying), everything, None, plan.hold_s, say)[0])
 
 
 def _mounted(plan: Plan, summary: HoldSummary) -> HeadingReset | None:
@@ -99,17 +107,10 @@ def _mounted(plan: Plan, summary: HoldSummary) -> HeadingReset | None:
 
 def _check_north(orient: Orientations, plan: Plan) -> None:
     """Raises EdgeposeError if a filter has begun with any headings and nothing will bring them together."""
-    if orient.north:
-        return
-    if plan.heading_reset is None:
+    if plan.heading_reset is None and not orient.north:
         raise EdgeposeError(
             "without a magnetometer in each sensor the filter's headings are arbitrary: "
             "add --heading-reset motion, live or mounting"
-        )
-    if plan.lying is not None:
-        raise EdgeposeError(
-            "the filter's headings begin anew in each recording, so another one cannot reset them: "
-            "use --heading-reset motion, live or mounting"
         )
 
 

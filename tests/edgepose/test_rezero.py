@@ -1,0 +1,225 @@
+"""Headings found anew during a run, wishes by datagram, and sensors that fall silent."""
+
+from __future__ import annotations
+
+import math
+import os
+import socket
+import struct
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edgepose import calibration as cal
+from edgepose import rotations as rot
+from edgepose.control import Control, parse
+from edgepose.errors import EdgeposeError
+from edgepose.imu import ImuFrame
+from edgepose.placements import PLACEMENTS
+from edgepose.rezero import BLEND_S, HOLD_S, START_HOLD_S, Headings
+from edgepose.silence import QUIET_S, SILENT_S, Silences
+
+RNG = np.random.default_rng(11)
+R_BS = rot.rotvec_to_matrix(RNG.normal(0.0, 1.0, (6, 3)))
+R_TI = cal.body_from_inertial(np.zeros((6, 4)), "heading:25")
+OFFSET = RNG.uniform(-2.0, 2.0, 6)
+STRAIGHT = cal.POSES["straight"]
+
+
+def worn(bones: np.ndarray, drift: np.ndarray | float = 0.0) -> np.ndarray:
+    """Quaternions (6, 4) of sensors whose headings have drifted since the calibration."""
+    true = rot.matrix_to_quat(R_TI.T @ bones @ R_BS)
+    return rot.quat_multiply(rot.about_z(drift - OFFSET), true)
+
+
+def calibration() -> cal.Calibration:
+    summary = cal.HoldSummary([100] * 6, worn(STRAIGHT), np.zeros(6), np.zeros((6, 3)), [])
+    return cal.calibrate(summary, pose="straight", body_frame="heading:25", created="", heading_offset=OFFSET)
+
+
+class Walk:
+    """Frames at 60 Hz through `Headings`, and what it says."""
+
+    def __init__(self, **options: object) -> None:
+        self.said: list[str] = []
+        self.wishes: list[float] = []
+        self.index = 0
+        self.headings = Headings(calibration(), requests=self._take, tell=self.said.append, **options)
+
+    def _take(self) -> list[float]:
+        taken, self.wishes = self.wishes, []
+        return taken
+
+    def go(self, seconds: float, orientation: np.ndarray, held: tuple[str, ...] = (), shake: float = 0.0):
+        """Calibrations of the frames of some seconds."""
+        found = []
+        for _ in range(round(seconds * 60)):
+            self.index += 1
+            turn = rot.rotvec_to_quat(np.array([shake * math.sin(self.index), 0.0, 0.0]))
+            marks = np.array([name in held for name in PLACEMENTS])
+            shaken = rot.quat_multiply(orientation, turn)
+            frame = ImuFrame(self.index, self.index / 60, shaken, np.zeros((6, 3)), marks, 0.0)
+            found.append(self.headings.at(frame))
+        return found
+
+
+def apart(found: cal.Calibration, orientation: np.ndarray) -> np.ndarray:
+    """Angles (6,), degrees, between measured bones and the straight pose."""
+    bones, _ = cal.apply(found, orientation, np.zeros((6, 3)))
+    return np.degrees(rot.angle_between(bones, STRAIGHT))
+
+
+DRIFT = np.radians([20.0, -35.0, 5.0, 0.0, 170.0, -12.0])
+
+
+def test_nothing_changes_unless_it_is_asked_for():
+    walk = Walk()
+    assert {id(found) for found in walk.go(3.0, worn(STRAIGHT, DRIFT))} == {id(walk.headings._calibration)}
+    assert walk.said == []
+
+
+def test_a_wish_turns_the_headings_smoothly():
+    walk, orientation = Walk(), worn(STRAIGHT, DRIFT)
+    walk.wishes = [2.0]
+    before = walk.go(2.0 + HOLD_S - 0.1, orientation)
+    assert apart(before[-1], orientation).max() > 100
+    assert walk.said == ["re-zero in 2 s: stand straight, arms hanging, palms to the thighs, facing forward"]
+    after = walk.go(BLEND_S + 0.5, orientation)
+    assert apart(after[-1], orientation).max() < 0.01
+    offsets = np.array([found.heading_offset for found in [*before, *after]])
+    steps = np.degrees(np.abs(np.angle(np.exp(1j * np.diff(offsets, axis=0)))))
+    # Half as fast again as evenly.
+    assert (steps.max(axis=0) < 1.6 * np.degrees(np.abs(DRIFT)) / (60 * BLEND_S) + 0.01).all()
+    assert walk.said[1].startswith("re-zeroed: headings turned by left_forearm -20.0, right_forearm 35.0, ")
+    assert walk.said[1].endswith("pelvis 0.0 deg")
+    # Nothing is pending: other poses do not change them.
+    assert walk.go(3.0, worn(STRAIGHT))[-1] is after[-1]
+
+
+def test_a_second_wish_while_headings_still_turn():
+    walk, orientation = Walk(), worn(STRAIGHT, DRIFT)
+    walk.wishes = [0.0]
+    walk.go(HOLD_S + 0.3 * BLEND_S, orientation)
+    walk.wishes = [0.0]
+    assert apart(walk.go(HOLD_S + BLEND_S + 0.2, orientation)[-1], orientation).max() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"shake": 0.2}, "headings stay as they are: moved: left_forearm 8 deg, "),
+        ({"held": ("head",)}, "headings stay as they are: nothing new from head"),
+        ({"lift": 0.6}, "headings stay as they are: another tilt than in the calibration: left_forearm 34 "),
+    ],
+)
+def test_a_bad_hold_changes_nothing_and_says_why(changes, says):
+    walk = Walk()
+    walk.wishes = [0.0]
+    bones = STRAIGHT.copy()
+    bones[0] = rot.about_axis("x", -changes.pop("lift", 0.0)) @ bones[0]
+    found = walk.go(HOLD_S + 2.0, worn(bones, DRIFT), **changes)
+    assert found[-1] is found[0]
+    assert len(walk.said) == 2
+    assert walk.said[1].startswith(says)
+
+
+def test_a_start_without_headings_waits_for_the_pose():
+    walk = Walk(hold_first=True)
+    assert set(walk.go(6.0, worn(STRAIGHT, DRIFT), shake=0.2)) == {None}
+    assert walk.said[0].endswith("facing forward, and hold still: poses begin after that")
+    assert walk.said[1].startswith("waiting for the pose: moved: left_forearm 8 deg")
+    assert len(walk.said) == 2
+    found = walk.go(START_HOLD_S + 1.5, worn(STRAIGHT, DRIFT))
+    assert apart(found[-1], worn(STRAIGHT, DRIFT)).max() < 0.01
+    assert walk.said[-1].startswith("headings found; tilt off by left_forearm 0.0, ")
+
+
+# --- wishes by datagram -------------------------------------------------------------------------------------
+
+OSC = b"/edgepose/rezero\0\0\0\0"
+
+
+@pytest.mark.parametrize(
+    ("datagram", "delay_s"),
+    [
+        (b"rezero", 0.0),
+        (b"rezero\n", 0.0),
+        (OSC, 0.0),
+        (OSC + b",\0\0\0", 0.0),
+        (OSC + b",i\0\0" + struct.pack(">i", 4), 4.0),
+        (OSC + b",f\0\0" + struct.pack(">f", 2.5), 2.5),
+        (b"", None),
+        (b"rezero please", None),
+        (b"REZERO", None),
+        (b"/edgepose/rezero", None),
+        (b"/edgepose/rezeros\0\0\0", None),
+        (OSC + b",f\0\0", None),
+        (OSC + b",f\0\0" + struct.pack(">f", math.nan), None),
+        (OSC + b",f\0\0" + struct.pack(">f", -1.0), None),
+        (OSC + b",i\0\0" + struct.pack(">i", 10_000), None),
+        (OSC + b",s\0\0now\0", None),
+        (OSC + b",ff\0" + bytes(8), None),
+    ],
+)
+def test_what_a_datagram_asks_for(datagram, delay_s):
+    assert parse(datagram) == delay_s
+
+
+@given(st.one_of(st.binary(max_size=60), st.binary(max_size=16).map(lambda tail: OSC + tail)))
+def test_any_datagram_is_a_wish_within_bounds_or_nothing(datagram):
+    delay_s = parse(datagram)
+    assert delay_s is None or 0.0 <= delay_s <= 60.0
+
+
+def test_a_socket_hears_wishes_and_counts_the_rest():
+    with Control("127.0.0.1", 0) as control, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.connect(control._socket.getsockname())
+        assert control.requests() == []
+        for datagram in (b"rezero", b"hello", os.urandom(2000), OSC + b",f\0\0" + struct.pack(">f", 1.5)):
+            sender.send(datagram)
+        heard, until = [], time.monotonic() + 10
+        while len(heard) < 2 and time.monotonic() < until:
+            heard += control.requests()
+        assert heard == [0.0, 1.5]
+        assert control.ignored == 2
+        port = control._socket.getsockname()[1]
+        with pytest.raises(EdgeposeError, match=f"cannot listen on 127.0.0.1 port {port}: .* a free port"):
+            Control("127.0.0.1", port)
+    with pytest.raises(EdgeposeError, match=r"cannot listen on 192\.0\.2\.1 port 9: "):
+        Control("192.0.2.1", 9)
+    with pytest.raises(EdgeposeError, match="cannot find 'no such host' to listen on"):
+        Control("no such host", 9)
+
+
+# --- silence ------------------------------------------------------------------------------------------------
+
+
+def test_a_sensor_that_falls_silent_is_told_once_and_when_it_is_back():
+    silences, lines = Silences(), []
+    head = PLACEMENTS.index("head")
+
+    def go(start_s: float, seconds: float, silent: bool) -> None:
+        for k in range(round(seconds * 10)):
+            marks = np.zeros(6, bool)
+            marks[head] = silent
+            frame = ImuFrame(0, start_s + k / 10, np.zeros((6, 4)), np.zeros((6, 3)), marks, 0.0)
+            lines.extend(silences.of(frame))
+
+    go(0.0, 5.0, False)
+    go(5.0, SILENT_S / 2, True)
+    go(6.0, 1.0, False)
+    assert lines == []
+    go(7.0, 5.0, True)
+    assert lines == ["head: nothing for 1 s; its last values are repeated: check its power and link"]
+    go(12.0, 1.0, False)
+    assert lines[1:] == ["head: back after 5.0 s"]
+    # A loose plug.
+    for k in range(5):
+        go(13.0 + 3 * k, 2.0, True)
+        go(15.0 + 3 * k, 1.0, False)
+    assert len(lines) == 2
+    go(13.0 + QUIET_S, 2.0, True)
+    assert len(lines) == 3
