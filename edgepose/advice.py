@@ -205,7 +205,7 @@ def _late(s: SensorHealth) -> str | None:
     if s.late_ms > LATE_LIMIT_MS + LATE_LIMIT_PERIODS * 1e3 / s.rate_hz:
         return (
             f"packets come up to {s.late_ms:.0f} ms late, in bursts: "
-            "shorten the USB adapter's latency timer, or relieve the radio or the line"
+            "shorten the USB adapter's latency timer, relieve radio or line, or end other programs here"
         )
     return None
 

@@ -134,7 +134,7 @@ def _listen(
 
     def state() -> State:
         sensors = [(sensor, judge(sensor)) for sensor in health.report(now_s, source.clocks)]
-        return State(now_s - (start_s or now_s), source.counters, sensors)
+        return State(0.0 if start_s is None else now_s - start_s, source.counters, sensors)
 
     try:
         for now_s, samples in source:
