@@ -141,22 +141,29 @@ def _walk(folder: Path, out: Path) -> Iterator[Path]:
             yield path
 
 
-def convert(job: Job, protocol: str = "auto", sensors: Path | None = None) -> Result:
+def convert(job: Job, protocol: str = "auto", sensors: Path | None = None, filter: str = "none") -> Result:
     """Write what is good in a recording.
 
     Args:
         job: the recording.
         protocol: what a raw capture or a CAN log speaks.
         sensors: map of devices to placements, for captures, CAN logs and x-io sessions.
+        filter: what makes orientations, see `orient_recording`; "none" leaves them as they are.
     """
     try:
         if job.target.suffix == ".bvh" or is_poses(job.source):
+            if filter != "none":
+                raise EdgeposeError(f"{job.source}: --filter is for recordings, not for poses; leave it out")
             job.target.parent.mkdir(parents=True, exist_ok=True)
             return Result(job, *convert_poses(job.source, job.target))
         recording = _read(job.source, protocol, sensors)
         data = recording.sensors.values()
         if not data:
             raise EdgeposeError(recording.damage or f"{job.source}: no samples")
+        if filter != "none":
+            from edgepose.orientation.recorded import orient_recording
+
+            recording = orient_recording(recording, filter, name=str(job.source))
         job.target.parent.mkdir(parents=True, exist_ok=True)
         write = WRITERS[job.target.suffix[1:]]
         replace_file(job.target, lambda path: write(path, recording), "recording")
@@ -209,7 +216,11 @@ def _serial_numbers(sensors: Path | None) -> Mapping[int, str] | None:
 
 
 def convert_all(
-    jobs: Sequence[Job], protocol: str = "auto", sensors: Path | None = None, workers: int = 1
+    jobs: Sequence[Job],
+    protocol: str = "auto",
+    sensors: Path | None = None,
+    workers: int = 1,
+    filter: str = "none",
 ) -> Iterator[Result]:
     """Results as they come.
 
@@ -218,8 +229,9 @@ def convert_all(
         protocol: see `convert`.
         sensors: see `convert`.
         workers: processes; one works in this process.
+        filter: see `convert`.
     """
-    work = partial(convert, protocol=protocol, sensors=sensors)
+    work = partial(convert, protocol=protocol, sensors=sensors, filter=filter)
     if workers == 1 or len(jobs) < 2:
         yield from map(work, jobs)
         return

@@ -32,6 +32,14 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path, file_okay=False),
     help="Folder to write to; made if it is not there.",
 )
+@click.option(
+    "--filter",
+    type=click.Choice(["none", "kalman", "smoother", "vqf"]),
+    default="none",
+    show_default=True,
+    help="Make orientations of gyroscope, accelerometer and, where there is one, magnetometer; smoother knows "
+    "what comes later. none: leave the devices' own.",
+)
 @protocol_option
 @sensors_option
 @click.option(
@@ -46,6 +54,7 @@ def convert(
     inputs: tuple[Path, ...],
     to: str,
     out: Path,
+    filter: str,
     protocol: str,
     sensors: Path | None,
     jobs: int,
@@ -66,6 +75,7 @@ def convert(
       edgepose convert walk.npz --to csv --out .
       edgepose convert sessions/ "more/*.bin" --to npz --out recordings --jobs 4
       edgepose convert walk.part.csv --to npz --out saved
+      edgepose convert raw.csv --to npz --out oriented --filter smoother
       edgepose convert poses/ --to bvh --out for-blender --jobs 2
     """
     from edgepose.converter import Result, convert_all, plan
@@ -77,7 +87,7 @@ def convert(
     done = {job: Result(job, skipped=True) for job in planned if skip_existing and job.target.exists()}
     todo = [job for job in planned if job not in done]
     try:
-        for result in _with_progress(convert_all(todo, protocol, sensors, jobs), len(todo)):
+        for result in _with_progress(convert_all(todo, protocol, sensors, jobs, filter), len(todo)):
             done[result.job] = result
     finally:
         click.echo(_table([done[job] for job in planned if job in done]))
