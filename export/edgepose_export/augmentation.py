@@ -34,6 +34,8 @@ class Augmentation(NamedTuple):
         heading_deg: deviation of each sensor's heading against the pelvis sensor.
         acceleration_noise: deviation of white noise on each frame's accelerations, m/s^2.
         acceleration_scale: deviation of each sensor's scale error.
+        aligned: share of sequences without misalignment and heading errors, so that a network trusts sensors
+            that agree with each other.
     """
 
     mirror: float = 0.5
@@ -41,6 +43,7 @@ class Augmentation(NamedTuple):
     heading_deg: float = 0.0
     acceleration_noise: float = 0.0
     acceleration_scale: float = 0.0
+    aligned: float = 0.0
 
 
 def mirror(orientation: Tensor, acceleration: Tensor, relative: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -81,12 +84,16 @@ def augment(
         mirrored = mirror(orientation[chosen], acceleration[chosen], relative[chosen])
         orientation, acceleration, relative = orientation.clone(), acceleration.clone(), relative.clone()
         orientation[chosen], acceleration[chosen], relative[chosen] = mirrored
+    turned = (
+        (torch.rand(size, generator=generator) >= how.aligned).float() if how.aligned else torch.ones(size)
+    )
     if how.misalignment_deg:
-        error = small_rotations(torch.deg2rad(how.misalignment_deg * normal(size, 1, 6, 3)))
+        angles = how.misalignment_deg * normal(size, 1, 6, 3) * turned[:, None, None, None]
+        error = small_rotations(torch.deg2rad(angles))
         orientation = orientation @ error
     if how.heading_deg:
         vertical = torch.zeros(size, 1, 6, 3)
-        vertical[..., :-1, 1] = torch.deg2rad(how.heading_deg * normal(size, 1, 5))
+        vertical[..., :-1, 1] = torch.deg2rad(how.heading_deg * normal(size, 1, 5) * turned[:, None, None])
         turn = small_rotations(vertical)
         orientation = turn @ orientation
         acceleration = (turn @ acceleration.unsqueeze(-1)).squeeze(-1)

@@ -17,6 +17,7 @@ _KINDS = {
 
 _INPUTS = {
     "root": "as seen from the pelvis",
+    "tilt": "as seen from the pelvis, with the pelvis' own tilt and acceleration",
     "heading": "without the pelvis' heading",
     "sequence": "as seen from the pelvis in the first frame",
 }

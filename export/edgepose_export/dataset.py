@@ -21,6 +21,9 @@ from edgepose.skeleton import PARENTS, forward_kinematics
 from edgepose_export.splits import part_of
 from edgepose_export.synthesis import INERTIAL_FROM_BODY
 
+SEATED = ".seated"
+"""Ends the names of takes whose legs were made by `edgepose_export.seating`."""
+
 RATE = 60.0
 """Frames a second that the networks are made for."""
 
@@ -142,6 +145,11 @@ class Tape(NamedTuple):
     def free(self) -> list[bool]:
         """Whether each take is CMU's, free for all use."""
         return [text.startswith("CMU") for text in self.licenses]
+
+    @property
+    def seated(self) -> list[bool]:
+        """Whether each take's legs were made by `edgepose_export.seating`."""
+        return [name.endswith(SEATED) for name in self.names]
 
 
 def tape(takes: list[Take]) -> Tape:

@@ -49,8 +49,9 @@ class NetworkShape(NamedTuple):
     @property
     def inputs(self) -> int:
         """Numbers of the input: 60 in the paper."""
-        sensors = len(PLACEMENTS) - (self.normalisation == "root")
-        return sensors * (9 + 3 * self.acceleration)
+        sensors = len(PLACEMENTS) - (self.normalisation in ("root", "tilt"))
+        own = 3 + 3 * self.acceleration if self.normalisation == "tilt" else 0
+        return sensors * (9 + 3 * self.acceleration) + own
 
     @property
     def joints(self) -> tuple[int, ...]:

@@ -11,8 +11,10 @@ from torch import Tensor, nn
 
 from edgepose.features import root_relative
 
-SCHEMES = ("root", "heading", "sequence")
-"""Seen from the root of each frame (DIP 4.3); from its heading only; from the root of the first frame."""
+SCHEMES = ("root", "tilt", "heading", "sequence")
+"""Seen from the root of each frame (DIP 4.3); the same with the root's own tilt and acceleration; seen from
+the root's heading only; from the root of the first frame.
+"""
 
 
 def heading_of(root: Tensor) -> Tensor:
@@ -37,11 +39,13 @@ def seen_from_first(orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, 
 def network_inputs(orientation: Tensor, acceleration: Tensor, scheme: str, with_acceleration: bool) -> Tensor:
     """Row-major rotation matrices, then accelerations against the root's; not yet z-scored.
 
-    Scheme "root" gives the five sensors that are not the root, 60 numbers (DIP 4.3). The others give all six,
-    72 numbers, of which the first acceleration, the root's, is always zero. What is given to "sequence" must
-    be as `seen_from_first` returns it. Without accelerations (DIP appendix D) 45 or 54 numbers remain.
+    Scheme "root" gives the five sensors that are not the root, 60 numbers (DIP 4.3). "tilt" adds what they do
+    not tell, between their rotations and their accelerations: where up is for the root, and the root's own
+    acceleration, both in the root's frame; 66 numbers. The others give all six sensors, 72 numbers, of which
+    the first acceleration, the root's, is always zero. What is given to "sequence" must be as
+    `seen_from_first` returns it. Without accelerations (DIP appendix D) 45, 48 or 54 numbers remain.
     """
-    if scheme == "root":
+    if scheme == "root" or scheme == "tilt":
         rotations, differences = root_relative(orientation, acceleration)
     else:
         if scheme == "heading":
@@ -50,9 +54,16 @@ def network_inputs(orientation: Tensor, acceleration: Tensor, scheme: str, with_
             )
         rotations = orientation
         differences = (acceleration - acceleration[..., -1:, :]).roll(1, -2)
-    if not with_acceleration:
-        return rotations.flatten(-3)
-    return torch.cat([rotations.flatten(-3), differences.flatten(-2)], dim=-1)
+    numbers = [rotations.flatten(-3)]
+    if scheme == "tilt":
+        root = orientation[..., -1, :, :]
+        numbers.append(root[..., 1, :])  # T's vertical, Y, in the root's frame
+        if with_acceleration:
+            own = torch.matmul(root.transpose(-1, -2), acceleration[..., -1, :].unsqueeze(-1))
+            numbers.append(own.squeeze(-1))
+    if with_acceleration:
+        numbers.append(differences.flatten(-2))
+    return torch.cat(numbers, dim=-1)
 
 
 class Inputs(nn.Module):

@@ -50,6 +50,8 @@ class TrainConfig:
         joined: sequences may run over the ends of takes: a network that is never reset learns to recover from
             a jump.
         free_share: share of the sequences taken from CMU's takes.
+        seated_share: share of the sequences taken from takes with made sitting, where there are any; the
+            other shares are of the rest.
         input_dropout: share of the inputs set to zero (DIP: 0.2).
         learning_rate: of Adam.
         warm_up: steps in which the learning rate rises to its first value.
@@ -70,6 +72,7 @@ class TrainConfig:
     window: int = 120
     joined: bool = False
     free_share: float = 0.0
+    seated_share: float = 0.0
     input_dropout: float = 0.2
     learning_rate: float = 1e-3
     warm_up: int = 200
@@ -164,6 +167,8 @@ _RANGES: dict[str, tuple[float, float]] = {
     "averaging": (0.0, 1.0),
     "input_dropout": (0.0, 0.99),
     "free_share": (0.0, 1.0),
+    "seated_share": (0.0, 1.0),
+    "aligned": (0.0, 1.0),
     "mirror": (0.0, 1.0),
 }
 """Least and greatest value of numbers; those of other fields are 0 and 1000."""
@@ -252,11 +257,19 @@ def likelihood_loss(mean: Tensor, deviation: Tensor, target: Tensor, beta: float
 # --- batches ------------------------------------------------------------------------------------------------
 
 
-def window_starts(tape: Tape, window: int, joined: bool) -> tuple[Tensor, Tensor]:
-    """First frames of all windows that a tape holds, those of CMU's takes apart: (others, CMU's)."""
+Starts = tuple[Tensor, Tensor]
+"""First frames of windows: of other takes, of CMU's."""
+
+
+def window_starts(
+    tape: Tape, window: int, joined: bool, chosen: Callable[[int], bool] = lambda take: True
+) -> Starts:
+    """First frames of all windows that the chosen takes of a tape hold."""
     groups: tuple[list[Tensor], list[Tensor]] = ([], [])
     last = int(tape.starts[-1]) - window
     for i, free in enumerate(tape.free):
+        if not chosen(i):
+            continue
         start, end = int(tape.starts[i]), int(tape.starts[i + 1])
         end = min(end - 1, last) if joined else end - window
         if end >= start:
@@ -265,7 +278,7 @@ def window_starts(tape: Tape, window: int, joined: bool) -> tuple[Tensor, Tensor
     return torch.cat([empty, *groups[0]]), torch.cat([empty, *groups[1]])
 
 
-def draw(starts: tuple[Tensor, Tensor], count: int, free_share: float, generator: torch.Generator) -> Tensor:
+def draw(starts: Starts, count: int, free_share: float, generator: torch.Generator) -> Tensor:
     """First frames (count,) of random windows with the wanted share of CMU's."""
     other, cmu = starts
     if free_share == 0.0 or len(other) == 0 or len(cmu) == 0:
@@ -319,7 +332,9 @@ class Trainer:
         torch.manual_seed(config.seed)
         self.config, self.train_tape, self.validation_tape = config, train, validation
         self.data, self.processes = data, processes
-        self.starts = window_starts(train, config.window, config.joined)
+        seated = train.seated if config.seated_share else [False] * len(train.names)
+        self.starts = window_starts(train, config.window, config.joined, lambda take: not seated[take])
+        self.seated_starts = window_starts(train, config.window, config.joined, seated.__getitem__)
         counts = processes.everywhere(len(torch.cat(self.starts)))
         if not all(counts):
             at = f"process {counts.index(0)} has " if processes.size > 1 else ""
@@ -376,7 +391,10 @@ class Trainer:
         for group in self.optimiser.param_groups:
             group["lr"] = rate * min(1.0, (self.step + 1) / (config.warm_up + 1))
         count = config.sequences // self.processes.size
-        starts = draw(self.starts, count, config.free_share, self.generator)
+        seated = round(count * config.seated_share) if len(torch.cat(self.seated_starts)) else 0
+        starts = draw(self.starts, count - seated, config.free_share, self.generator)
+        if seated:
+            starts = torch.cat([starts, draw(self.seated_starts, seated, 0.0, self.generator)])
         batch = augment(windows(self.train_tape, starts, config.window), config.augmentation, self.generator)
         loss = self._loss(self.parallel, batch, config.input_dropout)
         self.optimiser.zero_grad(set_to_none=True)

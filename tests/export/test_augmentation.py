@@ -127,6 +127,16 @@ def test_heading_turns_all_but_the_pelvis_about_the_vertical():
     torch.testing.assert_close(acceleration, (turn @ data[1][..., None])[..., 0])
 
 
+def test_a_share_of_the_sequences_stays_aligned():
+    data = batch()
+    how = Augmentation(mirror=0, misalignment_deg=4.0, heading_deg=3.0, aligned=0.25)
+    orientation, acceleration, _ = augment(data, how, generator())
+    untouched = (orientation - data[0]).abs().amax((1, 2, 3, 4)) < 1e-6
+    assert 0.18 < untouched.float().mean() < 0.32
+    still = (acceleration - data[1]).abs().amax((1, 2, 3)) < 1e-5
+    assert torch.equal(still, untouched)
+
+
 def test_noise_and_scale_of_accelerations():
     data = batch()
     noisy = augment(data, Augmentation(mirror=0, acceleration_noise=0.1), generator())[1] - data[1]

@@ -180,6 +180,19 @@ def test_share_of_cmu(takes, share):
     assert sum(int(s) in starts[1].tolist() for s in drawn) == 40 * share
 
 
+def test_share_of_made_sitting(takes):
+    made = [takes[0]._replace(name=f"{takes[0].name}.seated"), *takes[1:]]
+    config = replace(SMALL, sequences=8, seated_share=0.25, free_share=0.0)
+    one = Trainer(config, tape(made), tape(takes), ABOUT)
+    end = len(made[0].pose)
+    assert (torch.cat(one.starts) >= end).all()
+    assert len(torch.cat(one.seated_starts)) == end - 19
+    # A run that does not ask for them takes them like others.
+    plain = Trainer(SMALL, tape(made), tape(takes), ABOUT)
+    assert (torch.cat(plain.starts) < end).any()
+    assert one.train_step() != plain.train_step()
+
+
 def test_takes_that_are_too_short(takes):
     with pytest.raises(EdgeposeError, match="no training take is as long as the window of 500"):
         trainer(takes, replace(SMALL, window=500))

@@ -160,6 +160,7 @@ def convert(path: Path, job: Job) -> str | None:
     """Converts one file, in parts where its source jumps; what was wrong with it, or None."""
     import numpy as np
 
+    from edgepose_export.dataset import SEATED
     from edgepose_export.mocap import pieces, read_motion, resample
     from edgepose_export.seating import seated
     from edgepose_export.synthesis import random_mounting, recording_arrays, virtual_imus, with_hold
@@ -178,8 +179,9 @@ def convert(path: Path, job: Job) -> str | None:
             if job.hold_s:
                 motion = with_hold(motion, job.hold_s)
             imus = virtual_imus(motion, job.body, mounting)
-            name = f"{path.stem}.part{i + 1}.npz" if len(takes) > 1 else f"{path.stem}.npz"
-            target = job.out / path.relative_to(job.root).with_name(name)
+            part = f".part{i + 1}" if len(takes) > 1 else ""
+            kind = "" if job.seated_seed is None else SEATED
+            target = job.out / path.relative_to(job.root).with_name(f"{path.stem}{part}{kind}.npz")
             target.parent.mkdir(parents=True, exist_ok=True)
             np.savez(target, **recording_arrays(motion, imus, LICENSES[motion.source]))
     except EdgeposeError as error:
