@@ -102,19 +102,6 @@ class SensorMap(NamedTuple):
             )
         return result
 
-    def mounting_warnings(self, found: list[str]) -> list[str]:
-        """One line for each sensor that is worn otherwise than the map says.
-
-        Args:
-            found: how they are worn, `calibration.mounting`.
-        """
-        return [
-            f"{name} sits {sits}, and {self.path} says {device.mounting}; "
-            "check that no two sensors are swapped and that it is the right way round"
-            for (name, device), sits in zip(self.devices.items(), found, strict=True)
-            if device.mounting not in (None, sits)
-        ]
-
 
 def channel(bus: str) -> str:
     """The channel of a bus named INTERFACE:CHANNEL, or named by its channel alone."""

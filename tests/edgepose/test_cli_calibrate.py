@@ -24,7 +24,8 @@ from edgepose import rotations as rot
 from edgepose.cli.calibrate import calibrate
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import BONES, PLACEMENTS
+from edgepose_export.exercises import ASIDE_DEG, exercises
 from firmware_protocols import native
 
 REAL = Path(__file__).parents[1] / "data" / "imu" / "six-sites-3s.npz"
@@ -186,6 +187,13 @@ def test_recordings_that_do_not_do(arguments: list[object], message: str) -> Non
         (["--file", REAL, "--pose", "sitting"], "'sitting' is not one of 'straight', 't-pose'"),
         (["--file", REAL, "--heading-reset", "live"], "--heading-reset live needs --port"),
         (["--port", "x", "--from", 3], "--from needs a recording"),
+        (["--port", "x", "--heading-reset", "motion", "--motion", "1:2"], "--motion needs a recording"),
+        (["--file", REAL, "--motion", "1:2"], "--motion goes with --heading-reset motion"),
+        (["--file", REAL, "--heading-reset", "motion", "--motion", "2:1"], "'2:1' is not FROM:TO"),
+        (["--file", REAL, "--heading-reset", "motion", "--motion", "nan:1"], "'nan:1' is not FROM:TO"),
+        (["--file", REAL, "--heading-reset", "motion", "--pose", "t-pose"], "begins with hanging arms"),
+        (["--file", REAL, "--heading-reset", "mounting:up"], "an axis is x, y or z"),
+        (["--file", REAL, "--filter", "madgwick"], "'madgwick' is not one of 'none', 'kalman', 'vqf'"),
         (["--file", REAL, "--hold", -1], "-1"),
     ],
 )
@@ -319,6 +327,77 @@ def test_missing_sensors_are_waited_for_and_then_named(
     result = run("--port", wearer.port, "--out", tmp_path / "calib.json")
     assert "Waiting for right_forearm, head." in result.output
     assert error_of(result).startswith("nothing from right_forearm, head in 1 s: check power, link and id")
+
+
+def test_headings_from_guided_motion(wearer: Wearer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The wearer does the exercises, at eight times their speed, as soon as the hold is over."""
+    bones = exercises(100.0)[:, list(BONES)]
+    monkeypatch.setattr(cal, "EXERCISE_S", cal.EXERCISE_S / 8)
+    began_s: float | None = None
+    now_s = 0.0
+
+    def quats(t: float) -> np.ndarray:
+        nonlocal now_s
+        now_s = t
+        row = 0 if began_s is None else int((t - began_s) * 800) % len(bones)
+        return worn(bones[row])
+
+    def check_and_begin(hold: cal.Hold) -> cal.HoldSummary:
+        nonlocal began_s
+        began_s = now_s
+        return check(hold)
+
+    check = cal.check_hold
+    monkeypatch.setattr(cal, "check_hold", check_and_begin)
+    wearer.quats_at = quats
+    out = tmp_path / "calib.json"
+    words = ("--port", wearer.port, "--hold", 1, "--countdown", 0, "--out", out)
+    result = run(*words, "--heading-reset", "motion")
+    assert result.exit_code == 0, result
+    asked = [line for line in result.output.splitlines() if line.endswith("(0.5 s).")]
+    assert [line.split(" ")[0] for line in asked[:5]] == ["Bow", "Lift", "Lift", "Lift", "Lift"]
+    calibration = cal.load_calibration(out)
+    assert calibration.body_frame == "heading:0"
+    assert not calibration.north
+    # To the frame in which the wearer faces X; forearms do not rise straight ahead.
+    wanted = ERRORS - FACING + np.radians([-ASIDE_DEG, ASIDE_DEG, 0, 0, 0, 0])
+    apart = np.degrees(np.angle(np.exp(1j * (calibration.heading_offset - wanted))))
+    assert np.abs(apart).max() < 3.0
+
+
+def test_a_wearer_who_does_not_do_the_exercises(
+    wearer: Wearer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cal, "EXERCISE_S", 0.1)
+    words = ("--port", wearer.port, "--hold", 1, "--countdown", 0, "--out", tmp_path / "calib.json")
+    result = run(*words, "--heading-reset", "motion")
+    assert error_of(result).startswith("no heading from this motion: left_forearm leant by 0 deg only, ")
+    assert result.output.count("Once more.") == 3
+
+
+def test_headings_from_the_mounting_in_a_map(tmp_path: Path) -> None:
+    file = write_recording(tmp_path / "pose.csv", lambda t: worn(cal.POSES["straight"]))
+    found = cal.mounting(
+        cal.calibrate(
+            cal.check_hold(cal.hold_from_recording(rec.read_recording(file))),
+            pose="straight", body_frame="heading:70", created="", heading_offset=ERRORS,
+        )
+    )  # fmt: skip
+    rows = zip(PLACEMENTS, range(6), found, strict=True)
+    rig = tmp_path / "rig.toml"
+    rig.write_text("".join(f'{name} = {{ id = {i}, mounting = "{sits}" }}\n' for name, i, sits in rows))
+    out = tmp_path / "calib.json"
+    words = ("--file", file, "--sensors", rig, "--hold", 2, "--out", out, "--heading-reset")
+    result = run(*words, "mounting")
+    assert result.exit_code == 0, result
+    assert result.stderr == ""
+    calibration = cal.load_calibration(out)
+    apart = np.degrees(np.angle(np.exp(1j * (calibration.heading_offset - ERRORS + FACING))))
+    # Words know quarter turns only.
+    assert np.abs(apart).max() < 46.0
+    # The pelvis sensor sits as its words say.
+    assert abs(apart[5]) < 0.1
+    assert not calibration.north
 
 
 def test_a_recording_at_its_own_pace_is_as_live(tmp_path: Path) -> None:

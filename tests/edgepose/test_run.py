@@ -461,6 +461,8 @@ def test_live_with_damage_on_the_line_a_sensor_that_pauses_and_ctrl_c(wearer, tm
     assert int(lost[2]) >= 20
     held = [i for i, text in enumerate(status) if text == "held head"]
     assert len(held) >= 30  # of about 90: a stalled machine holds the others too
+    assert "head: nothing for 1 s; its last values are repeated" in errors
+    assert re.search(r"^head: back after \d\.\d s$", errors, re.MULTILINE)
     assert re.search(r"^held     .*\bhead in \d+ frames", errors, re.MULTILINE)
     assert "ok" in status[: held[0]]
     assert "ok" in status[held[-1] :]
