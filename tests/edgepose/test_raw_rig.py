@@ -309,9 +309,7 @@ def test_keys_come_at_once_and_the_terminal_is_as_before(ending):
 
 
 def test_keys_without_a_terminal():
-    code = (
-        "from edgepose.cli.keys import Keys\nwith Keys() as keys: print(keys.listening, repr(keys.pressed()))"
-    )
+    code = "from edgepose.cli.keys import Keys\nwith Keys() as keys: print(keys.listening, [keys.pressed()])"
     result = subprocess.run(
         [sys.executable, "-c", code], stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60
     )
