@@ -67,8 +67,8 @@ def orientation_poser(problem: Problem, on_step: OnStep = lambda count, cost: No
         trial = _wrapped(parameters + step)
         there = evaluate(problem, trial)
         better = _by_frame(there) < cost
-        parameters = np.where(better[:, None], trial, parameters)
-        here, before = evaluate(problem, parameters), cost
+        parameters, before = np.where(better[:, None], trial, parameters), cost
+        here = there if better.all() else evaluate(problem, parameters)
         cost = _by_frame(here)
         damping = np.clip(damping * np.where(better, _DOWN, _UP), _LEAST, _MOST)
         on_step(count, float(cost.mean()))

@@ -1,0 +1,246 @@
+"""Speed, memory and accuracy of `edgepose solve`.
+
+    OMP_NUM_THREADS=1 python tools/bench_solve.py speed --plot speed.png
+    OMP_NUM_THREADS=1 python tools/bench_solve.py table --data recordings/ --part cmu-walk-run
+
+`speed` solves made-up motion of 500 to 8000 frames and counts the seconds that one core is busy. `table` is
+SIP's table 2 on held-out motion capture (recordings of `edgepose synthesize`), with the shipped networks on
+the same sensors: the wearer has a body of their own, the sensors noise and bias.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgepose import metrics
+from edgepose import rotations as rot
+from edgepose.calibration import GRAVITY
+from edgepose.offline.bodies import scaled, sensor_points, shaped_body
+from edgepose.offline.measurements import Measurements
+from edgepose.offline.prior import Prior, load_prior
+from edgepose.offline.rigs import Rig, hinge_rig, smpl_rig
+from edgepose.offline.solve import Settings, solve
+from edgepose.offline.terms import Weights, second_difference
+from edgepose.placements import BONES, PLACEMENTS
+from edgepose.skeleton import Body, default_body, forward_kinematics
+
+Array = NDArray[np.float64]
+
+RATE = 60.0
+FRAMES = (500, 1000, 2000, 4000, 8000)
+EVALUATIONS = 20
+
+HEIGHT_M, SEX, WEIGHT_KG, WORDS = 1.82, "male", 88.0, ("long-legged", "broad-shouldered")
+"""The wearer of the table, as their friends describe them."""
+OWN_SHAPE = 0.03
+"""What that leaves out: spread of each bone's length about it, as a share."""
+
+ACC_NOISE, ACC_BIAS, ACC_SCALE = 0.1, 0.05, 0.01
+"""Of the accelerometers: spread of a frame, of the bias of each axis (m/s^2), of each axis' scale."""
+TURN_NOISE_DEG, TURN_BIAS_DEG = 0.3, 1.5
+"""Of the orientations: spread of a frame, and of what calibration leaves, degrees an axis."""
+
+
+# --- sensors ------------------------------------------------------------------------------------------------
+
+
+def sensors_of(local: Array, translation: Array, body: Body, rng: np.random.Generator) -> Measurements:
+    """What six imperfect sensors measure on a body in poses (T, 24, 3, 3) along a path (T, 3), metres."""
+    rotations, joints = forward_kinematics(local, body.offsets, translation)
+    bones = rotations[:, list(BONES)]
+    places = joints[:, list(BONES)] + np.einsum("tsij,sj->tsi", bones, body.sensors)
+    gravity = np.array([0.0, -GRAVITY, 0.0])
+    force = np.einsum("tsji,tsj->tsi", bones, second_difference(places, RATE) - gravity)
+    shape = (1, len(BONES), 3)
+    force = force * (1.0 + ACC_SCALE * rng.normal(size=shape)) + ACC_BIAS * rng.normal(size=shape)
+    force += ACC_NOISE * rng.normal(size=force.shape)
+    turned = TURN_BIAS_DEG * rng.normal(size=shape) + TURN_NOISE_DEG * rng.normal(size=force.shape)
+    bones = bones @ rot.rotvec_to_matrix(np.deg2rad(turned))
+    acceleration = np.einsum("tsij,tsj->tsi", bones, force) + gravity
+    frames = len(local)
+    valid = np.ones((frames, len(BONES)), bool)
+    valid[[0, -1]] = False
+    times = np.arange(frames) / RATE
+    return Measurements(PLACEMENTS, times, RATE, bones, acceleration, valid, np.zeros_like(valid))
+
+
+def own_body(rng: np.random.Generator) -> Body:
+    """The wearer's body: that of the description, with every bone a little longer or shorter."""
+    body = shaped_body(HEIGHT_M, SEX, WEIGHT_KG, WORDS)
+    share = 1.0 + OWN_SHAPE * rng.normal(size=(24, 1))
+    for right in (2, 5, 8, 11, 14, 17, 19, 21, 23):
+        share[right] = share[right - 1]  # both sides are alike
+    return body._replace(offsets=share * body.offsets)
+
+
+# --- speed --------------------------------------------------------------------------------------------------
+
+
+def made_up_motion(frames: int) -> tuple[Array, Array]:
+    """Poses (T, 24, 3, 3) and path (T, 3) of somebody who swings arms and legs."""
+    t = np.arange(frames) / RATE
+    angles = np.zeros((frames, 24, 3))
+    for phase, leg, knee, arm in ((0.0, 1, 4, 17), (np.pi, 2, 5, 16)):
+        swing = np.sin(2.0 * np.pi * 0.9 * t + phase)
+        angles[:, leg, 0] = -0.4 * swing
+        angles[:, knee, 0] = 0.5 + 0.4 * swing
+        angles[:, arm, 2] = (1.2 + 0.2 * swing) * (1.0 if arm == 17 else -1.0)
+    path = np.stack([0.0 * t, 0.02 * np.sin(4.0 * np.pi * 0.9 * t), 1.2 * t], axis=1)
+    return rot.rotvec_to_matrix(angles), path
+
+
+def speed(plot: Path | None) -> None:
+    """Print seconds of a core and memory by number of frames; every chunk takes all its evaluations."""
+    import edgepose.offline.minimise as minimise
+
+    minimise.ENOUGH = -1.0  # never enough
+    prior, rows = load_prior(), []
+    print(f"frames  seconds  evaluations a frame  memory MB   ({EVALUATIONS} evaluations of SIP after SOP)")
+    for frames in FRAMES:
+        measurements = sensors_of(*made_up_motion(frames), default_body(), np.random.default_rng(1))
+        points = sensor_points(default_body(), PLACEMENTS)
+        settings = Settings("sip", smpl_rig(prior, BONES), points, Weights(), EVALUATIONS)
+        started = time.process_time()
+        done = [len(part.rotations) * part.evaluations for part in solve(measurements, settings)]
+        seconds = time.process_time() - started
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+        print(f"{frames:6d}{seconds:9.2f}{sum(done) / frames:21.1f}{memory:11.0f}", flush=True)
+        rows.append((frames, seconds))
+    if plot is not None:
+        _draw(plot, np.array(rows))
+
+
+def _draw(path: Path, rows: Array) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.0, 3.6), dpi=130, layout="constrained")
+    axes = figure.subplots()
+    axes.plot(*rows.T, "o-", color="#2A6F9E", label="measured")
+    axes.plot(rows[:, 0], rows[-1, 1] * rows[:, 0] / rows[-1, 0], ":", color="#969696", label="in proportion")
+    axes.set_xlabel("frames")
+    axes.set_ylabel(f"seconds, {EVALUATIONS} cost evaluations, one core")
+    axes.legend(frameon=False)
+    figure.savefig(path)
+
+
+# --- accuracy -----------------------------------------------------------------------------------------------
+
+
+class Sample(NamedTuple):
+    """A take: sensors, and local rotations (T, 24, 3, 3) that are to be found."""
+
+    measurements: Measurements
+    pose: Array
+
+
+def takes(data: Path, part: str, every: int, body: Body) -> Iterator[Sample]:
+    """Every so many takes of a part of the split, on the wearer's body."""
+    from edgepose_export.splits import part_of
+
+    paths = sorted((p for p in data.rglob("*.npz") if part_of(p.stem) == part), key=lambda p: p.stem)
+    for number, path in enumerate(paths[::every]):
+        with np.load(path, allow_pickle=False) as file:
+            pose = rot.rotvec_to_matrix(file["poses"].reshape(-1, 24, 3).astype(float))
+            translation = file["trans"].astype(float)
+        yield Sample(sensors_of(pose, translation, body, np.random.default_rng(number)), pose)
+
+
+def solver(method: str, rig: Rig, body: Body, weights: Weights) -> Callable[[Measurements], Array]:
+    """Poses (T, 24, 3, 3) that SIP or SOP finds."""
+    settings = Settings(method, rig, sensor_points(body, PLACEMENTS), weights)
+    return lambda measurements: np.concatenate([p.rotations for p in solve(measurements, settings)])
+
+
+def network(name: str, mode: str) -> Callable[[Measurements], Array]:
+    """Poses of a shipped model, run as `edgepose run` runs it."""
+    from edgepose import archive
+    from edgepose_export.dataset import Take
+    from edgepose_export.evaluation import modes_of, run_archive
+
+    info = archive.inspect(archive.find(name))
+    module = archive.load(info)
+    chosen = next(m for m in modes_of(info.metadata) if m.name == mode)
+
+    def run(measurements: Measurements) -> Array:
+        # A frame of a run holds the mean over the time since the frame before.
+        mean = measurements.acceleration.copy()
+        mean[1:] = 0.5 * (mean[1:] + mean[:-1])
+        pose = np.zeros((len(mean), 24, 3, 3), np.float32)
+        take = Take("", measurements.orientation.astype(np.float32), mean.astype(np.float32), pose, "")
+        return run_archive(module, [take], chosen)[0]
+
+    return run
+
+
+def methods(prior: Prior, body: Body, weights: Weights) -> dict[str, Callable[[Measurements], Array]]:
+    """The rows of the table."""
+    smpl = smpl_rig(prior, BONES)
+    described = shaped_body(HEIGHT_M, SEX, WEIGHT_KG, WORDS)
+    return {
+        "SOP": solver("sop", smpl, body, weights),
+        "SIP-M": solver("sip", hinge_rig(prior), body, weights),
+        "SIP": solver("sip", smpl, body, weights),
+        "SIP-BW": solver("sip", smpl, described, weights),
+        "SIP-110": solver("sip", smpl, scaled(body, 1.1), weights),
+        "SIP-120": solver("sip", smpl, scaled(body, 1.2), weights),
+        "rnn, online": network("rnn", "stream"),
+        "birnn, online, 5 future frames": network("birnn", "stream"),
+        "birnn, whole take": network("birnn", "offline"),
+    }
+
+
+def table(data: Path, part: str, every: int, prior: Prior, weights: Weights) -> None:
+    """Print mean and deviation of the errors of every method."""
+    body = own_body(np.random.default_rng(0))
+    rows = methods(prior, body, weights)
+    values: dict[str, dict[str, list[Array]]] = {name: {} for name in rows}
+    count = 0
+    for sample in takes(data, part, every, body):
+        count += 1
+        for name, method in rows.items():
+            poses = method(sample.measurements)
+            for key, column in metrics.per_frame(poses, sample.pose, body.offsets, RATE).items():
+                values[name].setdefault(key, []).append(column)
+    if not count:
+        raise SystemExit(f"{data}: no take of the part {part!r}; make them with edgepose synthesize")
+    print(f"{part}: {count} takes; prior of {prior.about}; {weights}")
+    print(
+        metrics.format_table(
+            {
+                name: {key: metrics.measure(np.concatenate(column)) for key, column in columns.items()}
+                for name, columns in values.items()
+            }
+        )
+    )
+
+
+def main() -> None:
+    """Run what is asked for."""
+    parser = argparse.ArgumentParser(description="speed, memory and accuracy of edgepose solve")
+    commands = parser.add_subparsers(dest="command", required=True)
+    fast = commands.add_parser("speed", help="seconds and memory from 500 to 8000 frames")
+    fast.add_argument("--plot", type=Path, help="picture to draw")
+    good = commands.add_parser("table", help="SIP's table 2 on held-out motion capture")
+    good.add_argument("--data", type=Path, required=True, help="folder that edgepose synthesize wrote")
+    good.add_argument("--part", default="cmu-walk-run", help="part of the split")
+    good.add_argument("--every", type=int, default=1, help="take only every so many takes")
+    good.add_argument("--prior", type=Path, help="file of edgepose learn-prior instead of the shipped one")
+    good.add_argument("--mahal", type=float, default=Weights().mahal, help="weight of the prior")
+    flags = parser.parse_args()
+    if flags.command == "speed":
+        speed(flags.plot)
+    else:
+        weights = Weights(mahal=flags.mahal)
+        table(flags.data, flags.part, flags.every, load_prior(flags.prior), weights)
+
+
+if __name__ == "__main__":
+    main()
