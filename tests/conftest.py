@@ -7,8 +7,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from edgepose_export.archive import Statistics, describe, save, script
-from edgepose_export.networks import NetworkShape, PoseNetwork
+from edgepose_export.archive import Statistics, describe, new_network, save, script
+from edgepose_export.networks import NetworkShape
 
 # The tests' networks are tiny: a second thread would only wait.
 torch.set_num_threads(1)
@@ -28,7 +28,7 @@ DATA = {"summary": "Made-up motion", "licenses": ["Made-up motion, public domain
 def tiny_network(shape):
     """A network whose recurrent weights are large enough for past and future to matter, and statistics."""
     torch.manual_seed(5)
-    network = PoseNetwork(shape).eval()
+    network = new_network(shape).eval()
     with torch.no_grad():
         for weights in network.parameters():
             weights.mul_(2.0)
@@ -43,7 +43,10 @@ def tiny_network(shape):
     else:
         mean = mean + torch.tensor([1.0, 0, 0, 0, 1, 0]).repeat(len(shape.joints))
     return network, Statistics(
-        numbers(60) * 0.1, 0.5 + numbers(60), mean, 0.1 + 0.3 * numbers(shape.pose_outputs)
+        numbers(shape.inputs) * 0.1,
+        0.5 + numbers(shape.inputs),
+        mean,
+        0.1 + 0.3 * numbers(shape.pose_outputs),
     )
 
 

@@ -161,7 +161,7 @@ def collect(takes: Iterable[Take], methods: Mapping[str, Method]) -> Columns:
     """Measures of several methods for every frame of some takes, on the default body."""
     offsets = default_body().offsets
     values: dict[str, dict[str, list[Array]]] = {}
-    for group in _groups(takes):
+    for group in groups(takes):
         for name, method in methods.items():
             for take, poses in zip(group, method(group), strict=True):
                 for key, column in per_frame(poses, take.pose.astype(float), offsets, RATE).items():
@@ -169,7 +169,8 @@ def collect(takes: Iterable[Take], methods: Mapping[str, Method]) -> Columns:
     return {name: {key: np.concatenate(v) for key, v in rows.items()} for name, rows in values.items()}
 
 
-def _groups(takes: Iterable[Take]) -> Iterator[list[Take]]:
+def groups(takes: Iterable[Take]) -> Iterator[list[Take]]:
+    """Lists of takes to run at once, at most `GROUP` each."""
     iterator = iter(takes)
     while group := list(islice(iterator, GROUP)):
         yield group
@@ -222,7 +223,7 @@ def window_errors(
     """
     totals, count = np.zeros((len(future), len(past))), 0
     for take in takes:
-        frames = np.arange(0, len(take.pose), every)
+        frames = np.arange(every // 2, len(take.pose), every)
         count += len(frames)
         for (row, column), _ in np.ndenumerate(totals):
             with torch.inference_mode():

@@ -43,8 +43,9 @@ def histogram(path: Path, parts: Mapping[str, Mapping[str, Array]]) -> None:
         for name, errors in methods.items():
             share = 100.0 * np.histogram(errors.clip(0, MOST_DEG), edges)[0] / len(errors)
             ax.stairs(share, edges, label=name)
-        ax.set(xlabel="SIP error, deg", ylabel="frames, %", xlim=(0, MOST_DEG), ylim=(0, None))
-        ax.legend(fontsize="small")
+        label = f"SIP error, deg (the last degree: all beyond {MOST_DEG - 1})"
+        ax.set(xlabel=label, ylabel="frames, %", xlim=(0, MOST_DEG), ylim=(0, None))
+    _legend(figure, axes)
     _save(figure, path)
 
 
@@ -81,7 +82,7 @@ def reliability_plot(path: Path, parts: Mapping[str, Mapping[str, Reliability]])
             most = max(most, *result.predicted_deg, *result.actual_deg)
         ax.plot([0, most], [0, most], color="0.6", linestyle="--", label="as predicted")
         ax.set(xlabel="predicted standard deviation, deg", ylabel="actual RMS error, deg")
-        ax.legend(fontsize="small")
+    _legend(figure, axes)
     _save(figure, path)
 
 
@@ -98,6 +99,13 @@ def _panels(titles: list[str]) -> tuple[Figure, list[Any]]:
     for ax, title in zip(axes, titles, strict=True):
         ax.set_title(title)
     return figure, axes
+
+
+def _legend(figure: Figure, axes: list[Any]) -> None:
+    """One legend for all panels, below them."""
+    handles, labels = axes[0].get_legend_handles_labels()
+    columns = 2 if len(axes) > 1 else 1
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize="small")
 
 
 def _save(figure: Figure, path: Path) -> None:

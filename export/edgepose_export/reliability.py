@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from edgepose.rotations import angle_between
 from edgepose.skeleton import JOINTS, forward_kinematics
 from edgepose_export.dataset import Take
-from edgepose_export.evaluation import Mode, run_with_std
+from edgepose_export.evaluation import Mode, groups, run_with_std
 
 Array = NDArray[np.float64]
 
@@ -53,13 +53,13 @@ def errors_and_deviations(
     """Errors and predicted deviations (N, joints), rad, of an archive's joints in all frames of takes."""
     joints = [JOINTS.index(name) for name in metadata["joints"]]
     errors, deviations = [], []
-    for take in takes:
-        ((poses, std),) = run_with_std(module, [take], mode)
-        pair = [poses, take.pose.astype(float)]
-        if metadata["targets"] != "local-matrix":
-            pair = [_seen_from_root(local) for local in pair]
-        errors.append(angle_between(pair[0][:, joints], pair[1][:, joints]))
-        deviations.append(std[:, joints])
+    for group in groups(takes):
+        for take, (poses, std) in zip(group, run_with_std(module, group, mode), strict=True):
+            pair = [poses, take.pose.astype(float)]
+            if metadata["targets"] != "local-matrix":
+                pair = [_seen_from_root(local) for local in pair]
+            errors.append(angle_between(pair[0][:, joints], pair[1][:, joints]))
+            deviations.append(std[:, joints])
     return np.concatenate(errors), np.concatenate(deviations)
 
 
@@ -70,8 +70,12 @@ def _seen_from_root(local: Array) -> Array:
 
 
 def scales(errors: Array, deviations: Array) -> Array:
-    """Factor (joints,) of each joint's deviations that makes the errors (N, joints) most likely."""
-    return _rms(errors / deviations)
+    """Factors (joints,) that make deviations (N, joints) as large as the errors in the mean square, by joint.
+
+    The most likely factors, of the mean square of each error over its deviation, would follow the few frames
+    in which a network is surest and wrong; on other takes they were twice too large.
+    """
+    return _rms(errors) / _rms(deviations)
 
 
 def reliability(errors: Array, deviations: Array) -> Reliability:
