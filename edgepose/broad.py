@@ -104,6 +104,8 @@ def read_trial(path: Path) -> Trial:
     rate = float(np.asarray(arrays["sampling_rate"]).reshape(-1)[0])
     if movement.shape != (count,) or not 1.0 < rate < 1e5:
         raise EdgeposeError(f"{path}: 'movement' or 'sampling_rate' is not that of {count} samples")
+    if not (movement & ~np.isnan(numbers["opt_quat"][:, 0])).any():
+        raise EdgeposeError(f"{path}: has no movement of which the true orientation is known")
     return Trial(
         path.stem,
         rate,
@@ -117,7 +119,8 @@ def read_trial(path: Path) -> Trial:
 
 def _load(path: Path) -> dict[str, Any]:
     if path.suffix == ".npz":
-        with np.load(path, allow_pickle=False) as archive:
+        # A file of ours, because numpy leaves its own open where there is no archive in it.
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             return dict(archive)
     try:
         from scipy.io import loadmat

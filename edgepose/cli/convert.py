@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     type=click.Choice(["none", "kalman", "smoother", "vqf"]),
     default="none",
     show_default=True,
-    help="Make orientations of gyroscope, accelerometer and, where there is one, magnetometer; smoother knows "
-    "what comes later. none: leave the devices' own.",
+    help="Make orientations of gyroscope, accelerometer and, where there is one, magnetometer; smoother uses "
+    "what comes later, too. none: leave the devices' own.",
 )
 @protocol_option
 @sensors_option
