@@ -469,6 +469,14 @@ def test_a_file_gives_the_same_calibration_back(tmp_path: Path) -> None:
         np.testing.assert_allclose(a, b, atol=1e-12)
 
 
+def test_what_made_the_orientations_is_kept() -> None:
+    made = cal.from_json(cal.to_json(Rig(3).calibration(filter="vqf", north=False)))
+    assert (made.filter, made.north) == ("vqf", False)
+    # Files from before there were filters here.
+    old = cal.from_json(corrupt(orientation=KeyError))
+    assert (old.filter, old.north) == ("none", True)
+
+
 def test_the_file_is_for_people() -> None:
     rig = Rig(2)
     # X of the case up along the spine, its face to the back.
@@ -531,6 +539,10 @@ def of_head(**changes: Any) -> str:
         (corrupt(body_frame="north"), "body frame 'north' is none of"),
         (corrupt(created=5), "'created' is missing or not text"),
         (corrupt(metadata=[]), "'metadata' is missing or not an object"),
+        (corrupt(orientation=3), "'orientation' is missing or not an object"),
+        (corrupt(orientation__filter="magic"), "'orientation' must say filter (none, kalman, vqf)"),
+        (corrupt(orientation__filter=["none"]), "'orientation' must say filter (none, kalman, vqf)"),
+        (corrupt(orientation__north=1), "north (true or false)"),
     ],
 )  # fmt: skip
 def test_a_hostile_file_is_refused_with_its_name(text: str, what: str, tmp_path: Path) -> None:

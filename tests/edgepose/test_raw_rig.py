@@ -113,6 +113,14 @@ def test_a_run_with_another_filter_is_refused(command, rig, tmp_path, words, say
     assert says in result.stderr
 
 
+def test_a_calibration_from_another_recording_is_told(command, rig, tmp_path):
+    other = part(rig.raw, STAND_S, STAND_S + 2.0, tmp_path / "other.npz")
+    words = ("--calibration", rig.calibration, "--filter", "kalman", "--model", "rnn")
+    result = command("run", "--file", other, *words, "--csv", tmp_path / "x.csv")
+    assert result.returncode == 0, result.stderr
+    assert f"warning: the calibration was made from {rig.raw}, and headings of a filter" in result.stderr
+
+
 def test_without_a_filter_the_message_names_it(command, rig, wearer, tmp_path):
     text = str(calibrated("--file", rig.raw, "--out", tmp_path / "x.json").exception)
     assert "no orientation from left_forearm, " in text

@@ -204,6 +204,21 @@ def test_standard_output_without_past_and_future(command, wearer, tmp_path):
     assert len(numbers(file)[1]) == 3 + 72
 
 
+def test_a_clock_that_began_anew_is_told(command, wearer, tmp_path):
+    recording = read_recording(wearer.short)
+    later = {name: data.time_s + 100.0 * (data.time_s > data.time_s[150]) for name, data in
+             recording.sensors.items()}  # fmt: skip
+    sensors = {name: data._replace(time_s=later[name]) for name, data in recording.sensors.items()}
+    file = tmp_path / "gap.csv"
+    write_csv(file, recording._replace(sensors=sensors))
+    result = command(
+        *("run", "--file", file, "--calibration", wearer.calibration, "--model", "rnn"),
+        *("--csv", tmp_path / "poses.csv"),
+    )
+    assert result.returncode == 0, result.stderr
+    assert "clock    began anew 1 times, after all sensors were silent for a minute or more" in result.stderr
+
+
 def test_datagrams_that_nobody_receives_are_told(command, wearer):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as unheard:
         unheard.bind(("127.0.0.1", 0))
