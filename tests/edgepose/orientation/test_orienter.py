@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from edgepose import rotations as rot
+from edgepose import xio
 from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
@@ -17,6 +18,7 @@ from edgepose.orientation.vqf_filter import VqfFilter
 from edgepose.recording import Recording, SensorData, read_recording, samples
 
 REAL = Path(__file__).parents[2] / "data" / "imu" / "six-sites-3s.npz"
+XIO = REAL.parent / "xio-lower-body"
 DEVICE = (0.5, 0.5, 0.5, 0.5)
 
 
@@ -128,6 +130,19 @@ def test_a_real_recording_without_its_orientations(kind):
     assert result.metadata["filter"] == kind
     for name, data in result.sensors.items():
         assert inclination(data.quat, recording.sensors[name].quat).mean() < 2.5, name
+
+
+@pytest.mark.parametrize("sensor", ["pelvis", "left_lower_leg"])
+@pytest.mark.parametrize("kind", ["kalman", "smoother"])
+def test_a_device_with_a_filter_of_its_own(sensor, kind):
+    """18 s with disturbed fields; the device counts its heading from north, ours from east."""
+    device = xio.read_session(XIO)
+    assert device.damage is None
+    ours = orient_recording(device, kind).sensors[sensor].quat
+    truth = rot.quat_multiply(rot.about_z(np.pi / 2), device.sensors[sensor].quat)
+    error = rot.quat_to_rotvec(rot.quat_multiply(ours[100:], rot.quat_conjugate(truth[100:])))
+    assert np.rad2deg(np.linalg.norm(error, axis=1)).mean() < 4.5
+    assert inclination(ours[100:], truth[100:]).mean() < 2.5
 
 
 def test_rows_without_a_rate_keep_their_orientation(worn):
