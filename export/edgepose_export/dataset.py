@@ -5,6 +5,7 @@ from __future__ import annotations
 import zipfile
 import zlib
 from collections.abc import Iterable
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -153,13 +154,15 @@ class Tape(NamedTuple):
 
 
 def tape(takes: list[Take]) -> Tape:
-    """Joins takes."""
+    """Joins takes; none give an empty tape."""
     lengths = [len(take.pose) for take in takes]
     return Tape(
-        torch.from_numpy(np.concatenate([take.orientation for take in takes])),
-        torch.from_numpy(np.concatenate([take.acceleration for take in takes])),
-        torch.cat([root_relative_pose(torch.from_numpy(take.pose)) for take in takes]),
-        torch.tensor([0, *np.cumsum(lengths)]),
+        torch.cat([torch.zeros(0, 6, 3, 3), *(torch.from_numpy(take.orientation) for take in takes)]),
+        torch.cat([torch.zeros(0, 6, 3), *(torch.from_numpy(take.acceleration) for take in takes)]),
+        torch.cat(
+            [torch.zeros(0, 24, 3, 3), *(root_relative_pose(torch.from_numpy(take.pose)) for take in takes)]
+        ),
+        torch.tensor([0, *accumulate(lengths)]),
         [take.name for take in takes],
         [take.license for take in takes],
     )

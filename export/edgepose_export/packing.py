@@ -93,5 +93,7 @@ def _read_index(folder: Path) -> dict[str, Any] | None:
 
 
 def _mapped(folder: Path, name: str, frames: int) -> torch.Tensor:
+    if frames == 0:
+        return torch.zeros(0, *FRAME[name])
     # Copy-on-write, because torch wants arrays that it could write to; the file is never changed.
     return torch.from_numpy(np.memmap(_file(folder, name), "<f4", "c", shape=(frames, *FRAME[name])))

@@ -329,6 +329,10 @@ class Trainer:
             data: what the training takes are, for the archive's card: summary, takes, hours, licenses.
             processes: that train together.
         """
+        if config.sequences % processes.size:
+            raise EdgeposeError(
+                f"{config.sequences} sequences a step cannot be shared by {processes.size} processes equally"
+            )
         torch.manual_seed(config.seed)
         self.config, self.train_tape, self.validation_tape = config, train, validation
         self.data, self.processes = data, processes
@@ -341,10 +345,6 @@ class Trainer:
             raise EdgeposeError(f"{at}no training take is as long as the window of {config.window} frames")
         if not any(processes.everywhere(len(self._validation_starts()))):
             raise EdgeposeError(f"no validation take is as long as the window of {config.window} frames")
-        if config.sequences % processes.size:
-            raise EdgeposeError(
-                f"{config.sequences} sequences a step cannot be shared by {processes.size} processes equally"
-            )
         self.statistics = self._placed(statistics_of(train, config.network, processes))
         self.network = new_network(config.network).to(processes.device)
         self.averaged = new_network(config.network).to(processes.device)
@@ -455,8 +455,9 @@ class Trainer:
         self.optimiser.load_state_dict(state["optimiser"])
         rank, states = self.processes.rank, torch.atleast_2d(state["generator"])
         if len(states) == self.processes.size:
-            self.generator.set_state(states[rank])
-            torch.set_rng_state(torch.atleast_2d(state["torch_generator"])[rank])
+            # Copies: torch crashes on a state that is a view into other memory.
+            self.generator.set_state(states[rank].clone())
+            torch.set_rng_state(torch.atleast_2d(state["torch_generator"])[rank].clone())
         else:
             self._seed(state["step"])
         self.step, self.best, self.worse = state["step"], state["best"], state["worse"]
