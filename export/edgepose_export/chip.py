@@ -8,7 +8,7 @@ import numpy as np
 
 from edgepose.calibration import GRAVITY
 from edgepose.recording import SensorData
-from edgepose.rotations import quat_conjugate, quat_rotate
+from edgepose.rotations import Array, quat_conjugate, quat_rotate
 
 
 class Chip(NamedTuple):
@@ -50,14 +50,16 @@ def raw(data: SensorData, chip: Chip, seed: int, magnetometer: bool) -> SensorDa
     if data.gyr is None or data.acc is None or (magnetometer and data.mag is None and data.quat is None):
         raise ValueError("it has no rates and forces to add errors to")
     rng = np.random.default_rng(seed)
+    # The biases come first: they are the chip's, whatever it records.
+    gyr_bias, acc_bias = rng.normal(0.0, chip.gyr_bias, 3), rng.normal(0.0, chip.acc_bias, 3)
     # White noise up to half the rate of the samples.
     bandwidth = np.sqrt(0.5 / np.median(np.diff(data.time_s)))
 
-    def spoilt(rows: np.ndarray, noise: float, bias: float) -> np.ndarray:
-        return rows + rng.normal(0.0, bias, 3) + rng.normal(0.0, noise, rows.shape)
+    def spoilt(rows: Array, noise: float, bias: Array | float) -> Array:
+        return rows + bias + rng.normal(0.0, noise, rows.shape)
 
-    gyr = spoilt(data.gyr, chip.gyr_noise * bandwidth, chip.gyr_bias)
-    acc = spoilt(data.acc, chip.acc_noise * bandwidth, chip.acc_bias)
+    gyr = spoilt(data.gyr, chip.gyr_noise * bandwidth, gyr_bias)
+    acc = spoilt(data.acc, chip.acc_noise * bandwidth, acc_bias)
     mag = None
     if magnetometer:
         ideal = data.mag if data.mag is not None else quat_rotate(quat_conjugate(data.quat), FIELD_UT)
