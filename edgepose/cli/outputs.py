@@ -22,43 +22,78 @@ class OutputFlags(NamedTuple):
     csv: str | None
     rotations: str
     std: bool
+    npz: str | None
+    bvh: str | None
     udp: Destination | None
+    osc: tuple[str, int] | None
+    tcp: tuple[str, int] | None
+    view: bool
+    height: float
 
     @property
     def any(self) -> bool:
         """Whether there is an output at all."""
-        return self.csv is not None or self.udp is not None
+        named = (self.csv, self.npz, self.bvh, self.udp, self.osc, self.tcp)
+        return self.view or any(output is not None for output in named)
 
     @property
     def files(self) -> dict[str, str]:
         """The files that will be written, by flag."""
-        return {} if self.csv in (None, "-") else {"--csv": str(self.csv)}
+        paths = {"--csv": self.csv, "--npz": self.npz, "--bvh": self.bvh}
+        return {flag: path for flag, path in paths.items() if path not in (None, "-")}
 
-    def open(self, stack: ExitStack) -> list[Sink]:
-        """The sinks, which the stack closes.
+    def open(self, stack: ExitStack, rate: float = 60.0) -> list[Sink]:
+        """The sinks, which the stack closes; `rate` is that of the poses, per second.
 
         Raises:
             EdgeposeError: a file or address cannot be written to.
         """
         from edgepose.sinks.csv_file import CsvSink
         from edgepose.sinks.udp import UdpSink
+        from edgepose.skeleton import default_body
 
+        body = default_body(self.height)
         sinks: list[Sink] = []
         if self.csv is not None:
             sinks.append(stack.enter_context(CsvSink(self.csv, self.rotations, self.std)))
+        if self.npz is not None:
+            from edgepose.sinks.npz import NpzSink
+
+            sinks.append(stack.enter_context(NpzSink(self.npz, rate)))
+        if self.bvh is not None:
+            from edgepose.sinks.bvh import BvhSink
+
+            sinks.append(stack.enter_context(BvhSink(self.bvh, rate, body)))
         if self.udp is not None:
             sinks.append(stack.enter_context(UdpSink(*self.udp)))
+        if self.osc is not None:
+            from edgepose.sinks.vmc import VmcSink
+
+            sinks.append(stack.enter_context(VmcSink(*self.osc, body)))
+        if self.tcp is not None:
+            from edgepose.sinks.tcp import TcpSink
+
+            sinks.append(stack.enter_context(TcpSink(*self.tcp)))
+        if self.view:
+            from edgepose.sinks.view import ViewSink
+
+            sinks.append(stack.enter_context(ViewSink(self.height)))
         return sinks
 
     def remarks(self, sinks: list[Sink]) -> list[str]:
         """What there is to say of the sinks at the end."""
         from edgepose.sinks.udp import UdpSink
+        from edgepose.sinks.vmc import VmcSink
 
-        unsent = sum(sink.unsent for sink in sinks if isinstance(sink, UdpSink))
-        if not unsent or self.udp is None:
-            return []
-        where = f"{self.udp.host}:{self.udp.port}"
-        return [f"udp      {unsent} datagrams did not arrive; is anything listening at {where}?"]
+        remarks = []
+        for name, kind, address in (("udp", UdpSink, self.udp), ("osc", VmcSink, self.osc)):
+            unsent = sum(sink.unsent for sink in sinks if type(sink) is kind)
+            if unsent and address is not None:
+                where = f"{address[0]}:{address[1]}"
+                remarks.append(
+                    f"{name}      {unsent} datagrams did not arrive; is anything listening at {where}?"
+                )
+        return remarks
 
 
 def _destination(ctx: click.Context, param: click.Parameter, value: str | None) -> Destination | None:
@@ -66,6 +101,15 @@ def _destination(ctx: click.Context, param: click.Parameter, value: str | None) 
 
     try:
         return None if value is None else parse_destination(value)
+    except EdgeposeError as error:
+        raise click.BadParameter(str(error)) from None
+
+
+def _address(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, int] | None:
+    from edgepose.sinks.udp import parse_address
+
+    try:
+        return None if value is None else parse_address(value)
     except EdgeposeError as error:
         raise click.BadParameter(str(error)) from None
 
@@ -87,10 +131,34 @@ def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
             help="Add the network's standard deviation of each joint to the CSV, radians.",
         ),
         click.option(
+            "--npz", metavar="FILE", help="Write poses as NPZ with the keys of AMASS when the run ends."
+        ),
+        click.option("--bvh", metavar="FILE", help="Write poses as BVH, for Blender and the like."),
+        click.option(
             "--udp",
             callback=_destination,
             metavar="HOST:PORT[,format=json|binary]",
             help="Send each pose as a datagram.",
+        ),
+        click.option(
+            "--osc",
+            callback=_address,
+            metavar="HOST:PORT",
+            help="Send each pose by the VMC protocol, for VRM avatars; they listen at port 39539 as a rule.",
+        ),
+        click.option(
+            "--tcp",
+            callback=_address,
+            metavar="HOST:PORT",
+            help="Wait here for viewers that read poses as text, as TransPose's does at port 8888.",
+        ),
+        click.option("--view", is_flag=True, help="Show a figure in the browser, see `edgepose view`."),
+        click.option(
+            "--height",
+            type=float,
+            default=1.75,
+            show_default=True,
+            help="The wearer's stature, for the bones of --bvh, --osc and --view, metres.",
         ),
     ]
 

@@ -111,7 +111,7 @@ def run(
       edgepose run --file walk.csv --calibration calib.json --csv - | head
     """
     if not outputs.any:
-        raise click.UsageError("give at least one output: --csv FILE or --udp HOST:PORT")
+        raise click.UsageError("give at least one output, such as --csv FILE, --udp HOST:PORT or --view")
     for flag, given in (("--file", source.file), ("--calibration", calibration_path)):
         for output, path in outputs.files.items():
             if given is not None and _is_same_file(path, given):
@@ -144,7 +144,7 @@ def run(
 
         engine = (StreamEngine if kind == "rnn" or online == "stream" else WindowEngine)(module, past, future)
         stop = stack.enter_context(Stop())
-        sinks = outputs.open(stack)
+        sinks = outputs.open(stack, rate)
         clock = FrameClock(rate)
         way = "stream" if isinstance(engine, StreamEngine) else "window"
         _say(f"running {model} ({kind}, {way}); Ctrl-C ends the run{wishes.hint}")

@@ -14,7 +14,7 @@ import numpy as np
 
 from edgepose.errors import EdgeposeError
 from edgepose.pose import PoseFrame, status_bits, status_text
-from edgepose.rotations import matrix_to_quat, matrix_to_rotvec, quat_to_matrix
+from edgepose.rotations import matrix_to_quat, matrix_to_rotvec, quat_to_matrix, rotvec_to_matrix
 from edgepose.sinks import Sink
 from edgepose.skeleton import JOINTS
 
@@ -112,6 +112,29 @@ def decode_binary(datagram: bytes) -> PoseFrame:
     return PoseFrame(
         index, time_s, status_text(flags, held), rotations, np.full(len(JOINTS), np.nan, np.float32)
     )
+
+
+def decode_json(datagram: bytes) -> PoseFrame:
+    """The pose in a JSON datagram; `std`, which is not sent, is NaN.
+
+    Raises:
+        EdgeposeError: not a datagram of this kind, or its numbers are not valid.
+    """
+    try:
+        message = json.loads(datagram)
+        index, time_s, status = int(message["frame"]), float(message["time_s"]), str(message["status"])
+        vectors = np.array(message["pose"], float)
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+        raise EdgeposeError(f"not a pose datagram: {len(datagram)} bytes, {type(error).__name__}") from None
+    if vectors.shape != (3 * len(JOINTS),) or not (np.abs(vectors) < 1e3).all() or not np.isfinite(time_s):
+        raise EdgeposeError(f"damaged pose datagram: time or angles of frame {index} are not valid numbers")
+    rotations = rotvec_to_matrix(vectors.reshape(-1, 3)).astype(np.float32)
+    return PoseFrame(index, time_s, status, rotations, np.full(len(JOINTS), np.nan, np.float32))
+
+
+def decode(datagram: bytes) -> PoseFrame:
+    """The pose in a datagram of either kind; see `decode_binary` and `decode_json`."""
+    return decode_binary(datagram) if datagram.startswith(MAGIC) else decode_json(datagram)
 
 
 class DatagramSink(Sink):

@@ -2,6 +2,7 @@ import csv
 import json
 import re
 import select
+import shutil
 import signal
 import socket
 import subprocess
@@ -408,31 +409,66 @@ def test_parse_destination_errors(text, message):
         parse_destination(text)
 
 
-def test_receiver_of_the_documentation(receiver):
+def documented_receiver(language: str, port: int) -> str:
+    (code,) = re.findall(rf"```{language}\n(.*?)```", DOCS.read_text(), re.DOTALL)
+    assert "9000" in code
+    return code.replace("9000", str(port))
+
+
+def python_receiver(folder: Path, port: int) -> list[str]:
+    code = documented_receiver("python", port)
+    assert len(code.splitlines()) <= 16
+    return [sys.executable, "-c", code]
+
+
+def javascript_receiver(folder: Path, port: int) -> list[str]:
+    if shutil.which("node") is None:
+        pytest.skip("no node here to run the receiver in JavaScript")
+    return ["node", "-e", documented_receiver("javascript", port)]
+
+
+def c_receiver(folder: Path, port: int) -> list[str]:
+    code = documented_receiver("c", port)
+    assert len(code.splitlines()) <= 26
+    (folder / "receiver.c").write_text(code)
+    subprocess.run(
+        ["cc", "-Wall", "-Wextra", "-Werror", "-o", folder / "receiver", folder / "receiver.c"], check=True
+    )
+    return [str(folder / "receiver")]
+
+
+@pytest.mark.parametrize(
+    ("command", "formats"),
+    [
+        (python_receiver, ("json", "binary")),
+        (javascript_receiver, ("json", "binary")),
+        (c_receiver, ("binary",)),
+    ],
+)
+def test_receivers_of_the_documentation(receiver, tmp_path, command, formats):
     port = receiver.getsockname()[1]
     receiver.close()
-    (code,) = re.findall(r"```python\n(.*?)```", DOCS.read_text(), re.DOTALL)
-    assert len(code.splitlines()) <= 16
-    assert "9000" in code
-    code = code.replace("9000", str(port))
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command(tmp_path, port), stdout=subprocess.PIPE, text=True)
+    vectors = Rotation.from_matrix([make_pose(number).rotations[0] for number in (4, 5)])
+    wanted = {"json": vectors[0].as_rotvec(), "binary": vectors[1].as_quat(canonical=True)[[3, 0, 1, 2]]}
     try:
-        with UdpSink("127.0.0.1", port) as as_json, UdpSink("127.0.0.1", port, "binary") as as_binary:
-            lines = []
-            for sink, number in ((as_json, 4), (as_binary, 5)):
+        for form in formats:
+            number = {"json": 4, "binary": 5}[form]
+            with UdpSink("127.0.0.1", port, form) as sink:
                 for _ in range(200):  # It takes a moment to bind; what is sent before is lost.
                     sink.write(make_pose(number))
                     if select.select([process.stdout], [], [], 0.05)[0]:
                         break
-                # The pipe of the first kind may hold several lines of one pose.
-                while not (line := process.stdout.readline()).startswith(f"{number} "):
-                    pass
-                lines.append(line)
+            # The pipe of the first kind may hold several lines of one pose.
+            while not (line := process.stdout.readline()).startswith(f"{number} "):
+                assert line
+            what, _, numbers = line.partition({"json": "axis-angle", "binary": "quaternion"}[form])
+            assert "pelvis" in what
+            found = [float(text) for text in re.findall(r"-?\d+\.?\d*(?:e-?\d+)?", numbers)]
+            np.testing.assert_allclose(found, wanted[form], atol=2e-6)
     finally:
         process.kill()
         process.communicate()
-    assert "pelvis axis-angle" in lines[0]
-    assert "pelvis quaternion" in lines[1]
 
 
 def test_documented_tables_are_those_of_the_code():

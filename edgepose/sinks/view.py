@@ -1,0 +1,48 @@
+"""Poses as a figure in the browser, by a process of its own that no run has to wait for."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+from importlib.util import find_spec
+
+from edgepose.errors import EdgeposeError
+from edgepose.sinks.udp import UdpSink
+
+STOP_S = 5.0
+"""Time that the viewer has to end, seconds."""
+
+
+class ViewSink(UdpSink):
+    """Starts `edgepose view` and sends it each pose as a datagram, of which it shows the newest."""
+
+    def __init__(self, height_m: float) -> None:
+        """Start the viewer; it tells on standard error where the page is.
+
+        Args:
+            height_m: stature of the figure, metres.
+
+        Raises:
+            EdgeposeError: what the viewer needs is not installed.
+        """
+        if find_spec("viser") is None:
+            raise EdgeposeError("the viewer needs viser: install it with pip install 'edgepose[view]'")
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        command = [sys.executable, "-m", "edgepose", "view", "--udp", f"127.0.0.1:{port}", "--with-parent"]
+        self._viewer = subprocess.Popen(
+            [*command, "--height", str(height_m)], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+        )
+        super().__init__("127.0.0.1", port, "binary")
+
+    def close(self) -> None:
+        """End the viewer; a second call does nothing."""
+        super().close()
+        self._viewer.terminate()
+        try:
+            self._viewer.wait(STOP_S)
+        except subprocess.TimeoutExpired:
+            self._viewer.kill()
+            self._viewer.wait()

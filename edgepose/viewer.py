@@ -1,0 +1,316 @@
+"""Poses as a figure in the browser: of a file, with a time line, or as they come over UDP.
+
+The scene and its controls are viser's, which serves a page of its own; nothing is loaded from elsewhere.
+"""
+
+from __future__ import annotations
+
+import io
+import socket
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import redirect_stdout
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgepose.errors import EdgeposeError
+from edgepose.mannequin import build, ground
+from edgepose.placements import PLACEMENTS
+from edgepose.pose import PoseFrame, status_bits
+from edgepose.poses import Poses
+from edgepose.sinks.udp import decode
+from edgepose.skeleton import Body, forward_kinematics
+
+Array = NDArray[np.float64]
+
+POSE = {"left": "#1F8FDB", "trunk": "#17588A", "right": "#082C47"}
+REFERENCE = {"left": "#B0B0B0", "trunk": "#808080", "right": "#585858"}
+"""Colours; sides differ in lightness, which every eye sees. The lamps of the scene brighten them."""
+
+FRAME_S = 1.0 / 60.0
+"""Time between two pictures, seconds."""
+
+TABLE_S = 0.25
+"""Time between two updates of the text beside the figure, seconds."""
+
+WINDOW_S = 5.0
+"""Rates and gaps are those of this time, seconds."""
+
+SPEEDS = ("0.25", "0.5", "1", "2", "4")
+
+
+class Figure:
+    """A body in the scene."""
+
+    def __init__(
+        self, server: Any, name: str, body: Body, colours: dict[str, str], opacity: float | None
+    ) -> None:
+        """Put a body in its zero pose into the scene of a viser server."""
+        import trimesh
+
+        self._offsets = body.offsets
+        self._solids = build(body.offsets)
+        meshes = (
+            trimesh.creation.cylinder(radius=1.0, height=1.0, sections=20),
+            trimesh.creation.icosphere(subdivisions=2),
+        )
+        self._handles = []
+        for kind, solids, mesh in zip(("bones", "joints"), self._solids, meshes, strict=True):
+            count = len(solids.joints)
+            handle = server.scene.add_batched_meshes_simple(
+                f"/{name}/{kind}",
+                np.asarray(mesh.vertices, np.float32),
+                np.asarray(mesh.faces, np.uint32),
+                np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+                np.zeros((count, 3)),
+                batched_scales=solids.sizes,
+                batched_colors=np.array([_rgb(colours[side]) for side in solids.sides], np.uint8),
+                opacity=opacity,
+                lod="off",
+            )
+            self._handles.append((solids, handle))
+
+    def show(self, rotations: Array, place: Array | None) -> None:
+        """Pose it: local rotations (24, 3, 3), place of the pelvis (3,) or the ground below it."""
+        turned, joints = forward_kinematics(rotations, self._offsets, place)
+        if place is None:
+            joints = joints - [0.0, ground(rotations, self._offsets), 0.0]
+        for solids, handle in self._handles:
+            handle.batched_wxyzs, handle.batched_positions = solids.placed(turned, joints)
+
+
+def _rgb(colour: str) -> tuple[int, ...]:
+    return tuple(bytes.fromhex(colour[1:]))
+
+
+def sensor_table(held: NDArray[np.bool_], rate: float) -> str:
+    """Markdown about the sensors in the last poses: held (N, 6), oldest first, in the order of PLACEMENTS.
+
+    A sensor that is held has sent nothing new for a pose, so its rate is told up to that of the poses.
+    """
+    lines = ["| sensor | new/s | longest gap | now |", "|---|--:|--:|---|"]
+    for name, column in zip(PLACEMENTS, held.T, strict=True):
+        new = rate * float((~column).mean()) if len(column) else 0.0
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], column, [False]]).astype(int)))
+        gap = float((edges[1::2] - edges[::2]).max() / rate) if len(edges) else 0.0
+        now = "held" if len(column) and column[-1] else "ok"
+        lines.append(f"| {name.replace('_', ' ')} | {new:.0f} | {f'{gap:.2f} s' if gap else '-'} | {now} |")
+    return "\n".join(lines)
+
+
+def held_sensors(status: str) -> list[bool]:
+    """Whether each sensor, in the order of PLACEMENTS, is held, of a status text."""
+    mask = status_bits(status)[1]
+    return [bool(mask >> i & 1) for i in range(len(PLACEMENTS))]
+
+
+class Viewer:
+    """A page with a scene, controls and a text, open from the construction until `close`."""
+
+    def __init__(self, host: str, port: int, body: Body) -> None:
+        """Serve the page.
+
+        Args:
+            host: address of this machine at which browsers find it.
+            port: TCP port.
+            body: of the figures.
+
+        Raises:
+            EdgeposeError: viser is not installed, or the port is taken.
+        """
+        try:
+            import viser
+        except ImportError as error:
+            raise EdgeposeError(
+                "the viewer needs viser: install it with pip install 'edgepose[view]'"
+            ) from error
+        # viser would take the next free port and not tell a program that waits for this one.
+        try:
+            socket.create_server(
+                (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET
+            ).close()
+        except OSError as error:
+            raise EdgeposeError(
+                f"cannot show poses at {host} port {port}: {error.strerror or error}; choose another --port"
+            ) from error
+        with redirect_stdout(
+            io.StringIO()
+        ):  # It greets, which a command that may be part of a pipe must not.
+            self._server: Any = viser.ViserServer(host=host, port=port, label="edgepose", verbose=False)
+        self._body = body
+        self._server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self._server.scene.set_up_direction("+y")
+        self._server.scene.add_grid(
+            "/ground", plane="xz", infinite_grid=True, cell_size=0.5, fade_distance=12.0
+        )
+        self._server.initial_camera.position = (0.8, 1.3, 2.1)
+        self._server.initial_camera.look_at = (0.0, 0.9, 0.0)
+        self.figure = Figure(self._server, "pose", body, POSE, None)
+        self._told = 0.0
+
+    @property
+    def port(self) -> int:
+        """Where the page is served."""
+        port: int = self._server.get_port()
+        return port
+
+    def close(self) -> None:
+        """Close the page."""
+        with redirect_stdout(io.StringIO()):
+            self._server.stop()
+
+    # --- poses of a file ------------------------------------------------------------------------------------
+
+    def play(self, poses: Poses, reference: Poses | None, stopped: Callable[[], bool]) -> None:
+        """Show poses of a file, over and over, until `stopped`.
+
+        Args:
+            poses: at least one.
+            reference: drawn transparently besides, on the same clock, or from its start where the two clocks
+                have no time in common.
+            stopped: asked for every picture.
+        """
+        times = poses.time_s - poses.time_s[0]
+        gui = self._server.gui
+        playing = gui.add_checkbox("play", True)
+        end = max(float(times[-1]), FRAME_S)
+        line = gui.add_slider("time, s", 0.0, round(end + 0.005, 2), 0.01, 0.0)
+        speed = gui.add_dropdown("speed", SPEEDS, initial_value="1")
+        text = gui.add_markdown("")
+        second = None
+        if reference is not None:
+            second = Figure(self._server, "reference", self._body, REFERENCE, 0.4)
+        places = _on_the_ground(poses, self._body)
+        second_places = None if reference is None else _on_the_ground(reference, self._body)
+        held = np.array([held_sensors(status) for status in poses.status])
+        window = max(1, round(WINDOW_S * poses.rate))
+        at, shown = 0.0, -1
+        wanted: deque[float] = deque(maxlen=1)  # where somebody has moved the slider to
+
+        @line.on_update
+        def _(event: Any) -> None:
+            if event.client is not None:
+                wanted.append(float(line.value))
+
+        last = time.monotonic()
+        while not stopped():
+            now = time.monotonic()
+            if wanted:
+                at = wanted.pop()
+            elif playing.value:
+                at = (at + (now - last) * float(speed.value)) % end
+            last = now
+            i = int(np.searchsorted(times, at + 1e-9, side="right")) - 1
+            if i != shown:
+                with self._server.atomic():
+                    self.figure.show(poses.rotations[i], None if places is None else places[i])
+                    if reference is not None and second is not None:
+                        j = _beside(reference, poses, i)
+                        second.show(
+                            reference.rotations[j], None if second_places is None else second_places[j]
+                        )
+                shown = i
+            if now - self._told >= TABLE_S:
+                self._told = now
+                if playing.value:
+                    line.value = round(at, 2)
+                table = sensor_table(held[max(0, i + 1 - window) : i + 1], poses.rate)
+                text.content = (
+                    f"pose {i + 1} of {len(times)}, {poses.rate:g} poses/s\n\n"
+                    f"**{poses.status[i]}**\n\n{table}"
+                )
+            time.sleep(max(0.0, FRAME_S - (time.monotonic() - now)))
+
+    # --- poses as they come ---------------------------------------------------------------------------------
+
+    def follow(self, receiver: socket.socket, stopped: Callable[[], bool]) -> None:
+        """Show poses that come as datagrams, always the newest one, until `stopped`.
+
+        Args:
+            receiver: bound socket; what comes is JSON or binary as `edgepose run --udp` sends it.
+            stopped: asked for every picture.
+        """
+        text = self._server.gui.add_markdown("waiting for poses")
+        stream = Stream()
+        receiver.setblocking(False)
+        while not stopped():
+            now = time.monotonic()
+            newest = stream.take(receiver, now)
+            if newest is not None:
+                with self._server.atomic():
+                    self.figure.show(newest.rotations.astype(float), newest.translation)
+            if now - self._told >= TABLE_S:
+                self._told = now
+                text.content = stream.text(now)
+            time.sleep(max(0.0, FRAME_S - (time.monotonic() - now)))
+
+
+class Stream:
+    """Poses that come as datagrams, and what there is to say of the last seconds of them."""
+
+    def __init__(self) -> None:
+        """Nothing has come yet."""
+        self.poses, self.lost, self.bad = 0, 0, 0
+        self._last: PoseFrame | None = None
+        self._recent: deque[tuple[float, list[bool]]] = deque()
+        self._newest_s = 0.0
+
+    def take(self, receiver: socket.socket, now: float) -> PoseFrame | None:
+        """The newest pose of all that wait at a non-blocking socket; `now` on a monotonic clock, seconds."""
+        newest = None
+        for _ in range(1000):  # A flood must not keep the picture from being drawn.
+            try:
+                datagram = receiver.recv(65536)
+            except OSError:
+                break
+            try:
+                newest = self._add(decode(datagram), now) or newest
+            except EdgeposeError:
+                self.bad += 1
+        while self._recent and self._recent[0][0] < now - WINDOW_S:
+            self._recent.popleft()
+        return newest
+
+    def _add(self, pose: PoseFrame, now: float) -> PoseFrame | None:
+        if self._last is not None:
+            step = pose.index - self._last.index
+            if -60 < step <= 0:  # Late or doubled; further back is a new run.
+                return None
+            self.lost += max(0, step - 1)
+        self.poses += 1
+        self._last, self._newest_s = pose, now
+        self._recent.append((now, held_sensors(pose.status)))
+        return pose
+
+    def text(self, now: float) -> str:
+        """Markdown about what has come."""
+        if self._last is None:
+            bad = f"; {self.bad} datagrams were no poses" if self.bad else ""
+            return f"waiting for poses{bad}"
+        span = min(WINDOW_S, max(1.0, now - self._recent[0][0])) if self._recent else WINDOW_S
+        rate = len(self._recent) / span
+        held = np.array([row for _, row in self._recent], bool).reshape(-1, len(PLACEMENTS))
+        silent = now - self._newest_s
+        state = self._last.status if silent < 1.0 else f"nothing for {silent:.0f} s"
+        counts = [f"{rate:.0f} poses/s", f"{self.poses} poses", f"{self.lost} lost"]
+        counts += [f"{self.bad} bad"] if self.bad else []
+        return f"{', '.join(counts)}\n\n**{state}**\n\n{sensor_table(held, rate or 60.0)}"
+
+
+def _beside(reference: Poses, poses: Poses, i: int) -> int:
+    """Index of the reference pose that is nearest to pose i."""
+    common = reference.time_s[0] <= poses.time_s[-1] and poses.time_s[0] <= reference.time_s[-1]
+    start = 0.0 if common else poses.time_s[0] - reference.time_s[0]
+    return int(np.abs(reference.time_s - (poses.time_s[i] - start)).argmin())
+
+
+def _on_the_ground(poses: Poses, body: Body) -> Array | None:
+    """Places of the pelvis (T, 3), metres, the lowest point of all on the ground; None if unknown."""
+    if poses.translation is None:
+        return None
+    some = slice(None, None, max(1, len(poses.frames) // 1000))
+    lowest = ground(poses.rotations[some], body.offsets, poses.translation[some])
+    return poses.translation - [poses.translation[0, 0], lowest, poses.translation[0, 2]]
