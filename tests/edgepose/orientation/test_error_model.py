@@ -69,3 +69,13 @@ def test_noise_grows_with_time_and_with_what_was_lost():
     np.testing.assert_allclose(np.diag(lost), [0.25] * 3 + [0] * 3 + [4.0] * 3 + [0] * 6)
     turning = model.process_noise(settings, 0.1, 1.0, 0.0, 0.0)
     assert (np.diag(turning)[model.TURN] > np.diag(short)[model.TURN]).all()
+
+
+def test_turn_is_the_product_with_a_rotation_vector():
+    rng = np.random.default_rng(1)
+    for size in (0.0, 1e-12, 1e-3, 1.0, 3.0, 7.0):
+        quat = rng.normal(size=4)
+        quat /= np.linalg.norm(quat)
+        vector = size * rng.normal(size=3)
+        expected = rot.quat_multiply(quat, rot.rotvec_to_quat(vector))
+        np.testing.assert_allclose(rot.turn(tuple(quat), *vector.tolist()), expected, atol=1e-12)
