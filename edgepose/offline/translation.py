@@ -21,13 +21,14 @@ FLIGHT = -4.0
 
 _ANKLES = [JOINTS.index("left_ankle"), JOINTS.index("right_ankle")]
 _FLYING = 1e-3  # how much the lower foot counts then
+_ROUNDS = 6  # of weighing anew
 
 
 def pelvis_path(solution: Solution, offsets: Array, rate: float) -> Array:
     """Path (T, 3) in T, metres: the likeliest for the acceleration and the supporting foot.
 
     Integrated twice, an error of the acceleration grows without bound. That the lower foot stands gives the
-    speed, except in flight. The path still drifts, by some hundredths of the way; there is no ground in it.
+    speed, except in flight. The path still drifts, by a tenth of the way; there is no ground in it.
     It begins over the origin, as high as the pelvis is of someone who stands straight.
 
     Args:
@@ -45,16 +46,21 @@ def pelvis_path(solution: Solution, offsets: Array, rate: float) -> Array:
     # supporting foot's. Errors last for many frames, so that one of a single frame counts `rate` times less.
     flies = np.fmin(acceleration[1:, 1], acceleration[:-1, 1]) < FLIGHT
     stands = np.where(flies, _FLYING, 1.0) / SLIP**2 / rate
-    measured = np.isfinite(acceleration[1:-1, 0])
-    pushes = np.where(measured, rate / ACCELERATION_ERROR**2, 0.0)
-    diagonal = stands.copy()
-    diagonal[1:] += pushes
-    diagonal[:-1] += pushes
-    right = stands[:, None] * _support_speed(solution.rotations, offsets, rate)
+    support = _support_speed(solution.rotations, offsets, rate)
+    pushes = np.where(np.isfinite(acceleration[1:-1, 0]), rate / ACCELERATION_ERROR**2, 0.0)
     push = pushes[:, None] * np.nan_to_num(acceleration[1:-1]) / rate
-    right[1:] += push
-    right[:-1] -= push
-    speed = solveh_banded(np.stack([diagonal, np.append(-pushes, 0.0)]), right, lower=True)
+    trust = np.ones(frames - 1)
+    for _ in range(_ROUNDS):
+        diagonal = stands * trust
+        right = diagonal[:, None] * support
+        diagonal[1:] += pushes
+        diagonal[:-1] += pushes
+        right[1:] += push
+        right[:-1] -= push
+        speed = solveh_banded(np.stack([diagonal, np.append(-pushes, 0.0)]), right, lower=True)
+        # While the weight passes from foot to foot, the lower one may be the one that swings.
+        slips = np.linalg.norm(speed - support, axis=1) / (2.0 * SLIP)
+        trust = 1.0 / (1.0 + slips**2) ** 2
     return standing_place(offsets) + np.concatenate([np.zeros((1, 3)), np.cumsum(speed, axis=0) / rate])
 
 
