@@ -1,0 +1,39 @@
+"""Readers for real recordings with true poses, as their makers publish them.
+
+Nobody may pass these data on: a user gets them from their makers and has a licence. What a reader needs to
+know of a layout comes from its makers and users; the readers' tests make small files of the same layout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from edgepose.errors import EdgeposeError
+from edgepose_export.dataset import Take
+from edgepose_export.published.dip_imu import read_dip
+from edgepose_export.published.totalcapture import read_totalcapture
+
+__all__ = ["read_dip", "read_published", "read_totalcapture"]
+
+
+def read_published(folder: Path) -> Iterator[Take]:
+    """All takes below a folder: DIP's .pkl files, or, where there are any, TotalCapture's .sensors files.
+
+    TotalCapture's .sensors need DIP's .pkl of the same name for the true pose, wherever below the folder.
+
+    Raises:
+        EdgeposeError: there is none, or one of them is broken.
+    """
+    pickles = sorted(folder.rglob("*.pkl"))
+    sensors = sorted(folder.rglob("*.sensors"))
+    if not pickles:
+        raise EdgeposeError(
+            f"{folder}: no .pkl file with true poses; unpack DIP-IMU or DIP's TotalCapture there"
+        )
+    if not sensors:
+        yield from map(read_dip, pickles)
+        return
+    truth = {path.stem.lower(): path for path in pickles}
+    for path in sensors:
+        yield read_totalcapture(path, folder, truth)

@@ -1,0 +1,152 @@
+"""Reader for TotalCapture's own files (cvssp.org/data/totalcapture): Xsens sensors and their calibration.
+
+`NAME_Xsens_AuxFields.sensors`: the number of sensors and of frames, then for each frame its number from 1 and
+a line a sensor: name, quaternion w x y z to the inertial frame, acceleration with gravity in the sensor's
+frame, and more; 60 Hz. `sN_NAME_calib_imu_ref.txt` and `_bone.txt`: the number of sensors, then name and
+quaternion x y z w of inertial to global frame, and of sensor to bone. The global frame has Y up and is SMPL's
+turned by half a turn about Y. True SMPL poses are DIP's; they end with the sensors.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgepose import rotations as rot
+from edgepose.calibration import GRAVITY
+from edgepose.errors import EdgeposeError
+from edgepose_export.dataset import Take
+from edgepose_export.published.dip_imu import read_true_pose
+
+Array = NDArray[np.float64]
+
+LICENSE = "TotalCapture (cvssp.org/data/totalcapture), for non-commercial research"
+
+NAMES = ("L_LowArm", "R_LowArm", "L_LowLeg", "R_LowLeg", "Head", "Pelvis")
+"""TotalCapture's names of the six placements, in their order."""
+
+BODY_FROM_GLOBAL = np.diag([-1.0, 1.0, -1.0])
+THEIR_BONE_FROM_OURS = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
+
+MAX_FRAMES = 1_000_000
+_NUMBERS = 7  # of each line: quaternion and acceleration; AuxFields has more behind them
+
+
+def read_totalcapture(path: Path, folder: Path, truth: Mapping[str, Path]) -> Take:
+    """One take of Xsens sensors, 60 frames a second.
+
+    Args:
+        path: `NAME_Xsens_AuxFields.sensors` in a folder of its subject, `s1` to `s5`.
+        folder: below which the calibrations lie.
+        truth: DIP's pickles by lower-case name, such as `s1_acting1`.
+
+    Raises:
+        EdgeposeError: a file is missing or broken; says which and where.
+    """
+    name = _take_name(path)
+    orientation, force = read_sensors(path)
+    refs = _calibration(folder, f"{name}_calib_imu_ref.txt")
+    bones = _calibration(folder, f"{name}_calib_imu_bone.txt")
+    if name not in truth:
+        raise EdgeposeError(f"{path}: no {name}.pkl with the true poses; DIP's authors publish them")
+    to_body = BODY_FROM_GLOBAL @ refs
+    r_tb = to_body @ orientation @ rot.transpose(bones) @ THEIR_BONE_FROM_OURS
+    acceleration = (to_body @ orientation @ force[..., None])[..., 0] - [0.0, GRAVITY, 0.0]
+    pose = read_true_pose(truth[name])
+    frames = min(len(pose), len(r_tb))
+    return Take(
+        name,
+        r_tb[-frames:].astype(np.float32),
+        acceleration[-frames:].astype(np.float32),
+        pose[-frames:].astype(np.float32),
+        LICENSE,
+    )
+
+
+def _take_name(path: Path) -> str:
+    """Subject and action, such as `s1_acting1`, of `s1/acting1_Xsens_AuxFields.sensors`."""
+    stem = path.stem.lower()
+    action = stem.partition("_xsens")[0]
+    if re.match(r"s\d_", action):
+        return action
+    subject = next((p.name.lower() for p in path.parents if re.fullmatch(r"[sS]\d", p.name)), "")
+    return f"{subject}_{action}"
+
+
+def read_sensors(path: Path) -> tuple[Array, Array]:
+    """R_IS (T, 6, 3, 3) and specific force (T, 6, 3) in the sensors' frames of a .sensors file.
+
+    Raises:
+        EdgeposeError: not such a file; names the line.
+    """
+    try:
+        with path.open(encoding="ascii", errors="replace") as file:
+            lines = iter(enumerate(file, start=1))
+            sensors, frames = _counts(path, next(lines, (1, ""))[1])
+            values = np.empty((frames, len(NAMES), _NUMBERS))
+            for frame in range(frames):
+                number, line = next(lines, (0, ""))
+                if line.strip() != str(frame + 1):
+                    raise EdgeposeError(
+                        f"{path}, line {number or 'at the end'}: expected frame {frame + 1} of {frames}, "
+                        f"found {line.strip()[:40]!r}"
+                    )
+                found = {}
+                for _ in range(sensors):
+                    number, line = next(lines, (0, ""))
+                    name, *cells = line.split()[: 1 + _NUMBERS] or [""]
+                    if name in NAMES:
+                        found[name] = _row(path, number, cells)
+                if missing := [name for name in NAMES if name not in found]:
+                    raise EdgeposeError(f"{path}: frame {frame + 1} has no {', '.join(missing)}")
+                values[frame] = [found[name] for name in NAMES]
+    except OSError as error:
+        raise EdgeposeError(f"{path}: cannot be read: {error.strerror or error}") from error
+    quats = values[..., :4]
+    return rot.quat_to_matrix(quats / np.linalg.norm(quats, axis=-1, keepdims=True)), values[..., 4:]
+
+
+def _counts(path: Path, line: str) -> tuple[int, int]:
+    """Numbers of sensors and of frames in a file's first line."""
+    cells = line.split()
+    if len(cells) == 2 and all(cell.isdecimal() and len(cell) < 9 for cell in cells):
+        sensors, frames = map(int, cells)
+        if len(NAMES) <= sensors <= 100 and 0 < frames <= MAX_FRAMES:
+            return sensors, frames
+    raise EdgeposeError(
+        f"{path}, line 1: expected the numbers of sensors and frames, found {line.strip()[:40]!r}"
+    )
+
+
+def _row(path: Path, number: int, cells: list[str]) -> list[float]:
+    """Quaternion and acceleration of a line."""
+    try:
+        row = [float(cell) for cell in cells]
+    except ValueError:
+        row = []
+    if len(row) != _NUMBERS or not np.abs(row).max() < 1e4 or not abs(np.linalg.norm(row[:4]) - 1.0) < 0.1:
+        raise EdgeposeError(f"{path}, line {number}: expected a unit quaternion and an acceleration")
+    return row
+
+
+def _calibration(folder: Path, name: str) -> Array:
+    """Rotations (6, 3, 3) in a calibration file anywhere below a folder."""
+    path = next(iter(sorted(p for p in folder.rglob("*.txt") if p.name.lower() == name)), None)
+    if path is None:
+        raise EdgeposeError(f"{folder}: no {name}, the calibration of these sensors")
+    try:
+        rows = {
+            line.split()[0]: line.split()[1:] for line in path.read_text().splitlines()[1:] if line.strip()
+        }
+        x, y, z, w = np.array([[float(v) for v in rows[name]] for name in NAMES]).T
+        quats = np.stack([w, x, y, z], axis=1)
+    except (OSError, ValueError, KeyError) as error:
+        raise EdgeposeError(f"{path}: not a calibration of {', '.join(NAMES)} ({error})") from error
+    norm = np.linalg.norm(quats, axis=1, keepdims=True)
+    if not (np.abs(norm - 1.0) < 0.1).all():
+        raise EdgeposeError(f"{path}: a quaternion is not of unit length")
+    return rot.quat_to_matrix(quats / norm)

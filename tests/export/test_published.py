@@ -1,0 +1,196 @@
+"""Readers of published recordings, on small files of their makers' layouts."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from edgepose import rotations as rot
+from edgepose.calibration import GRAVITY
+from edgepose.errors import EdgeposeError
+from edgepose.placements import BONES, PLACEMENTS
+from edgepose.skeleton import forward_kinematics
+from edgepose_export.published import read_dip, read_published, read_totalcapture
+
+FRAMES = 12
+DIP_PLACES = (7, 8, 11, 12, 0, 2)
+
+
+@pytest.fixture
+def truth():
+    """Poses (T, 72), the bones' orientations (T, 6, 3, 3), accelerations in T (T, 6, 3)."""
+    rng = np.random.default_rng(1)
+    gt = np.cumsum(0.05 * rng.normal(size=(FRAMES, 72)), axis=0)
+    bones = forward_kinematics(rot.rotvec_to_matrix(gt.reshape(-1, 24, 3)), np.zeros((24, 3)))[0]
+    return gt, bones[:, list(BONES)], rng.normal(size=(FRAMES, 6, 3))
+
+
+def dip_imu(truth):
+    gt, orientation, acceleration = truth
+    imu_ori, imu_acc = np.zeros((FRAMES, 17, 3, 3)), np.zeros((FRAMES, 17, 3))
+    imu_ori[:, DIP_PLACES], imu_acc[:, DIP_PLACES] = orientation, acceleration
+    return {"imu_ori": imu_ori, "imu_acc": imu_acc, "gt": gt}
+
+
+@pytest.mark.parametrize("protocol", [0, 2, 4])
+def test_dip_imu(truth, tmp_path, protocol):
+    path = tmp_path / "s_09" / "01.pkl"
+    path.parent.mkdir()
+    path.write_bytes(pickle.dumps(dip_imu(truth), protocol))
+    take = read_dip(path)
+    gt, orientation, acceleration = truth
+    assert take.name == "s_09_01"
+    assert "non-commercial" in take.license
+    np.testing.assert_allclose(take.orientation, orientation, atol=1e-6)
+    np.testing.assert_allclose(take.acceleration, acceleration, atol=1e-6)
+    np.testing.assert_allclose(take.pose, rot.rotvec_to_matrix(gt.reshape(-1, 24, 3)), atol=1e-6)
+
+
+def test_lost_packets_have_the_nearest_frame(truth, tmp_path):
+    content = dip_imu(truth)
+    content["imu_ori"][3:6, 7] = np.nan
+    content["imu_acc"][:2, 0] = np.nan
+    path = tmp_path / "01.pkl"
+    path.write_bytes(pickle.dumps(content))
+    take = read_dip(path)
+    arm, head = PLACEMENTS.index("left_forearm"), PLACEMENTS.index("head")
+    for frame, nearest in ((3, 2), (5, 6)):
+        np.testing.assert_allclose(take.orientation[frame, arm], truth[1][nearest, arm], atol=1e-6)
+    np.testing.assert_allclose(take.acceleration[:2, head], truth[2][[2, 2], head], atol=1e-6)
+    content["imu_acc"][:, 2] = np.nan
+    path.write_bytes(pickle.dumps(content))
+    with pytest.raises(EdgeposeError, match="pelvis in 'imu_acc': no frame was measured"):
+        read_dip(path)
+
+
+def test_dips_totalcapture(truth, tmp_path):
+    gt, orientation, acceleration = truth
+    order = [2, 3, 0, 1, 4, 5]  # legs first
+    path = tmp_path / "s1_acting1.pkl"
+    path.write_bytes(
+        pickle.dumps(
+            {"ori": orientation[:, order].reshape(FRAMES, 6, 9), "acc": acceleration[:, order], "gt": gt}
+        )
+    )
+    (take,) = read_published(tmp_path)
+    np.testing.assert_allclose(take.orientation, orientation, atol=1e-6)
+    np.testing.assert_allclose(take.acceleration, acceleration, atol=1e-6)
+
+
+class Attack:
+    def __reduce__(self):
+        return (print, ("run!",))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: c.pop("gt"), "has no 'gt'"),
+        (lambda c: c.pop("imu_acc"), r"neither DIP-IMU .* it has gt, imu_ori"),
+        (lambda c: c.update(gt=np.zeros((FRAMES, 10))), r"'gt' is \(12, 10\)"),
+        (lambda c: c.update(gt=np.full((FRAMES, 72), np.nan)), "gt contains NaN"),
+        (lambda c: c.update(imu_ori=np.zeros((5, 17, 3, 3))), r"'imu_ori' is \(5, 17, 3, 3\) and not \(12,"),
+        (lambda c: c.update(imu_ori=np.ones((FRAMES, 17, 3, 3))), "matrices that are no rotations"),
+        (lambda c: c.update(imu_ori="words"), "not an array of numbers"),
+        (lambda c: c.update(extra=Attack()), r"asks for \S+print, .*it was not run"),
+    ],
+)
+def test_broken_pickles(truth, tmp_path, capsys, change, message):
+    content = dip_imu(truth)
+    change(content)
+    path = tmp_path / "01.pkl"
+    path.write_bytes(pickle.dumps(content))
+    with pytest.raises(EdgeposeError, match=message):
+        read_dip(path)
+    assert "run!" not in capsys.readouterr().out
+
+
+def test_no_pickle_at_all(tmp_path):
+    with pytest.raises(EdgeposeError, match=r"none\.pkl: cannot be read"):
+        read_dip(tmp_path / "none.pkl")
+    with pytest.raises(EdgeposeError, match=r"no \.pkl file with true poses"):
+        list(read_published(tmp_path))
+    (tmp_path / "cut.pkl").write_bytes(pickle.dumps({"gt": np.zeros((3, 72))})[:40])
+    with pytest.raises(EdgeposeError, match="not a readable pickle of DIP-IMU"):
+        read_dip(tmp_path / "cut.pkl")
+
+
+# --- TotalCapture -------------------------------------------------------------------------------------------
+
+SENSORS = ("Head", "Sternum", "Pelvis", "L_UpArm", "R_UpArm", "L_LowArm", "R_LowArm", "L_LowLeg", "R_LowLeg")
+OURS = ("L_LowArm", "R_LowArm", "L_LowLeg", "R_LowLeg", "Head", "Pelvis")
+GLOBAL_FROM_BODY = np.diag([-1.0, 1.0, -1.0])
+OUR_BONE_FROM_THEIRS = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]]).T
+
+
+def line(name, numbers):
+    return "\t".join([name, *(f"{number:.9f}" for number in numbers)])
+
+
+@pytest.fixture
+def totalcapture(truth, tmp_path):
+    """A folder as TotalCapture and DIP publish them, with three frames of sensors more than of poses."""
+    gt, orientation, acceleration = truth
+    rng = np.random.default_rng(5)
+    ref, bone = (rot.rotvec_to_matrix(rng.normal(size=(6, 3))) for _ in range(2))
+    # R_GB of their bones = R_ref R_IS inverse(R_bone)
+    theirs = GLOBAL_FROM_BODY @ orientation @ OUR_BONE_FROM_THEIRS
+    sensor = rot.transpose(ref) @ theirs @ bone
+    in_global = (acceleration + np.array([0.0, GRAVITY, 0.0])) @ GLOBAL_FROM_BODY.T
+    force = (rot.transpose(sensor) @ rot.transpose(ref) @ in_global[..., None])[..., 0]
+    quats = rot.matrix_to_quat(sensor)
+    rows = [f"{len(SENSORS)}\t{FRAMES + 3}"]
+    for frame in range(FRAMES + 3):
+        rows.append(str(frame + 1))
+        at = max(frame - 3, 0)
+        for name in SENSORS:
+            i = OURS.index(name) if name in OURS else 0
+            rows.append(line(name, [*quats[at, i], *force[at, i], *np.zeros(6)]))
+    folder = tmp_path / "tc"
+    (folder / "gyro_mag" / "s1").mkdir(parents=True)
+    (folder / "imu" / "s1").mkdir(parents=True)
+    path = folder / "gyro_mag" / "s1" / "Acting1_Xsens_AuxFields.sensors"
+    path.write_text("\n".join(rows) + "\n")
+    for kind, turns in (("ref", ref), ("bone", bone)):
+        x = rot.matrix_to_quat(turns)[:, [1, 2, 3, 0]]
+        text = "\n".join(["6", *(line(name, x[i]).replace("\t", " ") for i, name in enumerate(OURS))])
+        (folder / "imu" / "s1" / f"s1_acting1_calib_imu_{kind}.txt").write_text(text + "\n")
+    (folder / "s1_acting1.pkl").write_bytes(pickle.dumps({"gt": gt}, 2))
+    return folder, path
+
+
+def test_totalcapture(totalcapture, truth):
+    (take,) = read_published(totalcapture[0])
+    assert take.name == "s1_acting1"
+    np.testing.assert_allclose(take.orientation, truth[1], atol=1e-5)
+    np.testing.assert_allclose(take.acceleration, truth[2], atol=1e-5)
+    assert take.pose.shape == (FRAMES, 24, 3, 3)
+
+
+def test_broken_sensors(totalcapture):
+    folder, path = totalcapture
+    truth = {"s1_acting1": folder / "s1_acting1.pkl"}
+    text = path.read_text()
+    rows = text.splitlines()
+
+    def broken(changed, message):
+        path.write_text(changed)
+        with pytest.raises(EdgeposeError, match=message):
+            read_totalcapture(path, folder, truth)
+
+    broken("", r"line 1: expected the numbers of sensors and frames")
+    broken(text.replace("9\t15", "9\t99999999999", 1), "line 1")
+    broken("\n".join(rows[:25]), r"line at the end: expected frame 3 of 15, found|frame 3 has no")
+    broken(text.replace("\n2\n", "\n7\n", 1), r"line 12: expected frame 2 of 15, found '7'")
+    broken(text.replace("Pelvis", "Tail", 1), "frame 1 has no Pelvis")
+    broken("\n".join([*rows[:2], "Head\tnan 0 0 0 0 0 0", *rows[3:]]), "line 3: expected a unit quaternion")
+    path.write_text(text)
+    with pytest.raises(EdgeposeError, match=r"no s1_acting1\.pkl"):
+        read_totalcapture(path, folder, {})
+    calibration = folder / "imu" / "s1" / "s1_acting1_calib_imu_ref.txt"
+    calibration.write_text("6\nHead 0 0 0 1\n")
+    with pytest.raises(EdgeposeError, match="not a calibration of"):
+        read_totalcapture(path, folder, truth)
+    calibration.unlink()
+    with pytest.raises(EdgeposeError, match=r"no s1_acting1_calib_imu_ref\.txt"):
+        read_totalcapture(path, folder, truth)
