@@ -15,7 +15,7 @@ import numpy as np
 from edgepose import __version__, calibration
 from edgepose.calibration import Calibration, HeadingReset, HoldSummary
 from edgepose.cli.guide import Guide
-from edgepose.cli.measuring import FACING, ROUTINE_S, Plan, live, recorded
+from edgepose.cli.measuring import ROUTINE_S, Plan, finds_forward, live, recorded
 from edgepose.cli.options import Orientations, SourceFlags, filter_options, source_options
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
@@ -168,11 +168,10 @@ def calibrate(
     metadata["warnings"] = warnings
     if reset is not None:
         metadata["heading_reset"] = {"source": heading_reset, "error_deg": _by_sensor(reset.error_deg)}
-    faces_x = heading_reset is not None and heading_reset.startswith(FACING)
     result = calibration.calibrate(
         summary,
         pose=pose,
-        body_frame=body_frame or ("heading:0" if faces_x else "pelvis:-z"),
+        body_frame=body_frame or ("heading:0" if finds_forward(heading_reset) else "pelvis:-z"),
         created=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         heading_offset=None if reset is None else reset.offset,
         metadata=metadata,

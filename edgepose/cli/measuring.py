@@ -16,11 +16,13 @@ from edgepose.errors import EdgeposeError
 from edgepose.recording import read_recording, samples
 from edgepose.sources.files import is_recording
 
-FACING = ("motion", "mounting")
-"""Ways of heading reset, by how they begin, that find out where the wearer faces."""
-
 ROUTINE_S = 30.0
 """Longest motion that is taken from a recording unless --motion says from where to where."""
+
+
+def finds_forward(heading_reset: str | None) -> bool:
+    """Whether that way of heading reset also finds out where the wearer faces."""
+    return heading_reset is not None and heading_reset.partition(":")[0] in ("motion", "mounting")
 
 
 class Plan(NamedTuple):
@@ -38,7 +40,7 @@ class Plan(NamedTuple):
     def lying(self) -> Path | None:
         """The recording of sensors that lie side by side."""
         way = self.heading_reset
-        return None if way is None or way == "live" or way.startswith(FACING) else Path(way)
+        return None if way is None or way == "live" or finds_forward(way) else Path(way)
 
 
 def live(
@@ -48,11 +50,12 @@ def live(
     reset = _side_by_side(source, plan, orient, say)
     with source.open() as opened:
         batches = all_reporting(((now_s, orient(came)) for now_s, came in opened), say)
-        _check_north(orient, plan)
         if plan.heading_reset == "live":
             reset = held(batches, "lying", plan.countdown_s, plan.hold_s, say, calibration.heading_offsets)
             wait_for_enter(batches, say)
         summary = held(batches, plan.pose, plan.countdown_s, plan.hold_s, say, calibration.check_hold)
+        # Not before: magnetometers may be slower than the rest.
+        _check_north(orient, plan)
         if plan.heading_reset == "motion":
             upright = summary.orientation
             reset = moved(batches, say, lambda moving: calibration.headings_from_motion(moving, upright))
@@ -98,11 +101,12 @@ def _side_by_side(source: SourceFlags, plan: Plan, orient: Orientations, say: Gu
 
 def _mounted(plan: Plan, summary: HoldSummary) -> HeadingReset | None:
     """Heading reset from how the sensors sit, if that is wanted."""
-    if plan.heading_reset is None or not plan.heading_reset.startswith("mounting"):
+    way, _, axis = (plan.heading_reset or "").partition(":")
+    if way != "mounting":
         return None
     if plan.mounting:
         return calibration.headings_from_mounting(summary.orientation, plan.mounting)
-    return calibration.headings_from_axis(summary.orientation, plan.heading_reset.partition(":")[2])
+    return calibration.headings_from_axis(summary.orientation, axis)
 
 
 def _check_north(orient: Orientations, plan: Plan) -> None:

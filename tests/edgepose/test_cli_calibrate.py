@@ -119,7 +119,8 @@ def test_a_raw_capture(tmp_path: Path) -> None:
 
 
 def test_a_heading_reset_from_a_recording(tmp_path: Path) -> None:
-    flat = write_recording(tmp_path / "flat.csv", lambda t: lying())
+    # Its name is none of the ways.
+    flat = write_recording(tmp_path / "mounting-flat.csv", lambda t: lying())
     pose = write_recording(tmp_path / "pose.csv", lambda t: worn(cal.POSES["t-pose"]))
     out = tmp_path / "calib.json"
     result = run("--file", pose, "--heading-reset", flat, "--pose", "t-pose", "--hold", 1, "--out", out)
