@@ -150,7 +150,9 @@ def test_the_command(six, tmp_path):
     names = [row[0] for row in rows if len(row) > 6]
     assert names.count("edgepose") == 4  # filter and smoother, with and without magnetometer
     assert names.count("vqf") == names.count("offlineVQF") == names.count("imufusion") == 2
-    scores = json.loads(subprocess.run([*command, "--json"], capture_output=True, check=True).stdout)
+    told = json.loads(subprocess.run([*command, "--json"], capture_output=True, check=True).stdout)
+    assert told["us_a_sample_at_286_hz"] > 0.0
+    scores = told["scores"]
     assert len(scores) == 2 * 2 * len({score["filter"] for score in scores})
     assert all(0 < score["total"] < 180 and score["us"] > 0 for score in scores)
 
