@@ -15,7 +15,7 @@ from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 from edgepose.recording import read_recording
-from edgepose.skeleton import default_body, forward_kinematics
+from edgepose.skeleton import JOINTS, default_body, forward_kinematics
 from edgepose_export.dataset import read_take
 from edgepose_export.training import read_checkpoint
 
@@ -310,3 +310,96 @@ def test_errors_are_one_line(made, tmp_path):
     assert done.returncode == 1
     assert done.stderr == f"edgepose: {tmp_path / 'bad.toml'}: steps is 'many'; it takes a whole number\n"
     assert not (tmp_path / "run").exists()
+
+
+def test_tables_and_figures_of_the_paper(made, tmp_path):
+    """Two archives side by side, with pictures, and what their deviations are worth."""
+    folder, _, _ = made
+    birnn, rnn = folder / "new" / "tiny.pt", tmp_path / "small-rnn.pt"
+    config = tmp_path / "rnn.toml"
+    config.write_text(CONFIG.replace('"birnn"', '"rnn"').replace("steps = 6", "steps = 1"))
+    data = ("--data", folder / "recordings")
+    edgepose("train", "--config", config, *data, "--out", tmp_path / "run", "--threads", 1)
+    edgepose("export", tmp_path / "run" / "checkpoint.pt", "--out", rnn)
+    both = ("evaluate", "--trust", "--model", birnn, "--model", rnn, *data)
+    said = edgepose(*both, "--table", 3, "--histogram", tmp_path / "errors.png").stdout
+    parts, head, *rows, note = said.strip("\n").splitlines()
+    assert parts.split() == ["cmu-walk-run", "cmu-02", "bandai-styles"]
+    assert head.count("μ_ang, deg") == head.count("σ_pos, cm") == 3
+    assert [line.split("   ")[0] for line in rows] == [
+        "tiny, online, window (20, 5)",
+        "tiny, online, window (50, 5)",
+        "small-rnn, online, step by step",
+    ]
+    assert "cmu-02 119" in note
+    assert (tmp_path / "errors.png").stat().st_size > 5000
+    said = edgepose(
+        *both, "--part", "cmu-02", "--online", "stream", "--reliability", tmp_path / "deviations.png"
+    ).stdout
+    assert "cmu-02: tiny, online, stream (5 future)" in said
+    assert "cmu-02: small-rnn, online, step by step" in said
+    assert said.count("% expected") == 4
+    assert (tmp_path / "deviations.png").stat().st_size > 5000
+
+
+def test_heat_map(made, tmp_path):
+    folder, _, _ = made
+    words = ("evaluate", "--trust", "--data", folder / "recordings", "--part", "cmu-02")
+    path = folder / "new" / "tiny.pt"
+    said = edgepose(*words, "--model", path, "--heat-map", tmp_path / "map.png", "--every", 40).stdout
+    lines = said.strip().splitlines()
+    assert "3 frames" in lines[0]
+    assert [line.split()[0] for line in lines[1:9]] == ["200", "100", "50", "20", "10", "5", "1", "0"]
+    assert lines[9].split() == ["0", "1", "5", "10", "20", "50", "100", "200"]
+    assert (tmp_path / "map.png").stat().st_size > 5000
+    for more in (("--model", path), ("--model", "rnn")):
+        wrong = CliRunner().invoke(
+            cli, [*map(str, words), "--model", str(path), *map(str, more), "--heat-map", "x.png"]
+        )
+        assert wrong.exit_code == 2
+    wrong = CliRunner().invoke(cli, [*map(str, words), "--model", "rnn", "--heat-map", "x.png"])
+    assert wrong.exit_code == 2
+    assert "rnn is unidirectional" in wrong.output
+    wrong = CliRunner().invoke(cli, [*map(str, words), "--table", "3", "--past", "4"])
+    assert wrong.exit_code == 2
+    assert "pictures are written as" in fails(*words, "--model", path, "--histogram", tmp_path / "x.gif")
+
+
+def test_deviations_are_fitted_at_export(made):
+    """The factors of the validation take stand in the archive's description and in what it predicts."""
+    folder, _, _ = made
+    about = archive.inspect(folder / "new" / "tiny.pt").metadata
+    factors = about["std_scale"]
+    assert set(factors) == set(JOINTS)
+    fitted = [factors[name] for name in about["joints"]]
+    assert all(factor > 0 for factor in fitted)
+    assert len(set(fitted)) == 10
+    assert factors["left_knee"] == factors["pelvis"] == 1.0
+    # The same take stands in every part of the split: on each the deviations are right.
+    for numbers in about["deviations"].values():
+        assert numbers["values"] == 119 * 10
+    card = (folder / "new" / "tiny.md").read_text(encoding="utf-8")
+    assert "### Predicted standard deviations" in card
+    assert f"| {about['deviations']['cmu-02']['scale']:.2f} | 1190 |" in card
+
+
+def test_fine_tuning_goes_on_too(made, tmp_path):
+    """A run that began from other weights (DIP 3.4.4) resumes like any other."""
+    folder, _, train = made
+    tuned = tmp_path / "tuned"
+    edgepose(*train, "--out", tuned, "--init", folder / "run" / "best.pt", "--steps", 3)
+    said = edgepose(*train, "--out", tuned, "--resume").output
+    assert "going on at step 3" in said
+    state = read_checkpoint(tuned / "checkpoint.pt")
+    assert state["step"] == 6
+    assert ", then " in state["data"]["summary"]
+    assert state["data"]["takes"] == 2
+
+
+def test_packed_takes_give_the_same_run(made, tmp_path):
+    folder, _, train = made
+    edgepose(*train, "--out", tmp_path / "packed", "--cache", tmp_path / "cache")
+    one, other = (read_checkpoint(path / "checkpoint.pt") for path in (folder / "run", tmp_path / "packed"))
+    for name, weights in one["network"].items():
+        torch.testing.assert_close(weights, other["network"][name], rtol=0, atol=1e-6)
+    assert one["data"] == other["data"]

@@ -11,7 +11,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.placements import BONES
 from edgepose.skeleton import PREDICTED, UNOBSERVED, default_body, forward_kinematics
 from edgepose_export import baselines, evaluation
-from edgepose_export.dataset import Take, describe, read_take
+from edgepose_export.dataset import Take, describe, read_take, take_paths, training_paths
 from edgepose_export.evaluation import Mode, run_archive
 from edgepose_export.mocap import read_motion, resample
 from edgepose_export.networks import NetworkShape
@@ -158,6 +158,47 @@ def test_interpolated_bones_lie_between_their_sensors(walk):
         np.testing.assert_allclose(world[:, joint], world[:, parent], atol=1e-6)
 
 
+def test_measured_bones_with_the_mean_pose_are_right_for_who_moves_only_those(wearers):
+    take = moving(wearers)
+    pose = Rotation.random(24, random_state=4).as_matrix()
+    take = take._replace(pose=baselines.with_measured_bones(take, pose))
+    world, _ = forward_kinematics(take.pose, np.zeros((24, 3)))
+    np.testing.assert_allclose(world[:, list(BONES)], take.orientation, atol=1e-6)
+    got = all_baselines(take, baselines.learn([take]))["measured bones, others' mean local pose"]
+    assert errors(got, take) < 1e-3
+
+
+def test_frozen_pose_is_the_straight_one(wearers):
+    take = moving(wearers)
+    got = all_baselines(take, baselines.learn([take]))["frozen calibration pose"]
+    np.testing.assert_allclose(got[:, 0], take.orientation[:, 5])
+    take = take._replace(pose=got)
+    world, _ = forward_kinematics(got, np.zeros((24, 3)))
+    # Seen from the pelvis the arms hang, everything else is as in the T-pose.
+    seen = np.swapaxes(world[:, :1], -1, -2) @ world
+    np.testing.assert_allclose(seen[:, 16] @ [1, 0, 0], np.tile([0, -1, 0], (50, 1)), atol=1e-6)
+    np.testing.assert_allclose(seen[:, 1], np.tile(np.eye(3), (50, 1, 1)), atol=1e-6)
+
+
+def test_nearest_neighbours_find_poses_that_were_seen(walk):
+    """Each frame stands in the training takes eight times: its neighbours are its copies."""
+    learnt = baselines.learn([walk] * 8)
+    assert errors(baselines.nearest(walk, learnt), walk) < 1e-2
+
+
+def test_baselines_need_no_more_memory_for_more_takes(walk, monkeypatch):
+    monkeypatch.setattr(baselines, "MOST_FRAMES", 300)
+    few, many = baselines.learn([walk]), baselines.learn(iter([walk] * 40))
+    assert len(few.inputs) == 119
+    assert 150 <= len(many.inputs) == len(many.poses) <= 300
+    # Evenly spread: every sixteenth frame of 40 times 119.
+    inputs = np.tile(few.inputs, (40, 1))
+    stride = round(len(inputs) / len(many.inputs))
+    np.testing.assert_array_equal(many.inputs, inputs[::stride])
+    np.testing.assert_allclose(many.mean_pose, few.mean_pose, atol=1e-9)
+    np.testing.assert_allclose(many.offsets, few.offsets, atol=1e-9)
+
+
 # --- the split ----------------------------------------------------------------------------------------------
 
 
@@ -187,6 +228,45 @@ def test_interpolated_bones_lie_between_their_sensors(walk):
 def test_part_of_the_split(name, part):
     assert part_of(name) == part
     assert part in (*HELD_OUT, "train", "validation")
+
+
+NAMES = [
+    *(f"{subject:02}_{take:02}" for subject in (1, 2, 3, 5, 6, 7, 8, 9) for take in (1, 12)),
+    *(
+        f"dataset-{part}_{motion}_{style}_{number:03}"
+        for part in (1, 2)
+        for motion in ("walk", "raise-up-both-hands")
+        for style in ("normal", "exhausted", "tired", "not-confident", "active", "masculine")
+        for number in (1, 27)
+    ),
+]
+
+
+def test_no_take_leaks(tmp_path):
+    """Every take has one part, neither its pieces nor copies elsewhere have another, and training sees no
+    held-out subject or style.
+    """
+    for name in NAMES:
+        for piece in (name, f"{name}.part2"):
+            for folder in ("", "standing", "seated"):
+                (tmp_path / folder).mkdir(exist_ok=True)
+                (tmp_path / folder / f"{piece}.npz").touch()
+            assert part_of(piece) == part_of(name)
+    parts = {part: take_paths(tmp_path, part) for part in ("train", "validation", *HELD_OUT)}
+    assert sum(map(len, parts.values())) == 6 * len(NAMES) == len(set().union(*parts.values()))
+    train, validation = training_paths(tmp_path)
+    assert (train, validation) == (parts["train"], parts["validation"])
+
+    def kinds(paths):
+        """Subjects of CMU and styles of Bandai-Namco."""
+        words = (path.stem.split(".")[0].split("_") for path in paths)
+        return {word[2] if len(word) == 4 else word[0] for word in words}
+
+    assert kinds(train) == {"01", "05", "06", "normal", "active", "masculine"}
+    assert kinds(validation) == {"03", "not-confident"}
+    assert kinds(parts["cmu-walk-run"]) == {"07", "08", "09"}
+    assert kinds(parts["cmu-02"]) == {"02"}
+    assert kinds(parts["bandai-styles"]) == {"exhausted", "tired"}
 
 
 def test_tables_of_a_folder(tmp_path, tiny, walk):

@@ -434,6 +434,96 @@ def test_paper_configs_are_the_papers():
 
 
 @pytest.mark.parametrize(
+    ("name", "acceleration_loss", "dropout", "shape"),
+    [
+        ("dip-rnn-dropout", False, 0.2, NetworkShape("rnn")),
+        ("dip-rnn-acc", True, 0.0, NetworkShape("rnn")),
+        ("dip-birnn-dropout", False, 0.2, NetworkShape()),
+        ("dip-birnn-acc", True, 0.0, NetworkShape()),
+        ("dip-birnn-no-acc", False, 0.2, NetworkShape(acceleration=False)),
+        ("dip-birnn-heading", True, 0.2, NetworkShape(normalisation="heading")),
+        ("dip-birnn-sequence", True, 0.2, NetworkShape(normalisation="sequence")),
+        ("dip-feed-forward", True, 0.2, NetworkShape("feed-forward")),
+        ("dip-wavenet", True, 0.2, NetworkShape("wavenet", 128)),
+    ],
+)
+def test_rows_of_the_papers_tables_differ_in_what_they_say(name, acceleration_loss, dropout, shape):
+    whole, config = (training.read_config(CONFIGS / f"{n}.toml") for n in ("dip-birnn", name))
+    assert (config.acceleration_loss, config.input_dropout, config.network) == (
+        acceleration_loss,
+        dropout,
+        shape,
+    )
+    same = {"acceleration_loss": True, "input_dropout": 0.2, "network": whole.network}
+    assert replace(config, **same) == whole
+    assert (whole.warm_up, whole.patience, whole.steps) == (0, 10, 100_000)
+
+
+@pytest.mark.parametrize(
+    ("kind", "normalisation", "acceleration", "inputs"),
+    [
+        ("feed-forward", "root", True, 60),
+        ("wavenet", "root", True, 60),
+        ("rnn", "heading", True, 72),
+        ("rnn", "sequence", True, 72),
+        ("rnn", "root", False, 45),
+    ],
+)
+def test_every_network_learns(takes, tmp_path, kind, normalisation, acceleration, inputs):
+    shape = NetworkShape(kind, 8, normalisation=normalisation, acceleration=acceleration)
+    config = replace(SMALL, network=shape, beta=0.0, acceleration_loss=acceleration)
+    one = trainer(takes, replace(config, steps=50, warm_up=0, learning_rate=0.03, validate_every=50))
+    assert one.statistics.input_mean.shape == (inputs,)
+    losses, _ = fit(one, tmp_path)
+    assert np.mean(losses[-10:]) < np.mean(losses[:10]) - 0.1
+    state = read_checkpoint(tmp_path / "checkpoint.pt")
+    assert same(state["averaged"], dict(one.averaged.state_dict()))
+
+
+def test_loss_without_accelerations_is_the_poses_alone(takes):
+    both, alone = (trainer(takes, replace(SMALL, beta=0.0, acceleration_loss=loss)) for loss in (True, False))
+    outputs = SMALL.network.pose_outputs
+
+    def zero(x):
+        nothing = torch.zeros(*x.shape[:-1], outputs + 15)
+        return nothing, nothing + 1
+
+    batch = training.windows(both.train_tape, torch.tensor([0]), 20)
+    s = both.statistics
+    targets = (training.pose_targets(batch[2], SMALL.network) - s.target_mean) / s.target_std
+    torch.testing.assert_close(alone._loss(zero, batch, 0.0), 0.5 * targets.square().mean())
+    assert both._loss(zero, batch, 0.0) != alone._loss(zero, batch, 0.0)
+
+
+def test_warm_up_and_decay(takes):
+    """DIP 4.1: times 0.96 in 2000 steps; the paper has no warm-up."""
+    one = trainer(takes, replace(SMALL, warm_up=0, learning_rate=1e-3))
+    for step, expected in ((0, 1e-3), (2000, 0.96e-3), (6000, 1e-3 * 0.96**3)):
+        one.step = step
+        one.train_step()
+        assert one.optimiser.param_groups[0]["lr"] == pytest.approx(expected)
+    slow = trainer(takes, replace(SMALL, warm_up=9, learning_rate=1e-3))
+    slow.train_step()
+    assert slow.optimiser.param_groups[0]["lr"] == pytest.approx(1e-4)
+
+
+def test_config_that_differs_from_another(tmp_path):
+    (tmp_path / "whole.toml").write_text("steps = 7\nseed = 3\n[network]\nhidden = 8\nkind = 'rnn'\n")
+    (tmp_path / "other.toml").write_text("base = 'whole'\nsteps = 9\n[network]\nhidden = 16\n")
+    config = training.read_config(tmp_path / "other.toml")
+    assert (config.steps, config.seed, config.network) == (9, 3, NetworkShape("rnn", 16))
+    (tmp_path / "other.toml").write_text("base = 3\n")
+    with pytest.raises(EdgeposeError, match=r"other\.toml: base is 3; it takes the name of a config"):
+        training.read_config(tmp_path / "other.toml")
+    (tmp_path / "other.toml").write_text("base = 'nosuch'\n")
+    with pytest.raises(EdgeposeError, match=r"nosuch\.toml: No such file"):
+        training.read_config(tmp_path / "other.toml")
+    (tmp_path / "other.toml").write_text("base = 'other'\n")
+    with pytest.raises(EdgeposeError, match=r"other\.toml: unknown field 'base'"):
+        training.read_config(tmp_path / "other.toml")
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("steps = 'many'", "steps is 'many'; it takes a whole number"),
@@ -452,6 +542,8 @@ def test_paper_configs_are_the_papers():
         ("[network]\nhidden = 0", "hidden is 0; it takes 1 to"),
         ("[network]\nlayers = 3", r"unknown field 'layers' in [network]"),
         ("[network]\nmeasured = 'passed'", 'measured = "passed" needs targets = "global-6d"'),
+        ("[network]\nacceleration = false", "cannot give them back: acceleration_loss = false"),
+        ("[network]\nnormalisation = 'none'", "normalisation is 'none'; it takes 'root' or"),
         ("[augmentation]\nmirror = 2", "mirror is 2; it takes 0 to 1"),
         ("[augmentation]\nheading_deg = inf", "heading_deg is inf; it takes"),
         ("[augmentation\n", "line 1"),
