@@ -88,8 +88,8 @@ def plot(path: str | Path, solution: Solution, measurements: Measurements) -> No
     turns.set_ylabel("orientation residual, deg")
     pulls.set_ylabel("acceleration residual, m/s²")
     pulls.set_xlabel("time, s")
-    costs.legend(loc="upper right", ncols=4, fontsize=7)
-    turns.legend(loc="upper right", ncols=3, fontsize=7)
+    for axes in (costs, turns):
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7, frameon=False)
     try:
         figure.savefig(path)
     except (OSError, ValueError) as error:  # ValueError: an ending that matplotlib does not know

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import partial
 from itertools import pairwise
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -190,9 +190,12 @@ def _passed_over(before: Solution, after: Solution) -> Solution:
     share = (np.arange(frames) + 0.5) / frames
     share = share * share * (3.0 - 2.0 * share)
     first, last = (rot.matrix_to_quat(s.rotations[:frames]) for s in (before, after))
-    rotations = after.rotations.copy()
-    rotations[:frames] = rot.quat_to_matrix(rot.slerp(first, last, share[:, None]))
-    acceleration = after.acceleration.copy()
-    # The ends of a chunk have none of their own.
-    acceleration[:frames] = np.where(share[:, None] < 0.5, before.acceleration, acceleration[:frames])
-    return after._replace(rotations=rotations, acceleration=acceleration)
+    between = rot.quat_to_matrix(rot.slerp(first, last, share[:, None]))
+    # Of all else the nearer chunk's: the ends of a chunk have no acceleration.
+    middle = frames // 2
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(before, name)[:middle], getattr(after, name)[middle:]])
+        for name in ("costs", "turn_rad", "pull", "acceleration")
+    }
+    rotations = np.concatenate([between, after.rotations[frames:]])
+    return after._replace(rotations=rotations, **columns)
