@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -57,3 +58,15 @@ def status_text(flags: int, held: int) -> str:
     if flags & FILLING_WINDOW:
         parts.append("filling window")
     return "; ".join(parts) or "ok"
+
+
+def held_sensors(status: Sequence[str]) -> NDArray[np.bool_]:
+    """Whether each sensor is held, (T, 6) in the order of PLACEMENTS, of T status texts."""
+    masks = np.array([status_bits(text)[1] for text in status], int)
+    return (masks[:, None] >> np.arange(len(PLACEMENTS)) & 1).astype(bool)
+
+
+def longest_holds(held: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Most poses in a row (6,) in which each sensor is held, of `held` (T, 6)."""
+    edges = np.diff(np.pad(held.astype(int), ((1, 1), (0, 0))), axis=0).T
+    return np.array([np.max(np.flatnonzero(e < 0) - np.flatnonzero(e > 0), initial=0) for e in edges])

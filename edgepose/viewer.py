@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from edgepose.errors import EdgeposeError
 from edgepose.mannequin import build, ground
 from edgepose.placements import PLACEMENTS
-from edgepose.pose import PoseFrame, status_bits
+from edgepose.pose import PoseFrame, held_sensors, longest_holds
 from edgepose.poses import Poses
 from edgepose.sinks.udp import decode
 from edgepose.skeleton import Body, forward_kinematics
@@ -92,19 +92,12 @@ def sensor_table(held: NDArray[np.bool_], rate: float) -> str:
     A sensor that is held has sent nothing new for a pose, so its rate is told up to that of the poses.
     """
     lines = ["| sensor | new/s | longest gap | now |", "|---|--:|--:|---|"]
-    for name, column in zip(PLACEMENTS, held.T, strict=True):
+    for name, column, longest in zip(PLACEMENTS, held.T, longest_holds(held), strict=True):
         new = rate * float((~column).mean()) if len(column) else 0.0
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], column, [False]]).astype(int)))
-        gap = float((edges[1::2] - edges[::2]).max() / rate) if len(edges) else 0.0
+        gap = longest / rate
         now = "held" if len(column) and column[-1] else "ok"
         lines.append(f"| {name.replace('_', ' ')} | {new:.0f} | {f'{gap:.2f} s' if gap else '-'} | {now} |")
     return "\n".join(lines)
-
-
-def held_sensors(status: str) -> list[bool]:
-    """Whether each sensor, in the order of PLACEMENTS, is held, of a status text."""
-    mask = status_bits(status)[1]
-    return [bool(mask >> i & 1) for i in range(len(PLACEMENTS))]
 
 
 class Viewer:
@@ -185,7 +178,7 @@ class Viewer:
             second = Figure(self._server, "reference", self._body, REFERENCE, 0.4)
         places = _on_the_ground(poses, self._body)
         second_places = None if reference is None else _on_the_ground(reference, self._body)
-        held = np.array([held_sensors(status) for status in poses.status])
+        held = held_sensors(poses.status)
         window = max(1, round(WINDOW_S * poses.rate))
         at, shown = 0.0, -1
         wanted: deque[float] = deque(maxlen=1)  # where somebody has moved the slider to
@@ -255,7 +248,7 @@ class Stream:
         """Nothing has come yet."""
         self.poses, self.lost, self.bad = 0, 0, 0
         self._last: PoseFrame | None = None
-        self._recent: deque[tuple[float, list[bool]]] = deque()
+        self._recent: deque[tuple[float, str]] = deque()
         self._newest_s = 0.0
 
     def take(self, receiver: socket.socket, now: float) -> PoseFrame | None:
@@ -282,7 +275,7 @@ class Stream:
             self.lost += max(0, step - 1)
         self.poses += 1
         self._last, self._newest_s = pose, now
-        self._recent.append((now, held_sensors(pose.status)))
+        self._recent.append((now, pose.status))
         return pose
 
     def text(self, now: float) -> str:
@@ -292,7 +285,7 @@ class Stream:
             return f"waiting for poses{bad}"
         span = min(WINDOW_S, max(1.0, now - self._recent[0][0])) if self._recent else WINDOW_S
         rate = len(self._recent) / span
-        held = np.array([row for _, row in self._recent], bool).reshape(-1, len(PLACEMENTS))
+        held = held_sensors([status for _, status in self._recent])
         silent = now - self._newest_s
         state = self._last.status if silent < 1.0 else f"nothing for {silent:.0f} s"
         counts = [f"{rate:.0f} poses/s", f"{self.poses} poses", f"{self.lost} lost"]

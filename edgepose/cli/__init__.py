@@ -15,7 +15,19 @@ import click
 from edgepose import __version__
 from edgepose.errors import EdgeposeError
 
-COMMANDS = ("bench", "calibrate", "check", "convert", "devices", "models", "record", "run", "solve", "view")
+COMMANDS = (
+    "bench",
+    "calibrate",
+    "check",
+    "convert",
+    "devices",
+    "models",
+    "record",
+    "report",
+    "run",
+    "solve",
+    "view",
+)
 """Commands of the runtime; others are found through the entry-point group `edgepose.commands`."""
 
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from edgepose.appending import replace_file
 from edgepose.errors import EdgeposeError
-from edgepose.placements import PLACEMENTS
-from edgepose.pose import FILLING_WINDOW, PoseFrame, status_bits
+from edgepose.pose import FILLING_WINDOW, PoseFrame, held_sensors, status_bits
 from edgepose.poses import Z_UP_TO_T, Poses, read_blocks
 from edgepose.rotations import matrix_to_rotvec
 from edgepose.sinks import Sink
@@ -42,12 +41,11 @@ def write_npz(path: Path, blocks: Iterable[Poses], count: int, rate: float) -> N
             np.lib.format.write_array_header_1_0(member, header)
             for block in blocks:
                 member.write(_vectors(block).tobytes())
-                bits = [status_bits(text) for text in block.status]
                 frames.append(block.frames)
                 times.append(block.time_s)
-                filling.append(np.array([flags & FILLING_WINDOW for flags, _ in bits], bool))
-                masks = np.array([mask for _, mask in bits])
-                held.append((masks[:, None] >> np.arange(len(PLACEMENTS)) & 1).astype(bool))
+                held.append(held_sensors(block.status))
+                flags = np.array([status_bits(text)[0] for text in block.status])
+                filling.append((flags & FILLING_WINDOW).astype(bool))
                 places.append(_places(block))
         arrays: dict[str, NDArray[Any]] = {
             "trans": np.concatenate(places),

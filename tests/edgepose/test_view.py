@@ -29,12 +29,12 @@ from websockets.sync.client import connect
 from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
 from edgepose.mannequin import TIPS, build, ground
-from edgepose.pose import PoseFrame
+from edgepose.pose import PoseFrame, held_sensors
 from edgepose.poses import read_poses
 from edgepose.sinks.csv_file import CsvSink
 from edgepose.sinks.udp import UdpSink, decode, encode_binary, encode_json
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics
-from edgepose.viewer import Stream, Viewer, held_sensors, sensor_table
+from edgepose.viewer import Stream, Viewer, sensor_table
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "chrome"))), None)
 needs_browser = pytest.mark.skipif(
@@ -105,8 +105,8 @@ def test_table_of_sensors():
     assert [cell.strip() for cell in rows[4]] == ["head", "45", "0.25 s", "ok"]
     assert [cell.strip() for cell in rows[5]] == ["pelvis", "50", "0.17 s", "held"]
     assert "| pelvis | 0 | - | ok |" in sensor_table(np.zeros((0, 6), bool), 60.0)
-    assert held_sensors("held head pelvis; filling window") == [False] * 4 + [True] * 2
-    assert held_sensors("held tail; and what nobody knows") == [False] * 6
+    flags = held_sensors(["held head pelvis; filling window", "held tail; and what nobody knows"])
+    assert flags.tolist() == [[False] * 4 + [True] * 2, [False] * 6]
 
 
 @pytest.fixture

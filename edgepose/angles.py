@@ -1,0 +1,114 @@
+"""Angles and steps that people read in poses: flexion of joints, lean of the trunk, cadence of a walk.
+
+Angles are those between directions of bones, so that they mean the same however a joint got there; degrees.
+In the zero pose (T-pose) legs, elbows and trunk are at 0 and the shoulders at 90.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgepose.rotations import transpose
+from edgepose.skeleton import JOINTS, forward_kinematics
+
+Array = NDArray[np.float64]
+
+ANGLES = {
+    "hip flexion": "thigh to the front of the pelvis",
+    "hip abduction": "thigh to the side of the pelvis",
+    "knee flexion": "shank to the back of the thigh",
+    "shoulder elevation": "upper arm from hanging down along the chest",
+    "elbow flexion": "forearm from the line of the upper arm",
+    "trunk flexion": "chest to the front of the pelvis",
+    "trunk side bend": "chest to the left of the pelvis",
+    "trunk rotation": "chest turned to the left of the pelvis",
+    "trunk lean": "chest from upright",
+}
+"""The angles, those of limbs on either side, and what they are."""
+
+LIMBS = tuple(name for name in ANGLES if not name.startswith("trunk"))
+
+
+def _axis(joint: str, x: float, y: float, z: float, local: Array) -> tuple[Array, Array, Array]:
+    """Components (T,) of a direction that a joint turns, in its parent's frame."""
+    turned = local[:, JOINTS.index(joint)] @ np.array([x, y, z])
+    return turned[:, 0], turned[:, 1], turned[:, 2]
+
+
+def joint_angles(local: Array) -> dict[str, Array]:
+    """The angles (T,) of `ANGLES`, degrees, of local rotations (T, 24, 3, 3); limbs as "left hip flexion"."""
+    world, _ = forward_kinematics(local, np.zeros((len(JOINTS), 3)))
+    chest = world[:, JOINTS.index("spine3")]
+    result = {}
+    for side, out in (("left", 1.0), ("right", -1.0)):
+        x, y, z = _axis(f"{side}_hip", 0.0, -1.0, 0.0, local)
+        result[f"{side} hip flexion"] = np.arctan2(z, -y)
+        result[f"{side} hip abduction"] = np.arcsin(np.clip(out * x, -1.0, 1.0))
+        x, y, z = _axis(f"{side}_knee", 0.0, -1.0, 0.0, local)
+        result[f"{side} knee flexion"] = np.arctan2(-z, -y)
+        arm = transpose(chest) @ world[:, JOINTS.index(f"{side}_shoulder")] @ np.array([out, 0.0, 0.0])
+        result[f"{side} shoulder elevation"] = np.arccos(np.clip(-arm[:, 1], -1.0, 1.0))
+        x, y, z = _axis(f"{side}_elbow", out, 0.0, 0.0, local)
+        result[f"{side} elbow flexion"] = np.arctan2(np.hypot(y, z), out * x)
+    relative = transpose(world[:, 0]) @ chest
+    up, front = relative[..., 1], relative[..., 2]
+    result["trunk flexion"] = np.arctan2(up[:, 2], up[:, 1])
+    result["trunk side bend"] = np.arcsin(np.clip(up[:, 0], -1.0, 1.0))
+    result["trunk rotation"] = np.arctan2(front[:, 0], front[:, 2])
+    result["trunk lean"] = np.arccos(np.clip(chest[:, 1, 1], -1.0, 1.0))
+    return {name: np.degrees(values) for name, values in result.items()}
+
+
+# --- steps --------------------------------------------------------------------------------------------------
+
+STEP_M = 0.15
+"""A foot that comes this much further to the front than before, against the other one, has made a step."""
+
+FASTEST_STEP_S, SLOWEST_STEP_S = 0.25, 1.2
+"""Between steps of a walk, seconds; a longer pause ends it."""
+
+LEAST_STEPS = 6
+"""Fewer in a row are no walk."""
+
+
+class Walk(NamedTuple):
+    """Steps one after the other without a pause.
+
+    Attributes:
+        frames: (N,) indices of the poses in which a foot was furthest to the front, which is about when it
+            touches the ground.
+        left: (N,) whether it was the left one.
+    """
+
+    frames: NDArray[np.int64]
+    left: NDArray[np.bool_]
+
+
+def walks(local: Array, offsets: Array, rate: float) -> list[Walk]:
+    """Stretches of walking or running.
+
+    Args:
+        local: (T, 24, 3, 3) local rotations.
+        offsets: (24, 3) joint position minus its parent's in the zero pose, metres.
+        rate: frames per second.
+    """
+    from scipy.signal import find_peaks
+
+    world, joints = forward_kinematics(local, offsets)
+    ahead = world[:, 0, :, 2] * [1.0, 0.0, 1.0]  # to the wearer's front, level
+    ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
+    apart = joints[:, JOINTS.index("left_ankle")] - joints[:, JOINTS.index("right_ankle")]
+    lead = np.sum(apart * ahead, axis=1)  # of the left foot before the right one
+    least = max(1, round(FASTEST_STEP_S * rate))
+    left, right = (find_peaks(s * lead, prominence=STEP_M, distance=least)[0] for s in (1.0, -1.0))
+    frames = np.concatenate([left, right])
+    order = np.argsort(frames)
+    frames, is_left = frames[order], (np.arange(len(frames)) < len(left))[order]
+    # A walk ends where the feet do not alternate, or after a pause.
+    pause = (np.diff(frames) > SLOWEST_STEP_S * rate) | (is_left[1:] == is_left[:-1])
+    starts = np.concatenate([[0], np.flatnonzero(pause) + 1, [len(frames)]])
+    return [Walk(frames[a:b], is_left[a:b]) for a, b in pairwise(starts) if b - a >= LEAST_STEPS]

@@ -1,0 +1,44 @@
+"""`edgepose report`: one page about the poses of a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command(short_help="Make a page with angles, steps and sensors of poses.")
+@click.argument("poses", type=click.Path(path_type=Path))
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="HTML file to write, replaced if it is there.  [default: POSES with the ending .html]",
+)
+@click.option(
+    "--height",
+    type=float,
+    default=1.75,
+    show_default=True,
+    help="The wearer's stature, for the figures and for telling steps, metres.",
+)
+def report(poses: Path, out: Path | None, height: float) -> None:
+    """Make one HTML page about the poses of a file (CSV, or NPZ with the keys of AMASS): figures, steps and
+    cadence, joint angles over time, ranges of motion, and how often each sensor was silent.
+
+    The page has everything in it. It needs `pip install 'edgepose[plot]'`.
+
+    \b
+    Examples:
+      edgepose report poses.csv
+      edgepose report walk.npz --out reports/walk.html --height 1.68
+    """
+    from edgepose.poses import read_poses
+    from edgepose.report import write_report
+    from edgepose.skeleton import default_body
+
+    path = poses.with_suffix(".html") if out is None else out
+    if path.resolve() == poses.resolve():
+        raise click.UsageError(f"--out would overwrite {poses}; name another file")
+    body = default_body(height)
+    write_report(path, read_poses(poses), body, poses.name)
+    click.echo(f"Wrote {path}.")
