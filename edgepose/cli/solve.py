@@ -6,22 +6,20 @@ import sys
 import time
 from collections.abc import Iterable
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
+from edgepose.cli.bodies import BodyFlags, body_options
 from edgepose.errors import EdgeposeError
-from edgepose.skeleton import MAX_HEIGHT, MIN_HEIGHT
 
 if TYPE_CHECKING:
     from edgepose.offline.measurements import Measurements
-    from edgepose.offline.solve import OnProgress, Settings, Solution
+    from edgepose.offline.solve import Method, OnProgress, Solution
     from edgepose.offline.terms import Weights
     from edgepose.rotations import Array
     from edgepose.sinks import Sink
-    from edgepose.skeleton import Body
 
 PLAIN_EVERY_S = 10.0
 
@@ -44,10 +42,6 @@ def _weights(ctx: click.Context, param: click.Parameter, value: str) -> Weights:
     return weights
 
 
-def _words(ctx: click.Context, param: click.Parameter, value: str) -> tuple[str, ...]:
-    return tuple(word.strip() for word in value.split(",") if word.strip())
-
-
 @click.command(short_help="Find the poses of a whole recording at once, without a network.")
 @click.argument("recording", metavar="IN", type=click.Path(path_type=Path))
 @click.option(
@@ -64,37 +58,7 @@ def _words(ctx: click.Context, param: click.Parameter, value: str) -> tuple[str,
     show_default=True,
     help="sip: all frames at once, by orientation and acceleration. sop: each frame by orientation alone.",
 )
-@click.option(
-    "--body",
-    "body_name",
-    default="smpl",
-    show_default=True,
-    metavar="smpl|hinges|FILE",
-    help="smpl: SMPL's joints with the average lengths for --height. hinges: a skeleton as rigged by hand "
-    "(SIP-M). FILE: your own SMPL model (.npz or .pkl); a .pkl's code is not run.",
-)
-@click.option(
-    "--height",
-    type=click.FloatRange(MIN_HEIGHT, MAX_HEIGHT),
-    help="Height of the wearer, metres.  [default: 1.75]",
-)
-@click.option("--sex", type=click.Choice(["neutral", "male", "female"]), help="[default: neutral]")
-@click.option("--weight", type=float, help="Weight of the wearer, kg.  [default: the average for --height]")
-@click.option(
-    "--words",
-    callback=_words,
-    default="",
-    metavar="WORD[,WORD...]",
-    help="Shape of the wearer: long-, short-legged, -armed, -necked; broad-, narrow-shouldered, -hipped; "
-    "muscular, slender.",
-)
-@click.option(
-    "--scale",
-    type=click.FloatRange(0.5, 2.0),
-    default=1.0,
-    show_default=True,
-    help="All lengths of the body times this (1.1: SIP-110).",
-)
+@body_options
 @click.option(
     "--weights",
     callback=_weights,
@@ -122,16 +86,16 @@ def _words(ctx: click.Context, param: click.Parameter, value: str) -> tuple[str,
     type=click.IntRange(2, 1000),
     default=30,
     show_default=True,
-    help="Cost evaluations of sip at most.",
+    help="Cost evaluations of sip at most, for each chunk of 15 s.",
 )
 @click.option(
     "--jobs",
     type=click.IntRange(1),
     default=1,
     show_default=True,
-    help="Chunks of 15 s solved at a time, each by a process of its own.",
+    help="Chunks solved at a time, each by a process of its own.",
 )
-@click.option("--csv", "csv_path", metavar="FILE", help="Write poses as CSV; - is standard output.")
+@click.option("--csv", metavar="FILE", help="Write poses as CSV; - is standard output.")
 @click.option(
     "--rotations",
     type=click.Choice(["axis-angle", "quat", "matrix", "euler"]),
@@ -139,10 +103,26 @@ def _words(ctx: click.Context, param: click.Parameter, value: str) -> tuple[str,
     show_default=True,
     help="Representation of rotations in the CSV.",
 )
-@click.option("--npz", "npz_path", metavar="FILE", help="Write poses as NPZ with AMASS's keys.")
-@click.option("--bvh", "bvh_path", metavar="FILE", help="Write poses as BVH.")
-@click.option("--plot", "plot_path", metavar="FILE", help="Draw costs and residuals over time, a picture.")
-def solve(recording: Path, calibration_path: Path, **words: Any) -> None:
+@click.option("--npz", metavar="FILE", help="Write poses as NPZ with AMASS's keys.")
+@click.option("--bvh", metavar="FILE", help="Write poses as BVH.")
+@click.option("--plot", metavar="FILE", help="Draw costs and residuals over time, a picture.")
+def solve(
+    recording: Path,
+    calibration_path: Path,
+    method: Method,
+    body: BodyFlags,
+    weights: Weights,
+    prior_path: Path | None,
+    hold_from: float | None,
+    rate: float,
+    evaluations: int,
+    jobs: int,
+    csv: str | None,
+    rotations: str,
+    npz: str | None,
+    bvh: str | None,
+    plot: str | None,
+) -> None:
     """Find the poses of a whole recording at once: Sparse Inertial Poser.
 
     No network and no training: poses that explain what the sensors measured and that people take. Any 3 to 17
@@ -154,41 +134,56 @@ def solve(recording: Path, calibration_path: Path, **words: Any) -> None:
       edgepose solve walk.npz --calibration calib.json --height 1.68 --words long-legged --npz poses.npz
       edgepose solve walk.npz --calibration calib.json --method sop --jobs 2 --csv - | head
     """
-    flags = _Flags(**words)
-    flags.check(recording, calibration_path)
+    if not (csv or npz or bvh):
+        raise click.UsageError("give at least one output: --csv FILE, --npz FILE or --bvh FILE")
+    for flag, name in {"--csv": csv, "--npz": npz, "--bvh": bvh, "--plot": plot}.items():
+        for given in (recording, calibration_path):
+            if name not in (None, "-") and Path(str(name)).resolve() == given.resolve():
+                raise click.UsageError(f"{flag} would overwrite {given}; name another file")
+
     from edgepose.calibration import load_calibration
     from edgepose.offline import reading, report
+    from edgepose.offline.bodies import sensor_points
     from edgepose.offline.measurements import measure
+    from edgepose.offline.prior import load_prior
+    from edgepose.offline.rigs import hinge_rig, smpl_rig
+    from edgepose.offline.solve import Settings
     from edgepose.offline.solve import solve as solve_all
     from edgepose.offline.translation import pelvis_path
+    from edgepose.sinks.bvh import BvhSink
+    from edgepose.sinks.csv_file import CsvSink
+    from edgepose.sinks.npz import NpzSink
 
-    body = flags.body()
+    wearer, prior = body.build(), load_prior(prior_path)
     calibration = load_calibration(calibration_path)
     data = reading.read(recording, calibration)
-    mounted = reading.mounted(recording, data, calibration, flags.hold_from)
-    if flags.method == "sip" and all(sensor.acc is None for sensor in data.sensors.values()):
+    if method == "sip" and all(sensor.acc is None for sensor in data.sensors.values()):
         raise EdgeposeError(f"{recording}: no sensor has accelerations, which sip needs; use --method sop")
-    measurements = measure(data, mounted, flags.rate)
-    settings = flags.settings(measurements, body)
-    solutions: list[Solution] = []
+    measurements = measure(data, reading.mounted(recording, data, calibration, hold_from), rate)
+    rig = hinge_rig(prior) if body.hinges else smpl_rig(prior, measurements.bones)
+    points = sensor_points(wearer, measurements.names)
+    settings = Settings(method, rig, points, weights, evaluations)
     with ExitStack() as stack:
-        sinks = flags.open(stack, body)  # before the work: a wrong name is told at once
-        interrupted = _collect(
-            solutions, solve_all(measurements, settings, flags.jobs, _progress(len(measurements.time_s)))
-        )
-        if sys.stderr.isatty():
-            click.echo(err=True)
+        # Opened before the work: a wrong name is told at once.
+        sinks: list[Sink] = []
+        if csv is not None:
+            sinks.append(stack.enter_context(CsvSink(csv, rotations, translation=True)))
+        if npz is not None:
+            sinks.append(stack.enter_context(NpzSink(npz, rate, translation=True)))
+        if bvh is not None:
+            sinks.append(stack.enter_context(BvhSink(bvh, rate, wearer)))
+        solutions, interrupted = _collect(solve_all(measurements, settings, jobs, _progress()))
         if not solutions:
             raise KeyboardInterrupt
         solution = report.joined(solutions)
-        _write(sinks, solution, measurements, pelvis_path(solution, settings.body.offsets, flags.rate))
+        _write(sinks, solution, measurements, pelvis_path(solution, points.offsets, rate))
         for sink in sinks:
             sink.close()
     click.echo(report.table(solution, measurements), err=True)
     for line in report.misfits(solution, measurements):
         click.echo(f"warning: {line}", err=True)
-    if flags.plot_path is not None:
-        report.plot(flags.plot_path, solution, measurements)
+    if plot is not None:
+        report.plot(plot, solution, measurements)
     done, frames = len(solution.rotations), len(measurements.time_s)
     click.echo(f"{done} of {frames} poses, {solution.evaluations} cost evaluations", err=True)
     if interrupted:
@@ -197,98 +192,18 @@ def solve(recording: Path, calibration_path: Path, **words: Any) -> None:
         raise EdgeposeError(data.damage)
 
 
-@dataclass(frozen=True)
-class _Flags:
-    """The command's flags."""
-
-    method: Any
-    body_name: str
-    height: float | None
-    sex: str | None
-    weight: float | None
-    words: tuple[str, ...]
-    scale: float
-    weights: Weights
-    prior_path: Path | None
-    hold_from: float | None
-    rate: float
-    evaluations: int
-    jobs: int
-    csv_path: str | None
-    rotations: str
-    npz_path: str | None
-    bvh_path: str | None
-    plot_path: str | None
-
-    def check(self, recording: Path, calibration: Path) -> None:
-        """Raises click.UsageError unless the flags go together."""
-        outputs = {"--csv": self.csv_path, "--npz": self.npz_path, "--bvh": self.bvh_path}
-        if not any(outputs.values()):
-            raise click.UsageError("give at least one output: --csv FILE, --npz FILE or --bvh FILE")
-        for flag, name in {**outputs, "--plot": self.plot_path}.items():
-            for given in (recording, calibration):
-                if (
-                    name not in (None, "-")
-                    and given.exists()
-                    and Path(str(name)).resolve() == given.resolve()
-                ):
-                    raise click.UsageError(f"{flag} would overwrite {given}; name another file")
-        if self._is_file and (self.height or self.sex or self.weight or self.words):
-            raise click.UsageError(
-                "a body from a file has its own shape: leave out --height, --sex, --weight and --words"
-            )
-
-    @property
-    def _is_file(self) -> bool:
-        return self.body_name not in ("smpl", "hinges")
-
-    def body(self) -> Body:
-        """The wearer's body."""
-        from edgepose.offline.bodies import scaled, shaped_body
-
-        if self._is_file:
-            from edgepose.smpl_file import read_smpl
-
-            return scaled(read_smpl(self.body_name), self.scale)
-        return scaled(
-            shaped_body(self.height or 1.75, self.sex or "neutral", self.weight, self.words), self.scale
-        )
-
-    def settings(self, measurements: Measurements, body: Body) -> Settings:
-        """How to solve."""
-        from edgepose.offline.bodies import sensor_points
-        from edgepose.offline.prior import load_prior
-        from edgepose.offline.rigs import hinge_rig, smpl_rig
-        from edgepose.offline.solve import Settings
-
-        prior = load_prior(self.prior_path)
-        rig = hinge_rig(prior) if self.body_name == "hinges" else smpl_rig(prior, measurements.bones)
-        points = sensor_points(body, measurements.names)
-        return Settings(self.method, rig, points, self.weights, self.evaluations)
-
-    def open(self, stack: ExitStack, body: Body) -> list[Sink]:
-        """The outputs, which the stack closes."""
-        from edgepose.sinks.bvh import BvhSink
-        from edgepose.sinks.csv_file import CsvSink
-        from edgepose.sinks.npz import NpzSink
-
-        sinks: list[Sink] = []
-        if self.csv_path is not None:
-            sinks.append(stack.enter_context(CsvSink(self.csv_path, self.rotations, translation=True)))
-        if self.npz_path is not None:
-            sinks.append(stack.enter_context(NpzSink(self.npz_path, self.rate, translation=True)))
-        if self.bvh_path is not None:
-            sinks.append(stack.enter_context(BvhSink(self.bvh_path, self.rate, body)))
-        return sinks
-
-
-def _collect(done: list[Solution], solutions: Iterable[Solution]) -> bool:
-    """Fill the list with solutions; whether Ctrl-C or SIGTERM ended that early."""
+def _collect(solutions: Iterable[Solution]) -> tuple[list[Solution], bool]:
+    """The solutions, and whether Ctrl-C or SIGTERM ended them early."""
+    done: list[Solution] = []
     try:
-        done.extend(solutions)
+        for solution in solutions:
+            done.append(solution)  # one by one: what is done stays
     except KeyboardInterrupt:
-        return True
-    return False
+        return done, True
+    finally:
+        if sys.stderr.isatty():
+            click.echo(err=True)
+    return done, False
 
 
 def _write(sinks: list[Sink], solution: Solution, measurements: Measurements, path: Array) -> None:
@@ -305,24 +220,24 @@ def _write(sinks: list[Sink], solution: Solution, measurements: Measurements, pa
             sink.write(pose)
 
 
-def _progress(frames: int) -> OnProgress:
+def _progress() -> OnProgress:
     """A line on a terminal with chunk, cost and time left; elsewhere a line now and then."""
     terminal = sys.stderr.isatty()
     every_s = 0.2 if terminal else PLAIN_EVERY_S
     started = shown = time.monotonic()
-    usual = 0.0  # evaluations of the chunks that are done
+    most = 0  # evaluations of any chunk so far
 
     def show(chunk: int, count: int, evaluations: int, cost: float) -> None:
-        nonlocal shown, usual
+        nonlocal shown, most
         now = time.monotonic()
-        usual = max(usual, evaluations)
+        most = max(most, evaluations)
         if now - shown < every_s:
             return
         shown = now
-        share = (chunk - 1 + evaluations / (usual + 1.0)) / count
+        share = (chunk - 1 + evaluations / (most + 1)) / count
         left = (now - started) * (1.0 / share - 1.0)
         text = f"chunk {chunk} of {count}, evaluation {evaluations}, cost {cost:.4f}, {left:.0f} s left"
         bar = f"[{'#' * int(30 * share):30}] "
-        click.echo(f"\r{bar}{text}  " if terminal else f"{text}, {frames} frames", nl=not terminal, err=True)
+        click.echo(f"\r{bar}{text}  " if terminal else text, nl=not terminal, err=True)
 
     return show
