@@ -12,7 +12,7 @@ from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
-from edgepose import xio
+from edgepose import mtmanager, xio
 from edgepose.appending import replace_file
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
@@ -40,7 +40,7 @@ class Job(NamedTuple):
     """One recording, or file of poses, to convert.
 
     Attributes:
-        source: file, or folder of an x-io session.
+        source: file, or folder of a session of x-io's software or MT Manager.
         target: file to write.
     """
 
@@ -128,7 +128,7 @@ def _expand(given: Path, out: Path) -> Iterator[tuple[Path, Path]]:
 
 def _walk(folder: Path, out: Path) -> Iterator[Path]:
     """Recordings in a folder, save those of an earlier conversion."""
-    if xio.is_session(folder):
+    if xio.is_session(folder) or mtmanager.is_session(folder):
         yield folder
         return
     if xio.is_sensor(folder):
@@ -184,7 +184,8 @@ def convert(job: Job, protocol: str = "auto", sensors: Path | None = None, filte
 
 def _read(path: Path, protocol: str, sensors: Path | None) -> Recording:
     if path.is_dir():
-        return xio.read_session(path, _serial_numbers(sensors))
+        read = mtmanager.read_session if mtmanager.is_session(path) else xio.read_session
+        return read(path, _serial_numbers(sensors))
     if is_recording(path):
         return salvage_recording(path)
     problems: list[str] = []

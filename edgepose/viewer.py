@@ -6,6 +6,7 @@ The scene and its controls are viser's, which serves a page of its own; nothing 
 from __future__ import annotations
 
 import io
+import select
 import socket
 import time
 from collections import deque
@@ -230,6 +231,8 @@ class Viewer:
         stream = Stream()
         receiver.setblocking(False)
         while not stopped():
+            # Awake as a pose comes, and not at a pace of its own that would skip some.
+            select.select([receiver], [], [], TABLE_S)
             now = time.monotonic()
             newest = stream.take(receiver, now)
             if newest is not None:
@@ -238,7 +241,7 @@ class Viewer:
             if now - self._told >= TABLE_S:
                 self._told = now
                 text.content = stream.text(now)
-            time.sleep(max(0.0, FRAME_S - (time.monotonic() - now)))
+            time.sleep(max(0.0, FRAME_S / 2 - (time.monotonic() - now)))
 
 
 class Stream:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from edgepose.errors import EdgeposeError
@@ -19,7 +19,7 @@ MAIN_FILE = "Inertial.csv"
 
 _LETTERS = {"Inertial.csv": "I", "Quaternion.csv": "Q", "Magnetometer.csv": "M"}
 _TIME = "Timestamp (us)"
-_SERIAL_NUMBER = re.compile(r"\b[0-9A-Fa-f]{8}\b")
+_SERIAL_NUMBER = re.compile(r"(?<![0-9A-Za-z])[0-9A-Fa-f]{8}(?![0-9A-Za-z])")
 _CHUNK = 1000  # lines
 
 _METADATA = {
@@ -50,23 +50,7 @@ def read_session(folder: Path, ids: Mapping[int, str] | None = None) -> Recordin
     Raises:
         EdgeposeError: no folder is of a placement, two are of one, or a file is of another kind.
     """
-    places: dict[str, Path] = {}
-    others = []
-    for sensor in sorted(path.parent for path in folder.glob(f"*/{MAIN_FILE}")):
-        placement = placement_of(sensor.name, ids)
-        if placement is None:
-            others.append(sensor.name)
-        elif placement in places:
-            raise EdgeposeError(
-                f"{folder}: {places[placement].name!r} and {sensor.name!r} are both {placement}; rename one"
-            )
-        else:
-            places[placement] = sensor
-    if not places:
-        how = "in the names of its folders" if ids is None else "with a serial number of --sensors"
-        raise EdgeposeError(
-            f"{folder}: no placement {how} ({', '.join(others)}); placements are {', '.join(PLACEMENTS)}"
-        )
+    places = by_placement(folder, sorted(path.parent for path in folder.glob(f"*/{MAIN_FILE}")), ids)
     problems: list[str] = []
     rows = [
         sample
@@ -85,8 +69,32 @@ def read_session(folder: Path, ids: Mapping[int, str] | None = None) -> Recordin
     return recording._replace(damage="; ".join(problems) or None)
 
 
+def by_placement(folder: Path, sensors: Sequence[Path], ids: Mapping[int, str] | None) -> dict[str, Path]:
+    """Files or folders of the sensors of a session by placement; those of no placement are left out.
+
+    Raises:
+        EdgeposeError: none is of a placement, or two are of one.
+    """
+    places: dict[str, Path] = {}
+    for sensor in sensors:
+        placement = placement_of(sensor.name, ids)
+        if placement is None:
+            continue
+        if placement in places:
+            raise EdgeposeError(
+                f"{folder}: {places[placement].name!r} and {sensor.name!r} are both {placement}; rename one"
+            )
+        places[placement] = sensor
+    if not places:
+        how = f"in the names of its {'folders' if sensors[0].is_dir() else 'files'}"
+        how = how if ids is None else "with a serial number of --sensors"
+        names = ", ".join(sensor.name for sensor in sensors)
+        raise EdgeposeError(f"{folder}: no placement {how} ({names}); placements are {', '.join(PLACEMENTS)}")
+    return places
+
+
 def placement_of(name: str, ids: Mapping[int, str] | None) -> str | None:
-    """Placement of a sensor's folder."""
+    """Placement of a sensor by the name of its folder or file."""
     if ids is not None:
         numbers = [int(number, 16) for number in _SERIAL_NUMBER.findall(name)]
         return next((ids[number] for number in numbers if number in ids), None)

@@ -60,7 +60,8 @@ def convert(
     jobs: int,
     skip_existing: bool,
 ) -> None:
-    """Convert recordings: CSV, NPZ, raw captures of a port, logs of a CAN bus, sessions of x-io's software.
+    """Convert recordings: CSV, NPZ, raw captures of a port, logs of a CAN bus, sessions of x-io's
+    software and of Xsens' MT Manager.
 
     IN are files, patterns and folders. A folder stands for the recordings in it, at any depth; one that holds
     a folder for each x-io sensor is one recording, whose sensors' folders have placements in their names (or,
