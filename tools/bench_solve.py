@@ -2,10 +2,12 @@
 
     OMP_NUM_THREADS=1 python tools/bench_solve.py speed --plot speed.png
     OMP_NUM_THREADS=1 python tools/bench_solve.py table --data recordings/ --part cmu-walk-run
+    OMP_NUM_THREADS=1 python tools/bench_solve.py table --published DIP_IMU/s_09
 
 `speed` solves made-up motion of 500 to 8000 frames and counts the seconds that one core is busy. `table` is
 SIP's table 2 on held-out motion capture (recordings of `edgepose synthesize`), with the shipped networks on
-the same sensors: the wearer has a body of their own, the sensors noise and bias.
+the same sensors: the wearer has a body of their own, the sensors noise and bias. With --published it is that
+of real sensors, of DIP-IMU or TotalCapture, and of the default body.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from __future__ import annotations
 import argparse
 import resource
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,6 +49,10 @@ ACC_NOISE, ACC_BIAS, ACC_SCALE = 0.1, 0.05, 0.01
 """Of the accelerometers: spread of a frame, of the bias of each axis (m/s^2), of each axis' scale."""
 TURN_NOISE_DEG, TURN_BIAS_DEG = 0.3, 1.5
 """Of the orientations: spread of a frame, and of what calibration leaves, degrees an axis."""
+
+
+Method = Callable[[Measurements], Array]
+"""Local rotations (T, 24, 3, 3) of what sensors measured."""
 
 
 # --- sensors ------------------------------------------------------------------------------------------------
@@ -153,13 +159,29 @@ def takes(data: Path, part: str, every: int, body: Body) -> Iterator[Sample]:
         yield Sample(sensors_of(pose, translation, body, np.random.default_rng(number)), pose)
 
 
-def solver(method: str, rig: Rig, body: Body, weights: Weights) -> Callable[[Measurements], Array]:
+def published(folder: Path) -> Iterator[Sample]:
+    """Takes of DIP-IMU or TotalCapture below a folder."""
+    from edgepose_export.published import read_published
+
+    for take in read_published(folder):
+        frames = len(take.pose)
+        valid = np.ones((frames, len(BONES)), bool)
+        valid[[0, -1]] = False
+        times = np.arange(frames) / RATE
+        orientation, acceleration = take.orientation.astype(float), take.acceleration.astype(float)
+        yield Sample(
+            Measurements(PLACEMENTS, times, RATE, orientation, acceleration, valid, ~valid),
+            take.pose.astype(float),
+        )
+
+
+def solver(method: str, rig: Rig, body: Body, weights: Weights) -> Method:
     """Poses (T, 24, 3, 3) that SIP or SOP finds."""
     settings = Settings(method, rig, sensor_points(body, PLACEMENTS), weights)
     return lambda measurements: np.concatenate([p.rotations for p in solve(measurements, settings)])
 
 
-def network(name: str, mode: str) -> Callable[[Measurements], Array]:
+def network(name: str, mode: str) -> Method:
     """Poses of a shipped model, run as `edgepose run` runs it."""
     from edgepose import archive
     from edgepose_export.dataset import Take
@@ -180,10 +202,9 @@ def network(name: str, mode: str) -> Callable[[Measurements], Array]:
     return run
 
 
-def methods(prior: Prior, body: Body, weights: Weights) -> dict[str, Callable[[Measurements], Array]]:
-    """The rows of the table."""
+def methods(prior: Prior, body: Body, described: Body, weights: Weights) -> dict[str, Method]:
+    """The rows of the table, for a wearer's body and what is said of it."""
     smpl = smpl_rig(prior, BONES)
-    described = shaped_body(HEIGHT_M, SEX, WEIGHT_KG, WORDS)
     return {
         "SOP": solver("sop", smpl, body, weights),
         "SIP-M": solver("sip", hinge_rig(prior), body, weights),
@@ -197,21 +218,19 @@ def methods(prior: Prior, body: Body, weights: Weights) -> dict[str, Callable[[M
     }
 
 
-def table(data: Path, part: str, every: int, prior: Prior, weights: Weights) -> None:
-    """Print mean and deviation of the errors of every method."""
-    body = own_body(np.random.default_rng(0))
-    rows = methods(prior, body, weights)
+def table(samples: Iterable[Sample], body: Body, rows: dict[str, Method]) -> None:
+    """Print mean and deviation of the errors of every method; positions are those of a body."""
     values: dict[str, dict[str, list[Array]]] = {name: {} for name in rows}
     count = 0
-    for sample in takes(data, part, every, body):
+    for sample in samples:
         count += 1
         for name, method in rows.items():
             poses = method(sample.measurements)
             for key, column in metrics.per_frame(poses, sample.pose, body.offsets, RATE).items():
                 values[name].setdefault(key, []).append(column)
     if not count:
-        raise SystemExit(f"{data}: no take of the part {part!r}; make them with edgepose synthesize")
-    print(f"{part}: {count} takes; prior of {prior.about}; {weights}")
+        raise SystemExit("no takes there; make them with edgepose synthesize")
+    print(f"{count} takes")
     print(
         metrics.format_table(
             {
@@ -229,7 +248,9 @@ def main() -> None:
     fast = commands.add_parser("speed", help="seconds and memory from 500 to 8000 frames")
     fast.add_argument("--plot", type=Path, help="picture to draw")
     good = commands.add_parser("table", help="SIP's table 2 on held-out motion capture")
-    good.add_argument("--data", type=Path, required=True, help="folder that edgepose synthesize wrote")
+    source = good.add_mutually_exclusive_group(required=True)
+    source.add_argument("--data", type=Path, help="folder that edgepose synthesize wrote")
+    source.add_argument("--published", type=Path, help="folder of DIP-IMU or TotalCapture")
     good.add_argument("--part", default="cmu-walk-run", help="part of the split")
     good.add_argument("--every", type=int, default=1, help="take only every so many takes")
     good.add_argument("--prior", type=Path, help="file of edgepose learn-prior instead of the shipped one")
@@ -238,8 +259,16 @@ def main() -> None:
     if flags.command == "speed":
         speed(flags.plot)
     else:
-        weights = Weights(mahal=flags.mahal)
-        table(flags.data, flags.part, flags.every, load_prior(flags.prior), weights)
+        weights, prior = Weights(mahal=flags.mahal), load_prior(flags.prior)
+        print(f"prior of {prior.about}; {weights}")
+        if flags.published:
+            body = default_body()
+            table(published(flags.published), body, methods(prior, body, body, weights))
+        else:
+            body = own_body(np.random.default_rng(0))
+            described = shaped_body(HEIGHT_M, SEX, WEIGHT_KG, WORDS)
+            samples = takes(flags.data, flags.part, flags.every, body)
+            table(samples, body, methods(prior, body, described, weights))
 
 
 if __name__ == "__main__":

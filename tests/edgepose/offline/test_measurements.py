@@ -1,5 +1,7 @@
 """From recordings of any sensors to frames, with gaps, late sensors and further sensors from a hold."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -166,6 +168,20 @@ def test_when_the_pose_was_held_must_be_known(wearer, with_thigh):
         reading.mounted(with_thigh, data, calibration, None)
     with pytest.raises(EdgeposeError, match="left_upper_leg: 0 orientations from 50 to 53 s"):
         mounts_from_hold(data, calibration, ["left_upper_leg"], 50.0, 53.0)
+
+
+def test_orientations_are_made_as_the_calibration_says(wearer, with_thigh):
+    calibration = replace(load_calibration(wearer.calibration), filter="kalman", north=False)
+    data = reading.read(wearer.short, calibration)
+    sent = read_recording(wearer.short)
+    for name, made in data.sensors.items():
+        change = rot.quat_multiply(made.quat, rot.quat_conjugate(sent.sensors[name].quat))
+        # Headings are the filter's own; the rest agrees, save in sharp movements.
+        tilt = 2.0 * np.arctan2(np.hypot(change[:, 1], change[:, 2]), np.hypot(change[:, 0], change[:, 3]))
+        assert np.degrees(np.median(tilt)) < 2.0, name
+        assert not np.array_equal(made.quat, sent.sensors[name].quat)
+    with pytest.raises(EdgeposeError, match=r"with --filter kalman, which takes the six .* left_upper_leg"):
+        reading.read(with_thigh, calibration)
 
 
 def test_only_named_bones_are_read(with_thigh, tmp_path):
