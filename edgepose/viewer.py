@@ -121,18 +121,9 @@ class Viewer:
             raise EdgeposeError(
                 "the viewer needs viser: install it with pip install 'edgepose[view]'"
             ) from error
-        # viser would take the next free port and not tell a program that waits for this one.
-        try:
-            socket.create_server(
-                (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET
-            ).close()
-        except OSError as error:
-            raise EdgeposeError(
-                f"cannot show poses at {host} port {port}: {error.strerror or error}; choose another --port"
-            ) from error
-        with redirect_stdout(
-            io.StringIO()
-        ):  # It greets, which a command that may be part of a pipe must not.
+        _check_free(host, port)
+        # It greets on standard output, which belongs to whom has started this.
+        with redirect_stdout(io.StringIO()):
             self._server: Any = viser.ViserServer(host=host, port=port, label="edgepose", verbose=False)
         self._body = body
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -144,12 +135,6 @@ class Viewer:
         self._server.initial_camera.look_at = (0.0, 0.9, 0.0)
         self.figure = Figure(self._server, "pose", body, POSE, None)
         self._told = 0.0
-
-    @property
-    def port(self) -> int:
-        """Where the page is served."""
-        port: int = self._server.get_port()
-        return port
 
     def close(self) -> None:
         """Close the page."""
@@ -168,49 +153,28 @@ class Viewer:
             stopped: asked for every picture.
         """
         times = poses.time_s - poses.time_s[0]
-        gui = self._server.gui
-        playing = gui.add_checkbox("play", True)
-        end = max(float(times[-1]), FRAME_S)
-        line = gui.add_slider("time, s", 0.0, round(end + 0.005, 2), 0.01, 0.0)
-        speed = gui.add_dropdown("speed", SPEEDS, initial_value="1")
-        text = gui.add_markdown("")
+        line = _TimeLine(self._server.gui, float(times[-1]))
+        text = self._server.gui.add_markdown("")
+        track = _Track(self.figure, poses, self._body)
         second = None
         if reference is not None:
-            second = Figure(self._server, "reference", self._body, REFERENCE, 0.4)
-        places = _on_the_ground(poses, self._body)
-        second_places = None if reference is None else _on_the_ground(reference, self._body)
+            figure = Figure(self._server, "reference", self._body, REFERENCE, 0.4)
+            second = _Track(figure, reference, self._body)
         held = held_sensors(poses.status)
         window = max(1, round(WINDOW_S * poses.rate))
-        at, shown = 0.0, -1
-        wanted: deque[float] = deque(maxlen=1)  # where somebody has moved the slider to
-
-        @line.on_update
-        def _(event: Any) -> None:
-            if event.client is not None:
-                wanted.append(float(line.value))
-
-        last = time.monotonic()
+        shown = -1
         while not stopped():
             now = time.monotonic()
-            if wanted:
-                at = wanted.pop()
-            elif playing.value:
-                at = (at + (now - last) * float(speed.value)) % end
-            last = now
-            i = int(np.searchsorted(times, at + 1e-9, side="right")) - 1
+            i = int(np.searchsorted(times, line.advance(now) + 1e-9, side="right")) - 1
             if i != shown:
                 with self._server.atomic():
-                    self.figure.show(poses.rotations[i], None if places is None else places[i])
-                    if reference is not None and second is not None:
-                        j = _beside(reference, poses, i)
-                        second.show(
-                            reference.rotations[j], None if second_places is None else second_places[j]
-                        )
+                    track.show(i)
+                    if second is not None:
+                        second.show(_beside(second.poses, poses, i))
                 shown = i
             if now - self._told >= TABLE_S:
                 self._told = now
-                if playing.value:
-                    line.value = round(at, 2)
+                line.tell()
                 table = sensor_table(held[max(0, i + 1 - window) : i + 1], poses.rate)
                 text.content = (
                     f"pose {i + 1} of {len(times)}, {poses.rate:g} poses/s\n\n"
@@ -242,6 +206,50 @@ class Viewer:
                 self._told = now
                 text.content = stream.text(now)
             time.sleep(max(0.0, FRAME_S / 2 - (time.monotonic() - now)))
+
+
+class _TimeLine:
+    """Controls of the time that is shown, seconds from the first pose."""
+
+    def __init__(self, gui: Any, length_s: float) -> None:
+        """Put the controls on the page."""
+        self._end_s = max(length_s, FRAME_S)
+        self._playing = gui.add_checkbox("play", True)
+        self._slider = gui.add_slider("time, s", 0.0, round(self._end_s + 0.005, 2), 0.01, 0.0)
+        self._speed = gui.add_dropdown("speed", SPEEDS, initial_value="1")
+        self._at_s, self._last_s = 0.0, time.monotonic()
+        self._wanted: deque[float] = deque(maxlen=1)  # where somebody has moved the slider to
+        self._slider.on_update(self._note)
+
+    def _note(self, event: Any) -> None:
+        if event.client is not None:  # and not `tell`
+            self._wanted.append(float(self._slider.value))
+
+    def advance(self, now: float) -> float:
+        """The time to show; `now` on a monotonic clock."""
+        if self._wanted:
+            self._at_s = self._wanted.pop()
+        elif self._playing.value:
+            self._at_s = (self._at_s + (now - self._last_s) * float(self._speed.value)) % self._end_s
+        self._last_s = now
+        return self._at_s
+
+    def tell(self) -> None:
+        """Let the slider follow."""
+        if self._playing.value:
+            self._slider.value = round(self._at_s, 2)
+
+
+class _Track:
+    """A figure and the poses that it takes."""
+
+    def __init__(self, figure: Figure, poses: Poses, body: Body) -> None:
+        self.poses = poses
+        self._figure = figure
+        self._places = _on_the_ground(poses, body)
+
+    def show(self, i: int) -> None:
+        self._figure.show(self.poses.rotations[i], None if self._places is None else self._places[i])
 
 
 class Stream:
@@ -310,3 +318,15 @@ def _on_the_ground(poses: Poses, body: Body) -> Array | None:
     some = slice(None, None, max(1, len(poses.frames) // 1000))
     lowest = ground(poses.rotations[some], body.offsets, poses.translation[some])
     return poses.translation - [poses.translation[0, 0], lowest, poses.translation[0, 2]]
+
+
+def _check_free(host: str, port: int) -> None:
+    """Raise if nothing can be served there; viser would take the next free port and not tell."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        socket.create_server((host, port), family=family).close()
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise EdgeposeError(
+            f"cannot show poses at {host} port {port}: {reason}; choose another --port"
+        ) from error
