@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from functools import partial
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple
@@ -122,15 +122,32 @@ def _solutions(
             yield work(problem, on_step=partial(on_progress, number, count))
         return
     from concurrent.futures import ProcessPoolExecutor
+    from concurrent.futures.process import BrokenProcessPool
     from multiprocessing import get_context
 
-    with ExitStack() as stack:
-        # Not forked: a copy of a process with threads may hang.
-        pool = stack.enter_context(ProcessPoolExecutor(min(jobs, count), mp_context=get_context("spawn")))
-        stack.callback(pool.shutdown, wait=False, cancel_futures=True)
-        for number, solution in enumerate(pool.map(work, problems), start=1):
-            on_progress(number, count, solution.evaluations, float(solution.costs.sum(axis=1).mean()))
-            yield solution
+    # Not forked: a copy of a process with threads may hang.
+    with ProcessPoolExecutor(min(jobs, count), get_context("spawn"), _ignore_interrupts) as pool:
+        # A new process ignores Ctrl-C from its first moment on where this one does.
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        try:
+            solutions = pool.map(work, problems)
+        finally:
+            signal.signal(signal.SIGINT, before)
+        try:
+            for number, solution in enumerate(solutions, start=1):
+                on_progress(number, count, solution.evaluations, float(solution.costs.sum(axis=1).mean()))
+                yield solution
+        except BrokenProcessPool as error:
+            raise EdgeposeError(
+                "a process was ended, perhaps for want of memory; use fewer --jobs"
+            ) from error
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _ignore_interrupts() -> None:
+    """Ctrl-C goes to all processes of a terminal; the one that started the others handles it for them."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def solve_chunk(

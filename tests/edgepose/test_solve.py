@@ -187,13 +187,14 @@ def test_wrong_use(command, wearer, tmp_path, words, message):
     assert message in " ".join(result.stderr.split())
 
 
-def test_ctrl_c_keeps_what_is_done(wearer, tmp_path):
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_ctrl_c_keeps_what_is_done(wearer, tmp_path, jobs):
     long = read_recording(wearer.recording).sensors
     # Twelve seconds again and again: many chunks.
     repeated = {
         name: SensorData(
             *(
-                None if c is None else np.concatenate([c + 12.0 * k if c.ndim == 1 else c for k in range(20)])
+                None if c is None else np.concatenate([c + 12.0 * k if c.ndim == 1 else c for k in range(15)])
                 for c in data
             )
         )
@@ -202,17 +203,17 @@ def test_ctrl_c_keeps_what_is_done(wearer, tmp_path):
     path, out = tmp_path / "long.npz", tmp_path / "poses.csv"
     write_npz(path, Recording(repeated, {}))
     words = [sys.executable, "-u", "-m", "edgepose", "solve", path, "--calibration", wearer.calibration]
-    words += ["--csv", out, "--evaluations", "200"]
+    words += ["--csv", out, "--jobs", jobs, "--evaluations", 6]
     master, slave = os.openpty()  # a terminal, on which progress shows
-    process = subprocess.Popen([str(word) for word in words], stderr=slave)
+    process = subprocess.Popen([str(word) for word in words], stderr=slave, start_new_session=True)
     os.close(slave)
     seen = b""
     until = time.monotonic() + 100.0
-    while b"chunk 3 of" not in seen and time.monotonic() < until:
+    while b"chunk 2 of" not in seen and time.monotonic() < until:
         seen += os.read(master, 4096)
     assert b"cost 0." in seen
     assert b"s left" in seen
-    process.send_signal(signal.SIGINT)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
     rest = b""
     try:
         while chunk := os.read(master, 4096):
@@ -221,6 +222,7 @@ def test_ctrl_c_keeps_what_is_done(wearer, tmp_path):
         pass
     os.close(master)
     assert process.wait(60) == 130
+    assert b"Traceback" not in rest
     poses = read_poses(out)
-    assert 1500 <= len(poses.rotations) < 14_000  # two chunks at least
+    assert 700 <= len(poses.rotations) < 10_000  # a chunk at least
     assert re.search(rf"{len(poses.rotations)} of \d+ poses", (seen + rest).decode())
