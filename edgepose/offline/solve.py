@@ -95,7 +95,7 @@ def solve(
         on_progress: told how far it is; with more than one job, of whole chunks only.
 
     Raises:
-        EdgeposeError: there is no frame, or no acceleration for SIP.
+        EdgeposeError: there is no frame, or a process was ended.
     """
     if not len(measurements.time_s):
         raise EdgeposeError("the recording has no frame in which all sensors report")
