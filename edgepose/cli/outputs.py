@@ -48,51 +48,55 @@ class OutputFlags(NamedTuple):
         Raises:
             EdgeposeError: a file or address cannot be written to.
         """
+        from edgepose.sinks.bvh import BvhSink
         from edgepose.sinks.csv_file import CsvSink
+        from edgepose.sinks.npz import NpzSink
+        from edgepose.sinks.tcp import TcpSink
         from edgepose.sinks.udp import UdpSink
+        from edgepose.sinks.view import ViewSink
+        from edgepose.sinks.vmc import VmcSink
         from edgepose.skeleton import default_body
 
         body = default_body(self.height)
         sinks: list[Sink] = []
+
+        def add(sink: Sink) -> None:
+            sinks.append(stack.enter_context(sink))
+
         if self.csv is not None:
-            sinks.append(stack.enter_context(CsvSink(self.csv, self.rotations, self.std)))
+            add(CsvSink(self.csv, self.rotations, self.std))
         if self.npz is not None:
-            from edgepose.sinks.npz import NpzSink
-
-            sinks.append(stack.enter_context(NpzSink(self.npz, rate)))
+            add(NpzSink(self.npz, rate))
         if self.bvh is not None:
-            from edgepose.sinks.bvh import BvhSink
-
-            sinks.append(stack.enter_context(BvhSink(self.bvh, rate, body)))
+            add(BvhSink(self.bvh, rate, body))
         if self.udp is not None:
-            sinks.append(stack.enter_context(UdpSink(*self.udp)))
+            add(UdpSink(*self.udp))
         if self.osc is not None:
-            from edgepose.sinks.vmc import VmcSink
-
-            sinks.append(stack.enter_context(VmcSink(*self.osc, body)))
+            add(VmcSink(*self.osc, body))
         if self.tcp is not None:
-            from edgepose.sinks.tcp import TcpSink
-
-            sinks.append(stack.enter_context(TcpSink(*self.tcp)))
+            add(TcpSink(*self.tcp))
         if self.view:
-            from edgepose.sinks.view import ViewSink
-
-            sinks.append(stack.enter_context(ViewSink(self.height)))
+            add(ViewSink(self.height))
         return sinks
 
     def remarks(self, sinks: list[Sink]) -> list[str]:
         """What there is to say of the sinks at the end."""
+        from edgepose.sinks.tcp import TcpSink
         from edgepose.sinks.udp import UdpSink
+        from edgepose.sinks.view import ViewSink
         from edgepose.sinks.vmc import VmcSink
 
         remarks = []
-        for name, kind, address in (("udp", UdpSink, self.udp), ("osc", VmcSink, self.osc)):
-            unsent = sum(sink.unsent for sink in sinks if type(sink) is kind)
-            if unsent and address is not None:
-                where = f"{address[0]}:{address[1]}"
+        for sink in sinks:
+            # Of the viewer it does not matter: it may have been closed.
+            if isinstance(sink, (UdpSink, VmcSink)) and not isinstance(sink, ViewSink) and sink.unsent:
+                name, address = ("osc", self.osc) if isinstance(sink, VmcSink) else ("udp", self.udp)
+                where = "" if address is None else f"{address[0]}:{address[1]}"
                 remarks.append(
-                    f"{name}      {unsent} datagrams did not arrive; is anything listening at {where}?"
+                    f"{name}      {sink.unsent} datagrams did not arrive; is anything listening at {where}?"
                 )
+            if isinstance(sink, TcpSink) and sink.missed:
+                remarks.append(f"tcp      {sink.missed} poses were missed by viewers that read too slowly")
         return remarks
 
 
