@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
+from edgepose.precision import quantized_quietly
 
 if TYPE_CHECKING:
     import torch
@@ -162,7 +163,8 @@ def load(info: ArchiveInfo, trust: bool = False) -> torch.jit.ScriptModule:
         content = info.path.read_bytes()
         if hashlib.sha256(content).hexdigest() != info.sha256:
             raise EdgeposeError(f"{info.path}: the archive changed while it was being loaded; run again")
-        module: torch.jit.ScriptModule = torch.jit.load(io.BytesIO(content), map_location="cpu")
+        with quantized_quietly():
+            module: torch.jit.ScriptModule = torch.jit.load(io.BytesIO(content), map_location="cpu")
     except (RuntimeError, ValueError, OSError) as error:
         reason = str(error).strip().splitlines()
         raise EdgeposeError(

@@ -18,15 +18,9 @@ from edgepose.placements import PLACEMENTS
 from edgepose.skeleton import JOINTS
 from edgepose_export.dataset import RATE
 from edgepose_export.fields import FeedForward, FieldArchive, WaveNet
-from edgepose_export.networks import (
-    BirnnArchive,
-    Ends,
-    NetworkShape,
-    PoseDecoder,
-    PoseNetwork,
-    RnnArchive,
-)
+from edgepose_export.networks import NetworkShape, PoseDecoder, PoseNetwork
 from edgepose_export.normalisation import FromFirstFrame, Inputs
+from edgepose_export.recurrent import BirnnArchive, Ends, RnnArchive
 
 Network = PoseNetwork | FeedForward | WaveNet
 
@@ -37,8 +31,6 @@ KINDS: dict[str, type[Network]] = {
     "wavenet": WaveNet,
 }
 """What trains a network of each kind."""
-
-METHODS = ["window", "start", "stream", "drain"]
 
 
 class Statistics(NamedTuple):
@@ -58,7 +50,7 @@ def new_network(shape: NetworkShape) -> Network:
 
 
 def build(network: Network, statistics: Statistics, std_scale: Tensor | None = None) -> nn.Module:
-    """The archive's module, in Python, sharing the network's weights.
+    """The archive's module, in Python.
 
     Args:
         network: a trained one.
@@ -66,9 +58,7 @@ def build(network: Network, statistics: Statistics, std_scale: Tensor | None = N
         std_scale: (24,) factors of the joints' standard deviations, see `reliability`; ones when None.
     """
     shape = network.shape
-    decoder = PoseDecoder(shape, statistics.target_mean, statistics.target_std)
-    if std_scale is not None:
-        decoder.std_scale.copy_(std_scale)
+    decoder = PoseDecoder(shape, statistics.target_mean, statistics.target_std, std_scale)
     if isinstance(network, PoseNetwork):
         ends = Ends(network, statistics.input_mean, statistics.input_std, decoder)
         module: nn.Module = (BirnnArchive if shape.kind == "birnn" else RnnArchive)(network, ends)
@@ -81,12 +71,14 @@ def build(network: Network, statistics: Statistics, std_scale: Tensor | None = N
 def script(
     network: Network, statistics: Statistics, std_scale: Tensor | None = None
 ) -> torch.jit.ScriptModule:
-    """The archive's module, scripted and frozen; arguments as in `build`."""
+    """The archive's module, scripted; arguments as in `build`.
+
+    It is not frozen: a frozen module could not pack its weights, and gains two percent.
+    """
     with warnings.catch_warnings():
         # TorchScript is deprecated in favour of torch.export; it is used on purpose, see docs/models.md.
         warnings.filterwarnings("ignore", message="`torch.jit", category=DeprecationWarning)
-        module = torch.jit.script(build(network, statistics, std_scale))
-        return torch.jit.freeze(module, preserved_attrs=METHODS)
+        return torch.jit.script(build(network, statistics, std_scale))
 
 
 def save(module: torch.jit.ScriptModule, path: Path, metadata: dict[str, object]) -> None:

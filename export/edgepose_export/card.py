@@ -59,6 +59,7 @@ def card(metadata: dict[str, Any]) -> str:
         lines += [f"### {part}", "", *_table(rows), ""]
     if metadata["measures"]:
         lines += _deviations(metadata["deviations"])
+        lines += _precisions(metadata["precisions"])
         lines += [
             "The parts: `cmu-walk-run` is CMU subjects 07, 08, 09; `cmu-02` is CMU subject 02 (bends, "
             "punches, sword, washing); `bandai-styles` is Bandai-Namco's styles exhausted and tired. None of "
@@ -123,4 +124,25 @@ def _deviations(parts: dict[str, dict[str, Any]]) -> list[str]:
     for part, numbers in parts.items():
         one, two = (100 * share for share in numbers["within"])
         lines.append(f"| {part} | {one:.1f} | {two:.1f} | {numbers['scale']:.2f} | {numbers['values']} |")
+    return [*lines, ""]
+
+
+def _precisions(parts: dict[str, dict[str, Any]]) -> list[str]:
+    """What `run --precision` does to the poses."""
+    lines = [
+        "### Precision of the weights",
+        "",
+        "As `run` streams: the error against the truth, and how far the poses are from those in f32.",
+        "",
+        "| part | precision | SIP error, deg | hips and shoulders from f32, deg | 10 joints from f32, deg |",
+        "|---|---|---|---|---|",
+    ]
+    for part, rows in parts.items():
+        for name, row in rows.items():
+            error = row["errors"]["sip_error_deg"]
+            cells = [
+                f"{row['away'][key][0]:.4f} ± {row['away'][key][1]:.4f}"
+                for key in ("sip_error_deg", "joint_angle_error_10_deg")
+            ]
+            lines.append(f"| {part} | {name} | {error[0]:.2f} ± {error[1]:.2f} | " + " | ".join(cells) + " |")
     return [*lines, ""]

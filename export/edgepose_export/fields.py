@@ -138,6 +138,12 @@ class FieldArchive(nn.Module):
         mean, deviation = self.network(self.inputs(orientation, acceleration))
         return self.decoder(orientation, mean, deviation)
 
+    @torch.jit.export
+    def pack(self, precision: str) -> None:
+        """There is only one precision, "f32"."""
+        if precision != "f32":
+            raise ValueError("networks without recurrence run in f32 only")
+
     def at(self, x: Tensor, orientation: Tensor, index: int) -> tuple[Tensor, Tensor]:
         """Pose of frame `index` of inputs (B, T, inputs), with its own orientation (B, 6, 3, 3)."""
         first, last = max(0, index - self.past), min(x.shape[1], index + self.future + 1)

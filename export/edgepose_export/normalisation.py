@@ -99,6 +99,11 @@ class FromFirstFrame(nn.Module):
         return _turned(rotations, orientation[:, :1, -1]), std
 
     @torch.jit.export
+    def pack(self, precision: str) -> None:
+        """See `edgepose_export.products.Product.pack`."""
+        self.archive.pack(precision)
+
+    @torch.jit.export
     def window(self, orientation: Tensor, acceleration: Tensor, index: int) -> tuple[Tensor, Tensor]:
         """Pose of frame `index` of a window."""
         seen = seen_from_first(orientation, acceleration)

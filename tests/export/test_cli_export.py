@@ -147,6 +147,7 @@ def test_card(made):
         "non-commercial",
         "### cmu-walk-run",
         "### bandai-styles",
+        "### Precision of the weights",
         "mean pose",
         "online, window (20, 5)",
         "edgepose synthesize",

@@ -1,0 +1,70 @@
+"""What packing an archive's weights does to its poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from edgepose.errors import EdgeposeError
+from edgepose.precision import PRECISIONS, pack_weights
+from edgepose_export.dataset import Take
+from edgepose_export.evaluation import Mode, Progress, collect, groups, run_archive, summarise, takes_of
+
+KEYS = ("sip_error_deg", "joint_angle_error_10_deg")
+
+
+def compare(
+    new_module: Callable[[], torch.jit.ScriptModule],
+    data: Path,
+    parts: Iterable[str],
+    mode: Mode,
+    progress: Progress = iter,
+) -> dict[str, dict[str, dict[str, Any]]]:
+    """Errors of each precision over the takes of some parts, and how far its poses are from those in f32.
+
+    Args:
+        new_module: gives the archive anew, its weights not packed.
+        data: folder of takes.
+        parts: of the split.
+        mode: how the archive runs.
+        progress: wraps the list of takes.
+
+    Returns:
+        For each part and precision that this machine has: "errors" against the truth and "away" from the f32
+        poses, each [mean, deviation, frames] for each of `KEYS`, degrees.
+    """
+    modules = {"f32": new_module()}
+    for precision in PRECISIONS[1:]:
+        module = new_module()
+        try:
+            pack_weights(module, precision)
+        except EdgeposeError:  # not on this machine, or not for this kind of network
+            continue
+        modules[precision] = module
+    return {part: _part(modules, takes_of(data, part, progress), mode) for part in parts}
+
+
+def _part(
+    modules: dict[str, torch.jit.ScriptModule], takes: Iterable[Take], mode: Mode
+) -> dict[str, dict[str, Any]]:
+    takes = list(takes)
+    reference = [
+        take._replace(pose=pose)
+        for group in groups(takes)
+        for take, pose in zip(group, run_archive(modules["f32"], group, mode), strict=True)
+    ]
+    methods = {
+        name: lambda group, module=module: run_archive(module, group, mode)
+        for name, module in modules.items()
+    }
+    errors, away = (summarise(collect(some, methods)) for some in (takes, reference))
+    return {
+        name: {
+            "errors": {key: list(errors[name][key]) for key in KEYS},
+            "away": {key: list(away[name][key]) for key in KEYS},
+        }
+        for name in modules
+    }

@@ -1,0 +1,74 @@
+"""Matrix products of an archive: in f32 as it is stored, or with weights packed as fp16 or int8 numbers.
+
+One frame at a time, the time of a product is the time in which its weights come from memory; half as many
+bytes take about half as long.
+"""
+
+# No `from __future__ import annotations`: TorchScript needs the type of an attribute, not its text.
+from typing import Optional
+
+import torch
+from torch import Tensor, nn
+
+PRECISIONS = ("f32", "fp16", "int8")
+"""Of the weights: 32-bit numbers; 16-bit ones; 8-bit ones with a scale for each output, inputs turned to
+8 bits as well. Sums are f32 everywhere.
+"""
+
+
+class Product(nn.Module):
+    """`x W + b`, scriptable; `pack` chooses the numbers that W is kept in."""
+
+    packed: Optional[torch.classes.quantized.LinearPackedParamsBase]  # noqa: UP045
+
+    def __init__(self, weight: Tensor, bias: Tensor | None = None) -> None:
+        """Takes torch's weight (outputs, inputs) and a bias (outputs,), zero when None."""
+        super().__init__()
+        # In this order a handful of frames at once takes two thirds of the time.
+        self.register_buffer("weight", weight.detach().t().contiguous())
+        self.register_buffer("bias", torch.zeros(len(weight)) if bias is None else bias.detach().clone())
+        self.precision = "f32"
+        self.packed = None
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Products (..., outputs) of x (..., inputs), with the bias."""
+        if self.precision == "f32":
+            return torch.matmul(x, self.weight) + self.bias
+        return self.with_packed(x)
+
+    def onto(self, x: Tensor, other: Tensor) -> Tensor:
+        """The same of x (N, inputs), without a bias, added to `other` (N, outputs)."""
+        if self.precision == "f32":
+            return torch.addmm(other, x, self.weight)
+        return self.with_packed(x) + other
+
+    def with_packed(self, x: Tensor) -> Tensor:
+        """Products with the packed weights, with the bias."""
+        packed = torch.jit._unwrap_optional(self.packed)
+        if self.precision == "fp16":
+            return torch.ops.quantized.linear_dynamic_fp16(x, packed)
+        # Inputs of 7 bits: processors without VNNI add two products in 16 bits, which 8 would overflow.
+        return torch.ops.quantized.linear_dynamic(x, packed, True)
+
+    @torch.jit.export
+    def pack(self, precision: str) -> None:
+        """Keeps the weights as "fp16" or "int8" from now on; "f32" leaves them as they are.
+
+        torch raises RuntimeError where this machine has no such products.
+        """
+        if precision == self.precision:
+            return
+        if self.precision != "f32":
+            raise ValueError("the weights are packed already")
+        weight = self.weight.t().contiguous()
+        if precision == "fp16":
+            self.packed = torch.ops.quantized.linear_prepack_fp16(weight, self.bias)
+        elif precision == "int8":
+            scales = weight.abs().amax(1).clamp(min=1e-8).double() / 127.0
+            zeros = torch.zeros(weight.shape[0], dtype=torch.int64)
+            whole = torch.quantize_per_channel(weight, scales, zeros, 0, torch.qint8)
+            self.packed = torch.ops.quantized.linear_prepack(whole, self.bias)
+        else:
+            raise ValueError("unknown precision")
+        self.precision = precision
+        self.weight = torch.zeros(0)

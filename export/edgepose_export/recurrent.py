@@ -1,0 +1,295 @@
+"""The recurrent networks of DIP 3.4 as they run: from calibrated frames to poses, one frame at a time.
+
+The LSTM cells are written out, which is several times quicker for single frames than `torch.nn.LSTM`, and an
+archive carries everything between calibration and pose: root normalisation, statistics, network, projection
+to rotations. Statistics are folded into the weights next to them.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from edgepose_export.networks import SIGMA_FLOOR, PoseDecoder, PoseNetwork
+from edgepose_export.normalisation import network_inputs
+from edgepose_export.products import Product
+
+
+class LstmCell(nn.Module):
+    """One LSTM direction, written out: the products of inputs and of states apart.
+
+    Over a sequence the products of all inputs are one; only those of the states have to wait for each other.
+    """
+
+    def __init__(self, lstm: nn.LSTM, suffix: str, parts: int = 1) -> None:
+        """Copies one direction's weights.
+
+        Args:
+            lstm: a layer.
+            suffix: torch's, "" forwards, "_reverse" backwards.
+            parts: in how many equal parts the input comes, each with a product of its own.
+        """
+        super().__init__()
+        self.size = lstm.hidden_size
+        weight_ih, weight_hh, bias_ih, bias_hh = (
+            getattr(lstm, f"{name}_l0{suffix}").detach()
+            for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+        )
+        # Rows of the candidate, the third of four gates, are doubled: tanh(x) = 2 sigmoid(2 x) - 1, so one
+        # sigmoid serves all four.
+        scale = torch.tensor([1.0, 1.0, 2.0, 1.0]).repeat_interleave(self.size)[:, None]
+        bias = (bias_ih + bias_hh) * scale[:, 0]
+        self.inputs = nn.ModuleList(
+            Product(part, bias if i == 0 else None)
+            for i, part in enumerate((weight_ih * scale).chunk(parts, dim=1))
+        )
+        self.state = Product(weight_hh * scale)
+
+    def forward(self, product: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+        """New h and c (B, hidden) from the inputs' product (B, 4 hidden) and the old ones."""
+        return self.step(self.state.onto(h, product), c)
+
+    def step(self, gates: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+        """New h and c from the sum of both products (B, 4 hidden)."""
+        i, f, g, o = torch.sigmoid(gates).chunk(4, dim=1)
+        c = torch.addcmul(f * c - i, i, g, value=2.0)
+        return o * torch.tanh(c), c
+
+    @torch.jit.export
+    def run(self, products: Tensor, reverse: bool) -> Tensor:
+        """Outputs (B, T, hidden) over the inputs' products (B, T, 4 hidden) from a zero state, in order or
+        from last to first.
+        """
+        rows = products.unbind(1)
+        if reverse:
+            rows = rows[::-1]
+        h, c = self.step(rows[0], products.new_zeros(products.shape[0], self.size))
+        outputs = [h]
+        for row in rows[1:]:
+            h, c = self(row, h, c)
+            outputs.append(h)
+        if reverse:
+            outputs = outputs[::-1]
+        return torch.stack(outputs, dim=1)
+
+    @torch.jit.export
+    def pack(self, precision: str) -> None:
+        """See `Product.pack`."""
+        for part in self.inputs:
+            part.pack(precision)
+        self.state.pack(precision)
+
+
+class Ends(nn.Module):
+    """What both archives share: the layers before and after the recurrent ones."""
+
+    def __init__(
+        self, network: PoseNetwork, input_mean: Tensor, input_std: Tensor, decoder: PoseDecoder
+    ) -> None:
+        """Takes the network's dense layers and the statistics of its inputs, 60 in the paper."""
+        super().__init__()
+        shape = network.shape
+        self.scheme, self.with_acceleration = shape.normalisation, shape.acceleration
+        self.decoder = decoder
+        self.floor = SIGMA_FLOOR
+        dense = network.dense.weight.detach() / input_std
+        self.dense = Product(dense, network.dense.bias.detach() - dense @ input_mean)
+        # The acceleration part of the outputs serves training alone.
+        size = shape.pose_outputs
+        mean, deviation = network.mean, network.deviation
+        weights = [mean.weight[:size] * decoder.target_std[:, None], deviation.weight[:size]]
+        biases = [mean.bias[:size] * decoder.target_std + decoder.target_mean, deviation.bias[:size]]
+        self.heads = Product(torch.cat(weights), torch.cat(biases))
+
+    def forward(self, orientation: Tensor, acceleration: Tensor) -> Tensor:
+        """First hidden layer (..., hidden) of calibrated frames."""
+        x = network_inputs(orientation, acceleration, self.scheme, self.with_acceleration)
+        return torch.relu(self.dense(x))
+
+    @torch.jit.export
+    def pose(self, orientation: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+        """Local rotations (..., 24, 3, 3) and deviations (..., 24) from the last recurrent outputs."""
+        pose, deviation = self.heads(hidden).chunk(2, dim=-1)
+        deviation = nn.functional.softplus(deviation) + self.floor
+        return self.decoder.rotations(orientation, pose), self.decoder.deviations(deviation)
+
+
+class RnnArchive(nn.Module):
+    """Unidirectional network: one step a frame, no look-ahead. Methods and shapes as in `BirnnArchive`."""
+
+    def __init__(self, network: PoseNetwork, ends: Ends) -> None:
+        """Takes a trained network's weights."""
+        super().__init__()
+        self.ends = ends
+        self.cell1 = LstmCell(network.lstm1, "")
+        self.cell2 = LstmCell(network.lstm2, "")
+
+    def forward(self, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
+        """Poses of a whole sequence."""
+        x = self.cell1.run(self.cell1.inputs[0](self.ends(orientation, acceleration)), False)
+        return self.ends.pose(orientation, self.cell2.run(self.cell2.inputs[0](x), False))
+
+    @torch.jit.export
+    def pack(self, precision: str) -> None:
+        """Chooses how the recurrent layers keep their weights, see `Product.pack`."""
+        self.cell1.pack(precision)
+        self.cell2.pack(precision)
+
+    @torch.jit.export
+    def window(self, orientation: Tensor, acceleration: Tensor, index: int) -> tuple[Tensor, Tensor]:
+        """Pose of frame `index` of a window; later frames are not used."""
+        rotations, std = self.forward(orientation[:, : index + 1], acceleration[:, : index + 1])
+        return rotations[:, -1], std[:, -1]
+
+    @torch.jit.export
+    def start(self, batch: int, future: int) -> list[Tensor]:
+        """State before the first frame; `future` must be 0."""
+        if future != 0:
+            raise ValueError("a unidirectional network has no future frames")
+        zero = torch.zeros(batch, self.cell1.size)
+        return [zero, zero, zero, zero]
+
+    @torch.jit.export
+    def stream(
+        self, orientation: Tensor, acceleration: Tensor, state: list[Tensor]
+    ) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """One frame on."""
+        x = self.ends(orientation, acceleration)
+        h1, c1 = self.cell1(self.cell1.inputs[0](x), state[0], state[1])
+        h2, c2 = self.cell2(self.cell2.inputs[0](h1), state[2], state[3])
+        rotations, std = self.ends.pose(orientation, h2)
+        return rotations.unsqueeze(1), std.unsqueeze(1), [h1, c1, h2, c2]
+
+    @torch.jit.export
+    def drain(self, state: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Nothing is ever left."""
+        batch = state[0].shape[0]
+        return torch.zeros(batch, 0, 24, 3, 3), torch.zeros(batch, 0, 24)
+
+
+class BirnnArchive(nn.Module):
+    """Bidirectional network: whole sequence, exact window, or stream with carried forward states.
+
+    Everywhere `orientation` is (B, [T,] 6, 3, 3), calibrated bone orientations R_TB, and `acceleration`
+    (B, [T,] 6, 3), m/s^2 in T without gravity; B counts wearers. Poses are (B, [T,] 24, 3, 3) local rotations
+    with (B, [T,] 24) standard deviations in radians.
+
+    The second layer's input comes in two parts, what the first layer says forwards and backwards: in a stream
+    the first is known for good once its frame has come, the second changes with every new frame.
+    """
+
+    def __init__(self, network: PoseNetwork, ends: Ends) -> None:
+        """Takes a trained network's weights."""
+        super().__init__()
+        self.ends = ends
+        self.forward1, self.backward1 = LstmCell(network.lstm1, ""), LstmCell(network.lstm1, "_reverse")
+        self.forward2, self.backward2 = LstmCell(network.lstm2, "", 2), LstmCell(network.lstm2, "_reverse", 2)
+
+    def layer1(self, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
+        """Outputs (B, T, hidden) of the first layer over a sequence, forwards and backwards."""
+        x = self.ends(orientation, acceleration)
+        return (
+            self.forward1.run(self.forward1.inputs[0](x), False),
+            self.backward1.run(self.backward1.inputs[0](x), True),
+        )
+
+    def forward2_products(self, ahead: Tensor, back: Tensor) -> Tensor:
+        """What both parts of its input give for the second layer's forward direction."""
+        return self.forward2.inputs[0](ahead) + self.forward2.inputs[1](back)
+
+    def backward2_products(self, ahead: Tensor, back: Tensor) -> Tensor:
+        """The same for the backward direction."""
+        return self.backward2.inputs[0](ahead) + self.backward2.inputs[1](back)
+
+    def forward(self, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
+        """Poses of a whole sequence."""
+        ahead, back = self.layer1(orientation, acceleration)
+        before = self.forward2.run(self.forward2_products(ahead, back), False)
+        after = self.backward2.run(self.backward2_products(ahead, back), True)
+        return self.ends.pose(orientation, torch.cat([before, after], dim=-1))
+
+    @torch.jit.export
+    def pack(self, precision: str) -> None:
+        """Chooses how the recurrent layers keep their weights, see `Product.pack`."""
+        self.forward1.pack(precision)
+        self.backward1.pack(precision)
+        self.forward2.pack(precision)
+        self.backward2.pack(precision)
+
+    @torch.jit.export
+    def window(self, orientation: Tensor, acceleration: Tensor, index: int) -> tuple[Tensor, Tensor]:
+        """Pose of frame `index` of a window (DIP 3.4), the same as `forward` over the window gives there.
+
+        The second layer runs only over the frames that reach `index`.
+        """
+        ahead, back = self.layer1(orientation, acceleration)
+        end = index + 1
+        before = self.forward2.run(self.forward2_products(ahead[:, :end], back[:, :end]), False)[:, -1]
+        after = self.backward2.run(self.backward2_products(ahead[:, index:], back[:, index:]), True)[:, 0]
+        return self.ends.pose(orientation[:, index], torch.cat([before, after], dim=-1))
+
+    @torch.jit.export
+    def start(self, batch: int, future: int) -> list[Tensor]:
+        """State before the first frame of a stream in which each pose sees `future` later frames.
+
+        The state is [h1, c1, h2, c2, then of the frames that wait for their future: products of layer 1
+        backwards, known products of layer 2 forwards, the same backwards, orientations; last a tensor whose
+        length is `future`].
+        """
+        size = self.forward1.size
+        zero, waiting = torch.zeros(batch, size), torch.zeros(batch, 0, 4 * size)
+        orientations = torch.zeros(batch, 0, 6, 3, 3)
+        return [zero, zero, zero, zero, waiting, waiting, waiting, orientations, torch.zeros(future)]
+
+    @torch.jit.export
+    def oldest(self, state: list[Tensor]) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """Pose of the oldest waiting frame, seen with all that wait behind it, and the state without it.
+
+        Forward states are carried; backward passes start anew at the newest frame (latency-controlled
+        bidirectional LSTM).
+        """
+        back = self.backward1.run(state[4], True)
+        h2, c2 = self.forward2(state[5][:, 0] + self.forward2.inputs[1](back[:, 0]), state[2], state[3])
+        after = self.backward2.run(state[6] + self.backward2.inputs[1](back), True)[:, 0]
+        rotations, std = self.ends.pose(state[7][:, 0], torch.cat([h2, after], dim=-1))
+        waiting = [state[4][:, 1:], state[5][:, 1:], state[6][:, 1:], state[7][:, 1:]]
+        return rotations, std, [state[0], state[1], h2, c2] + waiting + state[8:]  # noqa: RUF005
+
+    @torch.jit.export
+    def stream(
+        self, orientation: Tensor, acceleration: Tensor, state: list[Tensor]
+    ) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """One frame on: the pose of the frame `future` frames ago, (B, 1, 24, 3, 3).
+
+        Or none, (B, 0, 24, 3, 3), while too few frames have come.
+        """
+        x = self.ends(orientation, acceleration)
+        h1, c1 = self.forward1(self.forward1.inputs[0](x), state[0], state[1])
+        state = [
+            h1,
+            c1,
+            state[2],
+            state[3],
+            torch.cat([state[4], self.backward1.inputs[0](x).unsqueeze(1)], dim=1),
+            torch.cat([state[5], self.forward2.inputs[0](h1).unsqueeze(1)], dim=1),
+            torch.cat([state[6], self.backward2.inputs[0](h1).unsqueeze(1)], dim=1),
+            torch.cat([state[7], orientation.unsqueeze(1)], dim=1),
+            state[8],
+        ]
+        if state[4].shape[1] <= state[8].shape[0]:
+            batch = x.shape[0]
+            return x.new_zeros(batch, 0, 24, 3, 3), x.new_zeros(batch, 0, 24), state
+        rotations, std, state = self.oldest(state)
+        return rotations.unsqueeze(1), std.unsqueeze(1), state
+
+    @torch.jit.export
+    def drain(self, state: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Poses of all frames that still wait when a stream ends, oldest first."""
+        batch = state[0].shape[0]
+        rotations: list[Tensor] = [torch.zeros(batch, 0, 24, 3, 3)]
+        stds: list[Tensor] = [torch.zeros(batch, 0, 24)]
+        while state[4].shape[1] > 0:
+            rotation, std, state = self.oldest(state)
+            rotations.append(rotation.unsqueeze(1))
+            stds.append(std.unsqueeze(1))
+        return torch.cat(rotations, dim=1), torch.cat(stds, dim=1)
