@@ -15,6 +15,7 @@ from edgepose.metrics import Measure, measure, per_frame, sip_error
 from edgepose.skeleton import default_body
 from edgepose_export import baselines
 from edgepose_export.dataset import RATE, Take, read_take, take_paths
+from edgepose_export.published import read_published
 
 Array = NDArray[np.float64]
 Tensors = tuple[torch.Tensor, torch.Tensor]
@@ -195,8 +196,17 @@ def baseline_methods(learnt: baselines.Baselines) -> dict[str, Method]:
 
 
 def takes_of(data: Path, part: str, progress: Progress = iter) -> Iterator[Take]:
-    """Takes of a part of the split, or of the part "all", read one by one."""
+    """Takes of a part of the split, of the part "all", or of "published" recordings, read one by one."""
+    if part == "published":
+        return map(_as_a_run_measures, read_published(data))
     return (read_take(path) for path in progress(take_paths(data, part)))
+
+
+def _as_a_run_measures(take: Take) -> Take:
+    """The take with a frame's acceleration as the mean since the frame before, see `edgepose.sync`."""
+    acceleration = take.acceleration.copy()
+    acceleration[1:] = 0.5 * (take.acceleration[1:] + take.acceleration[:-1])
+    return take._replace(acceleration=acceleration)
 
 
 def columns_of_parts(

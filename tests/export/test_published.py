@@ -4,12 +4,15 @@ import pickle
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from edgepose import rotations as rot
 from edgepose.calibration import GRAVITY
 from edgepose.errors import EdgeposeError
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import forward_kinematics
+from edgepose_export.cli.evaluate import evaluate
+from edgepose_export.evaluation import takes_of
 from edgepose_export.published import read_dip, read_published, read_totalcapture
 
 FRAMES = 12
@@ -75,6 +78,19 @@ def test_dips_totalcapture(truth, tmp_path):
     (take,) = read_published(tmp_path)
     np.testing.assert_allclose(take.orientation, orientation, atol=1e-6)
     np.testing.assert_allclose(take.acceleration, acceleration, atol=1e-6)
+
+
+def test_evaluate_measures_them(truth, tmp_path):
+    path = tmp_path / "s_09" / "01.pkl"
+    path.parent.mkdir()
+    path.write_bytes(pickle.dumps(dip_imu(truth)))
+    (take,) = takes_of(tmp_path, "published")
+    np.testing.assert_allclose(take.acceleration[5], 0.5 * (truth[2][4] + truth[2][5]), atol=1e-6)
+    arguments = ["--data", str(tmp_path), "--part", "published", "--model", "rnn", "--online", "stream"]
+    result = CliRunner().invoke(evaluate, arguments, catch_exceptions=False)
+    assert result.exit_code == 0
+    assert "published" in result.output
+    assert f"{FRAMES} frames" in result.output
 
 
 class Attack:

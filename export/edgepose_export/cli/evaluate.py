@@ -48,14 +48,15 @@ class _Model(NamedTuple):
     "--data",
     required=True,
     type=click.Path(path_type=Path, exists=True, file_okay=False),
-    help="Folder that `edgepose synthesize` wrote.",
+    help="Folder that `edgepose synthesize` wrote, or with --part published one of DIP-IMU or TotalCapture.",
 )
 @click.option(
     "--part",
     "parts",
     multiple=True,
-    type=click.Choice(["cmu-walk-run", "cmu-02", "bandai-styles", "validation", "all"]),
-    help="Part of the split, or all takes below --data; may be repeated  [default: the three held-out parts]",
+    type=click.Choice(["cmu-walk-run", "cmu-02", "bandai-styles", "validation", "all", "published"]),
+    help="Part of the split, all takes below --data, or the files of DIP-IMU or TotalCapture there as their "
+    "makers publish them; may be repeated  [default: the three held-out parts]",
 )
 @click.option(
     "--online",
@@ -118,6 +119,7 @@ def evaluate(
       edgepose evaluate --data recordings/ --model birnn --model rnn --part cmu-walk-run
       edgepose evaluate --data recordings/ --online window --past 50 --future 5
       edgepose evaluate --data recordings/ --table 3 --histogram errors.png
+      edgepose evaluate --data DIP_IMU/s_09 --part published --table 3 --model birnn --model dip-birnn.pt
       edgepose evaluate --data recordings/ --part cmu-walk-run --heat-map window.png --every 10
     """
     if table and (modes or past is not None or future is not None):
