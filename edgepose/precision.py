@@ -47,7 +47,8 @@ def pack(
         if choice not in ("auto", stored):
             raise EdgeposeError(f"{info.path}: its weights are {stored}; export it again for {choice}")
         return str(stored)
-    if choice == "f32":
+    # Archives of older exports cannot pack their weights.
+    if choice == "f32" or (choice == "auto" and not hasattr(module, "pack")):
         return "f32"
     wanted = "fp16" if choice == "auto" else choice
     try:
