@@ -6,7 +6,7 @@ import json
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,14 +14,105 @@ if TYPE_CHECKING:
     from edgepose.orientation.comparison import Score
 
 
-@click.group(short_help="Measure accuracy and speed.")
-def bench() -> None:
+@click.group(short_help="Measure accuracy and speed.", invoke_without_command=True)
+@click.option(
+    "--model",
+    "models",
+    multiple=True,
+    help="Shipped model or an archive's path; several times for several  [default: all shipped ones]",
+)
+@click.option("--trust", is_flag=True, help="Load models although their sums are not known.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON in the place of tables.")
+@click.pass_context
+def bench(ctx: click.Context, models: tuple[str, ...], trust: bool, as_json: bool) -> None:
     """Measure how well and how fast parts of the program do their work.
 
+    Without a command: the speed of every step from packets to poses on one core of this machine, of the
+    models in all their modes and precisions, and of torch.nn.LSTM of the same size beside them.
+
     \b
-    Example:
+    Examples:
+      edgepose bench
+      edgepose bench --model my-birnn.pt --trust --json
       edgepose bench orientation --data broad/data_mat
     """
+    if ctx.invoked_subcommand is None:
+        _speed(models, trust, as_json)
+
+
+def _speed(models: tuple[str, ...], trust: bool, as_json: bool) -> None:
+    from edgepose import archive
+
+    infos = [archive.inspect(archive.find(name)) for name in models]
+    infos = infos or [archive.inspect(path) for path in archive.shipped()]
+    if not infos:
+        raise click.UsageError("no model is shipped; name one with --model")
+
+    from tempfile import TemporaryDirectory
+
+    from edgepose import speed
+
+    report: dict[str, Any] = {"machine": speed.machine(), "models": []}
+    for info in infos:
+        _say(f"measuring {info.path.stem}")
+        start = speed.start_up(info, trust)
+        with TemporaryDirectory() as folder:
+            engine = speed.load_engine(info, trust, "auto")
+            steps = speed.step_costs(engine, Path(folder))
+        walks = {
+            name: speed.whole_walk(speed.load_engine(info, trust, "auto"), paced)._asdict()
+            for name, paced in (("full_speed", False), ("paced", True))
+        }
+        ways = [row._asdict() for row in speed.model_speeds(info, trust)]
+        report["models"].append(
+            {"name": info.path.stem, "start": start._asdict(), "steps_us": steps, **walks, "ways": ways}
+        )
+    click.echo(json.dumps(report, indent=1) if as_json else _speed_tables(report, speed.BUDGET_US))
+
+
+def _say(text: str) -> None:
+    click.echo(text, err=True)
+
+
+def _speed_tables(report: dict[str, Any], budget_us: float) -> str:
+    """Markdown, to read and to put on a page."""
+    about = report["machine"]
+    lines = [f"{about['processor']}, one core; Python {about['python']}, torch {about['torch']}"]
+    models = report["models"]
+    names = [model["name"] for model in models]
+    lines += ["", *_head(["us a frame", *names])]
+    for step in models[0]["steps_us"]:
+        lines.append(_row([step, *(f"{model['steps_us'][step]:.0f}" for model in models)]))
+    lines += ["", *_head(["packets to UDP, all steps", "frames a second", "p50 ms", "p99 ms", "max ms"])]
+    for model in models:
+        for key, words in (("full_speed", "at full speed"), ("paced", "at 60 Hz")):
+            walk = model[key]
+            times = (f"{walk[name]:.2f}" for name in ("p50_ms", "p99_ms", "max_ms"))
+            lines.append(_row([f"{model['name']}, {words}", f"{walk['per_s']:.0f}", *times]))
+    heads = ["model", "way", "weights", "us", "p50", "p99", "max", "frames a second", "of 1/60 s", "times"]
+    lines += ["", *_head(heads)]
+    for way in (way for model in models for way in model["ways"]):
+        name = "torch.nn.LSTM, defaults" if way["mode"] == "reference" else way["mode"]
+        times = (f"{way[key]:.0f}" for key in ("us", "p50_us", "p99_us", "max_us"))
+        share = f"{100 * way['us'] / budget_us:.1f} %"
+        speed = f"{1e6 / way['us']:.0f}"
+        lines.append(
+            _row([way["model"], name, way["precision"], *times, speed, share, f"{way['times']:.1f}"])
+        )
+    lines += ["", *_head(["a fresh process", "imports s", "model s", "memory MB"])]
+    for model in models:
+        start = model["start"]
+        memory = "-" if start["memory_mb"] is None else f"{start['memory_mb']:.0f}"
+        lines.append(_row([model["name"], f"{start['imports_s']:.2f}", f"{start['load_s']:.2f}", memory]))
+    return "\n".join(lines)
+
+
+def _row(cells: list[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _head(cells: list[str]) -> list[str]:
+    return [_row(cells), "|" + "---|" * len(cells)]
 
 
 @bench.command(short_help="Orientation filters on BROAD.")

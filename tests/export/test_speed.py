@@ -1,0 +1,67 @@
+"""`edgepose bench`: the speed of every step, with models of a few units."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from edgepose_export.networks import NetworkShape
+
+RNN = NetworkShape("rnn", 8, "global-6d", "passed", "tilt")
+
+
+def bench(*words):
+    command = [sys.executable, "-m", "edgepose", "bench", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+def test_every_step_and_way_is_measured(tmp_path, write_archive):
+    path = write_archive(tmp_path / "small.pt", RNN._replace(kind="birnn"))
+    done = bench("--model", path, "--trust", "--json")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == "measuring small\n"
+    (model,) = json.loads(done.stdout)["models"]
+    assert {"decode", "frames", "calibration", "network", "CSV"} < set(model["steps_us"])
+    assert all(cost > 0 for cost in model["steps_us"].values())
+    ways = [(way["mode"], way["precision"]) for way in model["ways"]]
+    assert ways == [
+        ("reference", "f32"),
+        *[(mode, precision) for mode in ("stream", "window") for precision in ("f32", "fp16", "int8")],
+    ]
+    assert model["ways"][0]["times"] == 1.0
+    for way in model["ways"]:
+        assert 0 < way["p50_us"] <= way["p99_us"] <= way["max_us"]
+    for walk, frames in (("full_speed", 595), ("paced", 295)):
+        assert frames <= model[walk]["frames"] <= frames + 10
+        assert 0 < model[walk]["p50_ms"] <= model[walk]["p99_ms"] <= model[walk]["max_ms"]
+    assert model["paced"]["per_s"] < 62
+    assert model["start"]["imports_s"] > 0
+    assert 50 < model["start"]["memory_mb"] < 2000
+
+
+def test_tables(tmp_path, write_archive):
+    path = write_archive(tmp_path / "small.pt", RNN)
+    done = bench("--model", path, "--trust")
+    assert done.returncode == 0, done.stderr
+    assert "| small | torch.nn.LSTM, defaults | f32 |" in done.stdout
+    assert "| small | stream | int8 |" in done.stdout
+    assert "window" not in done.stdout
+    # Every table's rows have as many cells as its head.
+    tables = [table.splitlines() for table in done.stdout.strip().split("\n\n")[1:]]
+    assert len(tables) == 4
+    for rows in tables:
+        assert len({row.count("|") for row in rows}) == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [(("--model", "none.pt"), "no such model"), (("--model", "small.pt"), "is not known")],
+)
+def test_models_that_cannot_run(tmp_path, write_archive, words, said):
+    write_archive(tmp_path / "small.pt", RNN)
+    words = [tmp_path / word if word.endswith("small.pt") else word for word in words]
+    done = bench(*words)
+    assert done.returncode == 1
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
