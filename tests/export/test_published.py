@@ -1,6 +1,7 @@
 """Readers of published recordings, on small files of their makers' layouts."""
 
 import pickle
+import re
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import forward_kinematics
 from edgepose_export.cli.evaluate import evaluate
 from edgepose_export.evaluation import takes_of
-from edgepose_export.published import read_dip, read_published, read_totalcapture
+from edgepose_export.published import read_dip, read_published, read_totalcapture, read_vicon
 
 FRAMES = 12
 DIP_PLACES = (7, 8, 11, 12, 0, 2)
@@ -210,3 +211,174 @@ def test_broken_sensors(totalcapture):
     calibration.unlink()
     with pytest.raises(EdgeposeError, match=r"no s1_acting1_calib_imu_ref\.txt"):
         read_totalcapture(path, folder, truth)
+
+
+# --- TotalCapture's own truth -------------------------------------------------------------------------------
+
+# Name -> joint of SMPL's whose rotation it has; `Spine` has none of SMPL's and is Spine1's here.
+VICON = {
+    "Hips": 0, "Spine": 3, "Spine1": 3, "Spine2": 6, "Spine3": 9, "Neck": 12, "Head": 15,
+    "RightShoulder": 14, "RightArm": 17, "RightForeArm": 19, "RightHand": 21,
+    "LeftShoulder": 13, "LeftArm": 16, "LeftForeArm": 18, "LeftHand": 20,
+    "RightUpLeg": 2, "RightLeg": 5, "RightFoot": 8, "LeftUpLeg": 1, "LeftLeg": 4, "LeftFoot": 7,
+}  # fmt: skip
+LIMBS = {
+    "RightForeArm": ("RightArm", [-1, 0, 0]), "RightHand": ("RightForeArm", [-1, 0, 0]),
+    "LeftForeArm": ("LeftArm", [1, 0, 0]), "LeftHand": ("LeftForeArm", [1, 0, 0]),
+    "RightLeg": ("RightUpLeg", [0, -1, 0]), "RightFoot": ("RightLeg", [0, -1, 0]),
+    "LeftLeg": ("LeftUpLeg", [0, -1, 0]), "LeftFoot": ("LeftLeg", [0, -1, 0]),
+}  # fmt: skip
+
+
+def write_vicon(folder, bones, hang=0.0):
+    """Files of global rotations (T, 24, 3, 3), as TotalCapture's; arms of the T-pose hang by some radians."""
+    theirs = GLOBAL_FROM_BODY @ bones @ OUR_BONE_FROM_THEIRS
+    turns = {name: theirs[:, joint] for name, joint in VICON.items()}
+    places = dict.fromkeys(VICON, np.zeros((len(bones), 3)))
+    for far, (near, rest) in LIMBS.items():
+        down = rot.about_axis("z", -hang * rest[0]) @ rest
+        places[far] = places[near] + 10.0 * bones[:, VICON[near]] @ down @ GLOBAL_FROM_BODY.T
+    folder.mkdir(parents=True)
+    quats = {name: rot.matrix_to_quat(turns[name])[:, [1, 2, 3, 0]] for name in VICON}
+    for kind, values in (("ori", quats), ("pos", places)):
+        rows = ["".join(f"{name}\t" for name in VICON)]
+        for frame in range(len(bones)):
+            cells = (" ".join(f"{number:.9f}" for number in values[name][frame]) for name in VICON)
+            rows.append("".join(f"{cell}\t" for cell in cells))
+        (folder / f"gt_skel_gbl_{kind}.txt").write_text("\n".join(rows) + "\n")
+    return folder / "gt_skel_gbl_ori.txt"
+
+
+@pytest.fixture
+def true_bones(truth):
+    """Global rotations (T, 24, 3, 3) of the truth with what Vicon's skeleton does not have at rest."""
+    bones = forward_kinematics(rot.rotvec_to_matrix(truth[0].reshape(-1, 24, 3)), np.zeros((24, 3)))[0]
+    bones[:, [10, 11]] = bones[:, [7, 8]]
+    bones[:, [20, 21, 22, 23]] = bones[:, [18, 19, 18, 19]]
+    return bones
+
+
+def global_rotations(take):
+    return forward_kinematics(take.pose, np.zeros((24, 3)))[0]
+
+
+def test_vicons_truth_where_dips_is_absent(totalcapture, true_bones):
+    folder, _ = totalcapture
+    path = write_vicon(folder / "S1" / "acting1", true_bones)
+    np.testing.assert_allclose(read_vicon(path), true_bones, atol=1e-7)
+    (folder / "s1_acting1.pkl").unlink()
+    (take,) = read_published(folder)
+    assert take.name == "s1_acting1"
+    assert take.pose.shape == (FRAMES, 24, 3, 3)
+    np.testing.assert_allclose(global_rotations(take), true_bones, atol=1e-5)
+    np.testing.assert_allclose(take.orientation, true_bones[:, list(BONES)], atol=1e-5)
+
+
+def test_vicons_truth_may_go_on_after_the_sensors(totalcapture, true_bones):
+    folder, _ = totalcapture
+    (folder / "s1_acting1.pkl").unlink()
+    as_sensors = true_bones[np.maximum(np.arange(FRAMES + 5) - 3, 0) % FRAMES]
+    write_vicon(folder / "S1" / "acting1", as_sensors)
+    (take,) = read_published(folder)
+    np.testing.assert_allclose(global_rotations(take), as_sensors[: FRAMES + 3], atol=1e-5)
+    np.testing.assert_allclose(take.orientation, as_sensors[: FRAMES + 3, list(BONES)], atol=1e-5)
+
+
+def test_dips_truth_is_the_first_choice(totalcapture, truth):
+    folder, _ = totalcapture
+    (folder / "S1" / "acting1").mkdir(parents=True)
+    (folder / "S1" / "acting1" / "gt_skel_gbl_ori.txt").write_text("broken")
+    (take,) = read_published(folder)
+    np.testing.assert_allclose(take.pose, rot.rotvec_to_matrix(truth[0].reshape(-1, 24, 3)), atol=1e-5)
+
+
+def test_a_take_with_two_files_of_sensors_is_one(totalcapture):
+    folder, path = totalcapture
+    (folder / "imu" / "s1" / "s1_acting1_Xsens.sensors").write_bytes(path.read_bytes())
+    (take,) = read_published(folder)
+    assert take.name == "s1_acting1"
+
+
+def test_limbs_point_as_vicons_do_whatever_its_t_pose(tmp_path, true_bones):
+    read = read_vicon(write_vicon(tmp_path / "S1" / "acting1", true_bones, hang=0.15))
+    for arm, side in ((16, 1), (17, -1), (18, 1), (19, -1)):
+        hanging = rot.about_axis("z", -0.15 * side) @ [side, 0, 0]
+        np.testing.assert_allclose(read[:, arm] @ [side, 0, 0], true_bones[:, arm] @ hanging, atol=1e-6)
+    straight = [joint for joint in range(16) if joint]
+    np.testing.assert_allclose(read[:, straight], true_bones[:, straight], atol=1e-7)
+
+
+def test_vicon_of_another_take(totalcapture, true_bones):
+    folder, path = totalcapture
+    turned = write_vicon(folder / "S1" / "acting1", rot.about_axis("y", 1.0) @ true_bones)
+    with pytest.raises(EdgeposeError, match="its bones are 57 degrees from what the sensors say"):
+        read_totalcapture(path, folder, {"s1_acting1": turned})
+
+
+def other_order(text):
+    """The text with quaternions w x y z."""
+    head, *rows = text.splitlines()
+    cells = ([cell.split() for cell in row.split("\t")[:-1]] for row in rows)
+    return "\n".join([head, *("".join(f"{w} {x} {y} {z}\t" for x, y, z, w in row) for row in cells)])
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "message"),
+    [
+        ("ori", lambda t: "", r"ori\.txt, line 1: the names of joints lack Head, Hips, Left"),
+        ("ori", lambda t: t.replace("Spine2", "Tail"), r"ori\.txt, line 1: the names of joints lack Spine2$"),
+        ("pos", lambda t: t.replace("LeftHand", "Paw"), r"pos\.txt, line 1: the names of joints lack LeftH"),
+        ("ori", lambda t: t.replace("Spine\t", "Hips\t", 1), r"line 1: a joint is named twice"),
+        ("ori", lambda t: t.splitlines()[0], r"ori\.txt: has no frame"),
+        ("ori", lambda t: t.rstrip().rpartition("\t")[0], r"line 13: 21 joints were expected, 20 found"),
+        ("ori", lambda t: t.rstrip().rpartition(" ")[0], r"line 13: 4 numbers were expected, 3 found"),
+        ("pos", lambda t: t.replace("\n", "\n\n", 1), r"pos\.txt, line 2: 21 joints were expected, 1 found"),
+        ("pos", lambda t: t.replace("0.000000000", "nan", 1), r"pos\.txt, line 2: a number is not finite"),
+        (
+            "pos",
+            lambda t: t.replace("0.000000000", "1e300", 1),
+            r"line 2: a number is not finite, or far too",
+        ),
+        ("ori", lambda t: t.replace("0.", "zero", 1), r"ori\.txt, line 2: a number was expected"),
+        ("ori", lambda t: t.replace("0.", "0.\ufffd", 1), r"ori\.txt, line 2: a number was expected"),
+        (
+            "ori",
+            lambda t: re.sub(r"\n\S+", "\n7", t, count=1),
+            "line 2: the quaternion of Hips is not of unit",
+        ),
+        (
+            "pos",
+            lambda t: t.rstrip().rpartition("\n")[0],
+            r"has 12 frames, gt_skel_gbl_pos\.txt beside it 11",
+        ),
+        (
+            "pos",
+            lambda t: t.replace("LeftLeg\tLeftFoot", "LeftFoot\tLeftLeg"),
+            "do not lie along the bones' axes",
+        ),
+        ("ori", other_order, "do not lie along the bones' axes"),
+    ],
+)
+def test_broken_vicon(tmp_path, true_bones, kind, change, message):
+    path = write_vicon(tmp_path / "S1" / "acting1", true_bones)
+    broken = path.with_name(f"gt_skel_gbl_{kind}.txt")
+    text = broken.read_text()
+    changed = change(text)
+    assert changed != text
+    broken.write_text(changed, encoding="utf-8")
+    with pytest.raises(EdgeposeError, match=message):
+        read_vicon(path)
+
+
+def test_vicon_without_its_places(tmp_path, true_bones):
+    path = write_vicon(tmp_path / "S1" / "acting1", true_bones)
+    path.with_name("gt_skel_gbl_pos.txt").unlink()
+    with pytest.raises(EdgeposeError, match=r"gt_skel_gbl_pos\.txt: cannot be read: No such file"):
+        read_vicon(path)
+
+
+def test_sensors_without_any_truth(totalcapture):
+    folder, _ = totalcapture
+    (folder / "s1_acting1.pkl").unlink()
+    with pytest.raises(EdgeposeError, match=r"no s1_acting1\.pkl .* and no s1/acting1/gt_skel_gbl_ori\.txt"):
+        list(read_published(folder))

@@ -120,7 +120,7 @@ def from_cmu_bvh(recording: Recording, path: object) -> Motion:
     start = int(np.argmax(filled))
     rotations, positions = forward(recording)
     ends = _bone_directions(CMU_BVH, recording.names, positions[0])
-    if not _near_rest(ends):
+    if not near_rest(ends):
         raise EdgeposeError(f"{path}: frame 0 is not the T-pose that CMU files in BVH start with")
     picked = rotations[:, _indices(CMU_BVH, recording.names)]
     return Motion(
@@ -147,7 +147,7 @@ def from_cmu_amc(recording: Recording, path: object) -> Motion:
     indices = _indices(CMU_AMC, recording.names)
     rotations, positions = forward(recording)
     ends = _bone_directions(CMU_AMC, recording.names, t_positions[0])
-    if not _near_rest(ends):
+    if not near_rest(ends):
         raise EdgeposeError(f"{path}: the limbs of its skeleton do not lie as in CMU's skeletons")
     return Motion(
         to_smpl(rotations[:, indices], t_pose[0, indices], ends), positions[:, 0], recording.rate, "cmu"
@@ -191,7 +191,7 @@ def from_bandai(recording: Recording, path: object, collars_back: bool = True) -
         if recording.parents[child] != joint:
             raise EdgeposeError(f"{path}: {end} does not hang from {start}")
         ends[limb] = t_pose[limb] @ _unit(recording.offsets[child])
-    if not _near_rest(ends):
+    if not near_rest(ends):
         raise EdgeposeError(f"{path}: the limbs of its skeleton do not lie as in Bandai-Namco's skeleton")
     translation = positions[:, recording.names.index(BANDAI.joints[0])] * BANDAI_METRES
     return Motion(to_smpl(picked, t_pose, ends), translation, recording.rate, "bandai-namco")
@@ -268,7 +268,7 @@ def _bone_directions(names: Names, joints: tuple[str, ...], positions: Array) ->
     }
 
 
-def _near_rest(ends: dict[int, Array]) -> bool:
+def near_rest(ends: dict[int, Array]) -> bool:
     """Whether limbs lie within 20 deg of the directions of SMPL's zero pose."""
     least = np.cos(np.radians(20.0))
     return all(ends[limb] @ _DIRECTIONS[direction] > least for limb, direction in LIMBS.items())

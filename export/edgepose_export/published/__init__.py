@@ -12,28 +12,32 @@ from pathlib import Path
 from edgepose.errors import EdgeposeError
 from edgepose_export.dataset import Take
 from edgepose_export.published.dip_imu import read_dip
-from edgepose_export.published.totalcapture import read_totalcapture
+from edgepose_export.published.totalcapture import read_totalcapture, take_name
+from edgepose_export.published.vicon import ORIENTATIONS, read_vicon
 
-__all__ = ["read_dip", "read_published", "read_totalcapture"]
+__all__ = ["read_dip", "read_published", "read_totalcapture", "read_vicon"]
 
 
 def read_published(folder: Path) -> Iterator[Take]:
     """All takes below a folder: DIP's .pkl files, or, where there are any, TotalCapture's .sensors files.
 
-    TotalCapture's .sensors need DIP's .pkl of the same name for the true pose, wherever below the folder.
+    The true pose of TotalCapture's .sensors is DIP's .pkl of the same name, wherever below the folder, or
+    where there is none Vicon's `gt_skel_gbl_ori.txt` in a folder of the take's name.
 
     Raises:
         EdgeposeError: there is none, or one of them is broken.
     """
     pickles = sorted(folder.rglob("*.pkl"))
-    sensors = sorted(folder.rglob("*.sensors"))
+    # A take may lie there twice, with and without the magnetometers; the orientations are the same.
+    sensors = {take_name(path): path for path in sorted(folder.rglob("*.sensors"))}
+    if sensors:
+        truth = {take_name(path): path for path in sorted(folder.rglob(ORIENTATIONS))}
+        truth |= {path.stem.lower(): path for path in pickles}
+        for path in sensors.values():
+            yield read_totalcapture(path, folder, truth)
+        return
     if not pickles:
         raise EdgeposeError(
             f"{folder}: no .pkl file with true poses; unpack DIP-IMU or DIP's TotalCapture there"
         )
-    if not sensors:
-        yield from map(read_dip, pickles)
-        return
-    truth = {path.stem.lower(): path for path in pickles}
-    for path in sensors:
-        yield read_totalcapture(path, folder, truth)
+    yield from map(read_dip, pickles)
