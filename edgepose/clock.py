@@ -116,11 +116,11 @@ class DeviceClock:
         """
         if len(self._fastest) < _DRIFT_LEAST:
             return nan, nan
-        arrival_s, delay_s = np.array(self._fastest).T
-        arrival_s = arrival_s - arrival_s.mean()
+        noted = np.array(self._fastest)
+        arrival_s, delay_s = (noted - noted.mean(axis=0)).T
         square = float(arrival_s @ arrival_s)
         slope = float(arrival_s @ delay_s) / square
-        rest = delay_s - delay_s.mean() - slope * arrival_s
+        rest = delay_s - slope * arrival_s
         error = float(np.sqrt(rest @ rest / (len(rest) - 2) / square))
         return 1e6 * slope, 1e6 * error
 
