@@ -42,8 +42,8 @@ class Engine(Protocol):
     """What `window_engine` and `stream_engine` give."""
 
     def push(self, tag: Any, orientation: Input, acceleration: Input) -> list[EngineOutput]:
-        """Takes a frame ((6, 3, 3) R_TB, (6, 3) m/s^2 in T without gravity) and gives the poses that are due:
-        none or one.
+        """Takes a frame ((6, 3, 3) R_TB, (6, 3) m/s^2 in T without gravity) and gives the poses that are
+        due.
         """
 
     def finish(self) -> list[EngineOutput]:
@@ -72,8 +72,12 @@ class WindowEngine:
     def push(self, tag: Any, orientation: Input, acceleration: Input) -> list[EngineOutput]:
         """See `Engine.push`."""
         length = self._past + 1 + self._future
-        self._orientation = torch.cat([self._orientation, _tensor(orientation)], dim=1)[:, -length:]
-        self._acceleration = torch.cat([self._acceleration, _tensor(acceleration)], dim=1)[:, -length:]
+        self._orientation = torch.cat([self._orientation, _tensor(orientation)[None, None]], dim=1)[
+            :, -length:
+        ]
+        self._acceleration = torch.cat([self._acceleration, _tensor(acceleration)[None, None]], dim=1)[
+            :, -length:
+        ]
         self._tags.append(tag)
         self._seen += 1
         return [self._oldest(self._future)] if self._seen > self._future else []
@@ -95,32 +99,56 @@ class WindowEngine:
 
 
 class StreamEngine:
-    """One step a frame with carried state; `future` is 0 for a unidirectional network."""
+    """Each frame once, with carried state; `future` is 0 for a unidirectional network."""
 
-    def __init__(self, module: torch.jit.ScriptModule, past: int, future: int) -> None:
-        """Warms the module up; the first `past` poses are marked as filling."""
-        self._module, self._past = module, past
+    def __init__(self, module: torch.jit.ScriptModule, past: int, future: int, together: int = 1) -> None:
+        """Warms the module up.
+
+        Args:
+            module: an archive.
+            past: as many first poses are marked as filling.
+            future: frames that a pose waits for.
+            together: frames that are gathered and run at once, where nobody waits for poses.
+        """
+        self._module, self._past, self._together = module, past, together
         self._tags: deque[Any] = deque()
+        self._frames: list[tuple[torch.Tensor, torch.Tensor]] = []
         self._done = 0
         with torch.inference_mode():
-            state = module.start(1, future)
+            self._state = module.start(1, future)
+            still = (torch.eye(3).expand(6, 3, 3), torch.zeros(6, 3))
             for _ in range(WARM_UP + future):
-                state = module.stream(torch.eye(3).expand(1, 6, 3, 3), torch.zeros(1, 6, 3), state)[2]
+                self._frames = [still] * together
+                self._run()
             self._state = module.start(1, future)
 
     def push(self, tag: Any, orientation: Input, acceleration: Input) -> list[EngineOutput]:
-        """See `Engine.push`."""
+        """See `Engine.push`; with several frames together, the poses of all of them at once."""
         self._tags.append(tag)
+        self._frames.append((_tensor(orientation), _tensor(acceleration)))
+        if len(self._frames) < self._together:
+            return []
         with torch.inference_mode():
-            rotations, std, self._state = self._module.stream(
-                _tensor(orientation)[0], _tensor(acceleration)[0], self._state
-            )
-        return self._outputs(rotations, std)
+            return self._outputs(*self._run())
 
     def finish(self) -> list[EngineOutput]:
         """See `Engine.finish`."""
         with torch.inference_mode():
-            return self._outputs(*self._module.drain(self._state))
+            outputs = self._outputs(*self._run()) if self._frames else []
+            return outputs + self._outputs(*self._module.drain(self._state))
+
+    def _run(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Poses that are due after the gathered frames."""
+        frames, self._frames = self._frames, []
+        if len(frames) == 1:
+            orientation, acceleration = frames[0]
+            rotations, std, self._state = self._module.stream(
+                orientation[None], acceleration[None], self._state
+            )
+        else:
+            orientations, accelerations = (torch.stack(column)[None] for column in zip(*frames, strict=True))
+            rotations, std, self._state = self._module.stream_many(orientations, accelerations, self._state)
+        return rotations, std
 
     def _outputs(self, rotations: torch.Tensor, std: torch.Tensor) -> list[EngineOutput]:
         outputs = []
@@ -131,4 +159,4 @@ class StreamEngine:
 
 
 def _tensor(array: Input) -> torch.Tensor:
-    return torch.from_numpy(np.asarray(array, np.float32))[None, None]
+    return torch.from_numpy(np.asarray(array, np.float32))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 import time
 from collections.abc import Callable
@@ -148,12 +149,20 @@ def run(
         wishes = Wishes(stack, control, keys=source.live)
         module = archive.load(info, trust)
         precision = pack(module, info, precision, _say)
-        from edgepose.engine import StreamEngine, WindowEngine
+        from edgepose.engine import Engine, StreamEngine, WindowEngine
         from edgepose.pipeline import run as run_pipeline
         from edgepose.rezero import Headings
         from edgepose.sync import FrameClock
 
-        engine = (StreamEngine if kind == "rnn" or online == "stream" else WindowEngine)(module, past, future)
+        engine: Engine
+        if kind != "rnn" and online == "window":
+            engine = WindowEngine(module, past, future)
+        else:
+            # Of a recording nobody waits for single poses. int8 goes one by one all the same: what its
+            # weights are multiplied with is scaled with all that is computed at once.
+            recorded = not source.live and source.file is not None and source.file.is_file()
+            many = recorded and precision != "int8" and hasattr(module, "stream_many")
+            engine = StreamEngine(module, past, future, TOGETHER if many else 1)
         stop = stack.enter_context(Stop())
         sinks = outputs.open(stack, rate)
         clock = FrameClock(rate)
@@ -165,6 +174,9 @@ def run(
             requests=wishes.poll,
             tell=_say,
         )
+        # What is alive now stays: going through all of it once in a while would hold up a frame by 0.1 s.
+        gc.collect()
+        gc.freeze()
         summary = run_pipeline(
             *(opened, clock, headings, engine, sinks),
             orient=Orientations(filter, magnetometer=calibration.north),
@@ -213,6 +225,9 @@ def _check_filter(calibration: Calibration, filter: str, no_mag: bool, source: S
             "magnetometers begin anew in each recording: calibrate from this one"
         )
 
+
+TOGETHER = 64
+"""Frames of a recording that are computed at once."""
 
 BEHIND_S = 1.0
 """A run that is further behind its sensors says so, seconds."""

@@ -195,6 +195,20 @@ class FieldArchive(nn.Module):
         return rotations.unsqueeze(1), std.unsqueeze(1), state
 
     @torch.jit.export
+    def stream_many(
+        self, orientation: Tensor, acceleration: Tensor, state: list[Tensor]
+    ) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """Several frames (B, T, ...) on: all poses that are due."""
+        batch = orientation.shape[0]
+        rotations: list[Tensor] = [torch.zeros(batch, 0, 24, 3, 3)]
+        stds: list[Tensor] = [torch.zeros(batch, 0, 24)]
+        for t in range(orientation.shape[1]):
+            rotation, std, state = self.stream(orientation[:, t], acceleration[:, t], state)
+            rotations.append(rotation)
+            stds.append(std)
+        return torch.cat(rotations, dim=1), torch.cat(stds, dim=1), state
+
+    @torch.jit.export
     def drain(self, state: list[Tensor]) -> tuple[Tensor, Tensor]:
         """Poses of all frames that still wait when a stream ends, oldest first."""
         batch = state[0].shape[0]

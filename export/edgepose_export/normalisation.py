@@ -121,9 +121,16 @@ class FromFirstFrame(nn.Module):
         self, orientation: Tensor, acceleration: Tensor, state: list[Tensor]
     ) -> tuple[Tensor, Tensor, list[Tensor]]:
         """One frame on."""
-        first = state[-1] if state[-1].shape[1] else orientation[:, -1:]
-        seen = seen_from(first[:, 0], orientation, acceleration)
-        rotations, std, rest = self.archive.stream(seen[0], seen[1], state[:-1])
+        return self.stream_many(orientation.unsqueeze(1), acceleration.unsqueeze(1), state)
+
+    @torch.jit.export
+    def stream_many(
+        self, orientation: Tensor, acceleration: Tensor, state: list[Tensor]
+    ) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """Several frames (B, T, ...) on."""
+        first = state[-1] if state[-1].shape[1] else orientation[:, :1, -1]
+        seen = seen_from(first, orientation, acceleration)
+        rotations, std, rest = self.archive.stream_many(seen[0], seen[1], state[:-1])
         return _turned(rotations, first), std, rest + [first]  # noqa: RUF005
 
     @torch.jit.export

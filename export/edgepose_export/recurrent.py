@@ -63,14 +63,31 @@ class LstmCell(nn.Module):
         rows = products.unbind(1)
         if reverse:
             rows = rows[::-1]
+        # The first state is zero: a product less.
         h, c = self.step(rows[0], products.new_zeros(products.shape[0], self.size))
-        outputs = [h]
-        for row in rows[1:]:
-            h, c = self(row, h, c)
-            outputs.append(h)
+        outputs = [h] + self.over(rows[1:], h, c)[0]
         if reverse:
             outputs = outputs[::-1]
         return torch.stack(outputs, dim=1)
+
+    @torch.jit.export
+    def carry(self, products: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Outputs (B, T, hidden) over the inputs' products (B, T, 4 hidden) from a state, and the last h and
+        c.
+        """
+        if products.shape[1] == 1:  # live; lists would cost a tenth of the time of a small network
+            h, c = self(products[:, 0], h, c)
+            return h.unsqueeze(1), h, c
+        outputs, h, c = self.over(products.unbind(1), h, c)
+        return torch.stack(outputs, dim=1), h, c
+
+    def over(self, rows: list[Tensor], h: Tensor, c: Tensor) -> tuple[list[Tensor], Tensor, Tensor]:
+        """Outputs after each of some products, and the last h and c."""
+        outputs: list[Tensor] = []
+        for row in rows:
+            h, c = self(row, h, c)
+            outputs.append(h)
+        return outputs, h, c
 
     @torch.jit.export
     def pack(self, precision: str) -> None:
@@ -154,11 +171,18 @@ class RnnArchive(nn.Module):
         self, orientation: Tensor, acceleration: Tensor, state: list[Tensor]
     ) -> tuple[Tensor, Tensor, list[Tensor]]:
         """One frame on."""
+        return self.stream_many(orientation.unsqueeze(1), acceleration.unsqueeze(1), state)
+
+    @torch.jit.export
+    def stream_many(
+        self, orientation: Tensor, acceleration: Tensor, state: list[Tensor]
+    ) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """Several frames on."""
         x = self.ends(orientation, acceleration)
-        h1, c1 = self.cell1(self.cell1.inputs[0](x), state[0], state[1])
-        h2, c2 = self.cell2(self.cell2.inputs[0](h1), state[2], state[3])
-        rotations, std = self.ends.pose(orientation, h2)
-        return rotations.unsqueeze(1), std.unsqueeze(1), [h1, c1, h2, c2]
+        x, h1, c1 = self.cell1.carry(self.cell1.inputs[0](x), state[0], state[1])
+        x, h2, c2 = self.cell2.carry(self.cell2.inputs[0](x), state[2], state[3])
+        rotations, std = self.ends.pose(orientation, x)
+        return rotations, std, [h1, c1, h2, c2]
 
     @torch.jit.export
     def drain(self, state: list[Tensor]) -> tuple[Tensor, Tensor]:
@@ -241,18 +265,21 @@ class BirnnArchive(nn.Module):
         orientations = torch.zeros(batch, 0, 6, 3, 3)
         return [zero, zero, zero, zero, waiting, waiting, waiting, orientations, torch.zeros(future)]
 
-    @torch.jit.export
-    def oldest(self, state: list[Tensor]) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Pose of the oldest waiting frame, seen with all that wait behind it, and the state without it.
+    def oldest(self, state: list[Tensor], count: int, future: int) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """Poses of the oldest waiting frames, each seen with `future` that wait behind it, and the state
+        without them.
 
-        Forward states are carried; backward passes start anew at the newest frame (latency-controlled
-        bidirectional LSTM).
+        Forward states are carried; backward passes start anew for each frame at the last one that it sees
+        (latency-controlled bidirectional LSTM). Those of several frames run side by side.
         """
-        back = self.backward1.run(state[4], True)
-        h2, c2 = self.forward2(state[5][:, 0] + self.forward2.inputs[1](back[:, 0]), state[2], state[3])
-        after = self.backward2.run(state[6] + self.backward2.inputs[1](back), True)[:, 0]
-        rotations, std = self.ends.pose(state[7][:, 0], torch.cat([h2, after], dim=-1))
-        waiting = [state[4][:, 1:], state[5][:, 1:], state[6][:, 1:], state[7][:, 1:]]
+        batch = state[0].shape[0]
+        back = self.backward1.run(_fields(state[4], count, future), True)
+        known = self.forward2.inputs[1](back[:, 0]).unflatten(0, (batch, count)) + state[5][:, :count]
+        before, h2, c2 = self.forward2.carry(known, state[2], state[3])
+        after = self.backward2.run(_fields(state[6], count, future) + self.backward2.inputs[1](back), True)
+        hidden = torch.cat([before, after[:, 0].unflatten(0, (batch, count))], dim=-1)
+        rotations, std = self.ends.pose(state[7][:, :count], hidden)
+        waiting = [state[4][:, count:], state[5][:, count:], state[6][:, count:], state[7][:, count:]]
         return rotations, std, [state[0], state[1], h2, c2] + waiting + state[8:]  # noqa: RUF005
 
     @torch.jit.export
@@ -263,24 +290,32 @@ class BirnnArchive(nn.Module):
 
         Or none, (B, 0, 24, 3, 3), while too few frames have come.
         """
+        return self.stream_many(orientation.unsqueeze(1), acceleration.unsqueeze(1), state)
+
+    @torch.jit.export
+    def stream_many(
+        self, orientation: Tensor, acceleration: Tensor, state: list[Tensor]
+    ) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """Several frames (B, T, ...) on: all poses that are due, those `stream` gives one by one."""
         x = self.ends(orientation, acceleration)
-        h1, c1 = self.forward1(self.forward1.inputs[0](x), state[0], state[1])
+        ahead, h1, c1 = self.forward1.carry(self.forward1.inputs[0](x), state[0], state[1])
         state = [
             h1,
             c1,
             state[2],
             state[3],
-            torch.cat([state[4], self.backward1.inputs[0](x).unsqueeze(1)], dim=1),
-            torch.cat([state[5], self.forward2.inputs[0](h1).unsqueeze(1)], dim=1),
-            torch.cat([state[6], self.backward2.inputs[0](h1).unsqueeze(1)], dim=1),
-            torch.cat([state[7], orientation.unsqueeze(1)], dim=1),
+            torch.cat([state[4], self.backward1.inputs[0](x)], dim=1),
+            torch.cat([state[5], self.forward2.inputs[0](ahead)], dim=1),
+            torch.cat([state[6], self.backward2.inputs[0](ahead)], dim=1),
+            torch.cat([state[7], orientation], dim=1),
             state[8],
         ]
-        if state[4].shape[1] <= state[8].shape[0]:
+        future = state[8].shape[0]
+        due = state[4].shape[1] - future
+        if due <= 0:
             batch = x.shape[0]
             return x.new_zeros(batch, 0, 24, 3, 3), x.new_zeros(batch, 0, 24), state
-        rotations, std, state = self.oldest(state)
-        return rotations.unsqueeze(1), std.unsqueeze(1), state
+        return self.oldest(state, due, future)
 
     @torch.jit.export
     def drain(self, state: list[Tensor]) -> tuple[Tensor, Tensor]:
@@ -289,7 +324,12 @@ class BirnnArchive(nn.Module):
         rotations: list[Tensor] = [torch.zeros(batch, 0, 24, 3, 3)]
         stds: list[Tensor] = [torch.zeros(batch, 0, 24)]
         while state[4].shape[1] > 0:
-            rotation, std, state = self.oldest(state)
-            rotations.append(rotation.unsqueeze(1))
-            stds.append(std.unsqueeze(1))
+            rotation, std, state = self.oldest(state, 1, state[4].shape[1] - 1)
+            rotations.append(rotation)
+            stds.append(std)
         return torch.cat(rotations, dim=1), torch.cat(stds, dim=1)
+
+
+def _fields(waiting: Tensor, count: int, future: int) -> Tensor:
+    """What each of the `count` oldest frames of (B, T, N) sees, (B * count, future + 1, N)."""
+    return waiting.narrow(1, 0, count + future).unfold(1, future + 1, 1).transpose(2, 3).flatten(0, 1)

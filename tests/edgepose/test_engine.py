@@ -98,3 +98,26 @@ def test_warming_up_leaves_no_trace(tiny, wearers, engine):
     copy = kept.rotations.copy()
     running.push(1, orientation[1].numpy(), acceleration[1].numpy())
     np.testing.assert_array_equal(kept.rotations, copy)
+
+
+@pytest.mark.parametrize("shape", [BIRNN, RNN, BIRNN._replace(normalisation="sequence")], ids=str)
+@pytest.mark.parametrize("frames", [0, 3, 4, 11, 13])
+def test_frames_together_give_what_they_give_one_by_one(tiny, wearers, shape, frames):
+    orientation, acceleration = (x[0, :frames] for x in wearers(1, 13))
+    future = 2 if shape.kind == "birnn" else 0
+    alone, _, _ = run(StreamEngine(tiny(shape), 3, future), orientation, acceleration)
+    together, counts, _ = run(StreamEngine(tiny(shape), 3, future, 4), orientation, acceleration)
+    assert counts == [(4 if t > 3 else 4 - future) if t % 4 == 3 else 0 for t in range(frames)]
+    assert [output.tag for output in together] == list(range(frames))
+    for a, b in zip(alone, together, strict=True):
+        assert a.filling == b.filling
+        np.testing.assert_allclose(a.rotations, b.rotations, atol=2e-5)
+        np.testing.assert_allclose(a.std, b.std, atol=2e-5)
+
+
+def test_frames_together_of_a_field(tiny, wearers):
+    module = tiny(NetworkShape("feed-forward", 8, "global-6d", "passed"))
+    orientation, acceleration = (x[0] for x in wearers(1, 9))
+    one, several = (run(StreamEngine(module, 0, 5, n), orientation, acceleration)[0] for n in (1, 4))
+    for a, b in zip(one, several, strict=True):
+        np.testing.assert_allclose(a.rotations, b.rotations, atol=2e-5)
