@@ -1,5 +1,6 @@
 """Small networks and made-up sensor data that several test files need."""
 
+import signal
 from functools import cache
 
 import numpy as np
@@ -9,6 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from edgepose_export.archive import Statistics, describe, new_network, save, script
 from edgepose_export.networks import NetworkShape
+
+# Tests send Ctrl-C to programs that they start; a shell that starts the tests in the background leaves it
+# ignored, and what they start inherits that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The tests' networks are tiny: a second thread would only wait.
 torch.set_num_threads(1)
