@@ -6,6 +6,7 @@ percentiles are times of the clock, what a wearer waits for.
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import socket
@@ -257,11 +258,14 @@ def _reference(about: dict[str, Any]) -> Callable[[], object]:
 
 
 def load_engine(info: archive.ArchiveInfo, trust: bool, precision: str, mode: str = "stream") -> Engine:
-    """A model ready to run in its default past and future."""
+    """A model ready to run in its default past and future, with what is alive put aside as `run` does."""
     module = archive.load(info, trust)
     pack(module, info, precision)
-    engine = StreamEngine if mode == "stream" else WindowEngine
-    return engine(module, info.metadata["past"], info.metadata["future"])
+    kind = StreamEngine if mode == "stream" else WindowEngine
+    engine = kind(module, info.metadata["past"], info.metadata["future"])
+    gc.collect()
+    gc.freeze()
+    return engine
 
 
 def model_speeds(info: archive.ArchiveInfo, trust: bool) -> list[Speed]:
