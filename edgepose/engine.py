@@ -50,10 +50,6 @@ class Engine(Protocol):
         """Gives the poses of the frames that still wait for their future."""
 
 
-def _output(tag: Any, rotations: torch.Tensor, std: torch.Tensor, filling: bool) -> EngineOutput:
-    return EngineOutput(tag, rotations.numpy(), std.numpy(), filling)
-
-
 class WindowEngine:
     """For each frame the network runs over `past` frames before it, itself and `future` frames after it."""
 
@@ -95,7 +91,7 @@ class WindowEngine:
             rotations, std = self._module.window(
                 self._orientation[:, first:], self._acceleration[:, first:], index - first
             )
-        return _output(self._tags.popleft(), rotations[0], std[0], index < self._past)
+        return EngineOutput(self._tags.popleft(), rotations[0].numpy(), std[0].numpy(), index < self._past)
 
 
 class StreamEngine:
@@ -152,8 +148,8 @@ class StreamEngine:
 
     def _outputs(self, rotations: torch.Tensor, std: torch.Tensor) -> list[EngineOutput]:
         outputs = []
-        for pose, deviation in zip(rotations[0], std[0], strict=True):
-            outputs.append(_output(self._tags.popleft(), pose, deviation, self._done < self._past))
+        for pose, deviation in zip(rotations[0].numpy(), std[0].numpy(), strict=True):
+            outputs.append(EngineOutput(self._tags.popleft(), pose, deviation, self._done < self._past))
             self._done += 1
         return outputs
 
