@@ -72,6 +72,7 @@ def card(metadata: dict[str, Any]) -> str:
         "```",
         "edgepose synthesize MOCAP --out recordings --jobs 2",
         "edgepose synthesize MOCAP/*_normal_*.bvh --hold 3 --out recordings/standing",
+        *(["edgepose synthesize SOME --seated 1 --out recordings/seated"] if _seated(metadata) else []),
         f"edgepose train --config {metadata['name']} --data recordings --out runs/{metadata['name']}",
         f"edgepose export runs/{metadata['name']}/checkpoint.pt --out {metadata['name']}.pt "
         "--measure recordings",
@@ -101,6 +102,11 @@ def _table(rows: dict[str, dict[str, list[float]]]) -> list[str]:
         cells = [f"{measures[key][0]:.2f} ± {measures[key][1]:.2f}" for key in _COLUMNS]
         lines.append("| " + " | ".join([name, *cells, str(int(measures["sip_error_deg"][2]))]) + " |")
     return lines
+
+
+def _seated(metadata: dict[str, Any]) -> bool:
+    """Whether the network was trained on made sitting."""
+    return metadata["training"]["config"].get("seated_share", 0.0) > 0.0
 
 
 def _size(metadata: dict[str, Any]) -> str:
