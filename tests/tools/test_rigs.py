@@ -88,7 +88,8 @@ def follow(recording: Path, protocol: str, out: Path) -> tuple[float, float, Pat
 
 def test_the_same_poses_over_every_wire(clip, tmp_path):
     recording, truth = clip
-    with ThreadPoolExecutor(len(RIGS)) as pool:
+    # Two at a time: wires without time stamps are timed by arrival, which a crowded machine shifts.
+    with ThreadPoolExecutor(2) as pool:
         results = list(pool.map(lambda name: follow(recording, name, tmp_path / name), RIGS))
     errors = {}
     for name, (begin, end, path) in zip(RIGS, results, strict=True):
