@@ -190,7 +190,10 @@ class Browser:
     def __init__(self, folder: Path) -> None:
         command = [CHROMIUM, "--no-sandbox", "--headless", "--enable-unsafe-swiftshader", "--disable-gpu"]
         command += ["--remote-debugging-port=0", "--window-size=800,500", f"--user-data-dir={folder}"]
-        self.process = subprocess.Popen([*command, "about:blank"], stderr=subprocess.DEVNULL)
+        # In a group of its own: Debian's command is a script, and the browser does not end with it.
+        self.process = subprocess.Popen(
+            [*command, "about:blank"], stderr=subprocess.DEVNULL, start_new_session=True
+        )
         told = folder / "DevToolsActivePort"
         until(lambda: told.exists() and "\n" in told.read_text(), "the browser")
         port = told.read_text().splitlines()[0]
@@ -218,7 +221,7 @@ class Browser:
 
     def close(self) -> None:
         self.socket.close()
-        self.process.terminate()
+        os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()
 
 
