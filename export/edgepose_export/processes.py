@@ -66,5 +66,7 @@ def joined() -> Iterator[Processes]:
     try:
         device = torch.device("cuda", local) if gpus else ALONE.device
         yield Processes(distributed.get_rank(), distributed.get_world_size(), device)
+        # None may leave while another still talks to it.
+        distributed.barrier()
     finally:
         distributed.destroy_process_group()

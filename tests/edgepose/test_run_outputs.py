@@ -53,7 +53,7 @@ def free_address() -> str:
 def test_all_outputs_say_the_same(command, wearer, tmp_path):
     mailbox = Mailbox()
     result = command(
-        *("run", "--file", wearer.short, "--calibration", wearer.calibration, "--model", "rnn"),
+        *("run", "--file", wearer.short, "--realtime", "--calibration", wearer.calibration, "--model", "rnn"),
         *("--csv", tmp_path / "a.csv", "--npz", tmp_path / "a.npz", "--bvh", tmp_path / "a.bvh"),
         *("--osc", mailbox.address, "--tcp", free_address(), "--height", "1.9"),
     )
