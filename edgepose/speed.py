@@ -64,7 +64,7 @@ Result = TypeVar("Result")
 
 def _chunks() -> list[bytes]:
     """What six sensors send on one line, a chunk each 1/60 s."""
-    encode = PROTOCOLS["native"].encoder()
+    encode = PROTOCOLS["native"].encode
     chunks = [b""] * (int(RATE) * _SECONDS + 1)
     for seq in range(_SENSOR_HZ * _SECONDS):
         time_s = seq / _SENSOR_HZ

@@ -39,7 +39,7 @@ class Protocol:
         text: what it is, one line.
         decoder: makes a decoder with nothing seen.
         encoder: makes a function that encodes samples; one for each line, as some count for themselves. Where
-            a device has an id on its line, `sample.sensor` is it.
+            a device has an id on its line, `sample.sensor` is it. None where the format is only read.
         ids: ids of six devices on one line when nothing else is said; empty where nothing is usual.
         alone: a device usually has a line to itself.
         request: what has to be sent to the device with an id for one sample, and the length of its answer,
@@ -51,7 +51,7 @@ class Protocol:
     speed: int
     text: str
     decoder: Callable[[], Decoder]
-    encoder: Callable[[], Encode]
+    encoder: Callable[[], Encode] | None
     ids: Sequence[int] = ()
     alone: bool = False
     request: Callable[[int], tuple[bytes, int]] | None = None
@@ -62,7 +62,13 @@ class Protocol:
         return self.decoder().WRAP_US
 
     def encode(self, sample: Sample, seq: int) -> Any:
-        """`encoder()(sample, seq)`, for formats without a count of their own."""
+        """`encoder()(sample, seq)`, for formats without a count of their own.
+
+        Raises:
+            ValueError: the format is only read.
+        """
+        if self.encoder is None:
+            raise ValueError(f"{self.name} is only read")
         return self.encoder()(sample, seq)
 
 

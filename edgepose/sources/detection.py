@@ -160,16 +160,13 @@ def _text_lines(path: Path) -> Protocol:
     def decoder() -> Any:
         return text.Decoder(pattern)
 
-    def cannot() -> Any:
-        raise NotImplementedError("text lines of a user's own are only read")
-
     return Protocol(
         path.name,
         "bytes",
         115200,
         "text lines as a file says",
         decoder,
-        cannot,
+        encoder=None,
         ids=range(6),
         alone="sensor" not in (pattern.regex or "") and "sensor" not in pattern.columns,
     )

@@ -19,6 +19,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 from edgepose.recording import csv_header, csv_row, read_recording, samples, write_csv
 from edgepose.sources import open_source
+from edgepose.sources.detection import protocol_named
 from edgepose.sync import FrameClock
 from firmware_protocols.native import Info, Packet, encode, encode_info
 from firmware_protocols.registry import PROTOCOLS
@@ -456,6 +457,8 @@ def test_lines_of_text_as_a_file_describes_them(tmp_path):
     assert len(got) == 300
     assert got[-1].sensor == 5
     assert got[-1].time_s - got[0].time_s == pytest.approx(0.49)
+    with pytest.raises(ValueError, match=r"mine\.toml is only read"):
+        protocol_named(str(pattern)).encode(Sample(0), 0)
     pattern.write_text("regexp = 'x'\n")
     with pytest.raises(EdgeposeError, match=r"mine\.toml: unknown key 'regexp'"):
         open_source(port="a", protocol=str(pattern))
