@@ -39,7 +39,7 @@ class EngineOutput(NamedTuple):
 
 
 class Engine(Protocol):
-    """What `window_engine` and `stream_engine` give."""
+    """What `WindowEngine` and `StreamEngine` are."""
 
     def push(self, tag: Any, orientation: Input, acceleration: Input) -> list[EngineOutput]:
         """Takes a frame ((6, 3, 3) R_TB, (6, 3) m/s^2 in T without gravity) and gives the poses that are

@@ -13,6 +13,8 @@ from edgepose.skeleton import forward_kinematics
 
 Array = NDArray[np.float64]
 
+PICTURES = (".png", ".pdf", ".svg")
+
 AZIMUTH = np.deg2rad(25.0)
 """The viewer stands this far round from the figure's front towards its left side."""
 
@@ -69,6 +71,25 @@ def project(points: ArrayLike) -> tuple[Array, Array]:
     return np.stack([c * x - s * z, y], axis=-1), s * x + c * z
 
 
+def require_matplotlib(what: str) -> None:
+    """Raises EdgeposeError, naming what needs it, unless matplotlib is there; it is an extra."""
+    try:
+        import matplotlib.figure  # noqa: F401
+    except ImportError as error:
+        raise EdgeposeError(
+            f"{what} needs matplotlib: install it with pip install 'edgepose[plot]'"
+        ) from error
+
+
+def check_picture(path: Path, what: str) -> None:
+    """Before long work: raises EdgeposeError unless this kind of picture can be drawn in this folder."""
+    require_matplotlib(what)
+    if path.suffix.lower() not in PICTURES:
+        raise EdgeposeError(f"{path}: pictures are written as {', '.join(PICTURES)}")
+    if not path.resolve().parent.is_dir():
+        raise EdgeposeError(f"{path}: no folder {path.parent}; make it first or choose another name")
+
+
 def skeleton_strip(
     path: str | Path,
     poses: ArrayLike,
@@ -90,12 +111,8 @@ def skeleton_strip(
     Raises:
         EdgeposeError: matplotlib is not installed, or the file cannot be written.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise EdgeposeError(
-            "drawing poses needs matplotlib: install it with pip install 'edgepose[plot]'"
-        ) from error
+    require_matplotlib("drawing poses")
+    from matplotlib.figure import Figure
 
     times = np.asarray(times, float)
     rows = [(_figures(poses, offsets), PREDICTION)]

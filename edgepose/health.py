@@ -348,8 +348,9 @@ class _Sensor:
 
     def _look_for_repeats(self, rows: Array, still: Array, new: int) -> None:
         values = rows[:, _QUAT.start : _GYR.stop]
-        moving = np.logical_not(still[1:][-new:])
-        same = np.all((values[1:] == values[:-1]) | np.isnan(values[1:]), axis=1)[-new:]
+        first = max(len(rows) - 1 - new, 0)
+        moving = np.logical_not(still[1:][first:])
+        same = np.all((values[1:] == values[:-1]) | np.isnan(values[1:]), axis=1)[first:]
         self._moved += int(np.count_nonzero(moving))
         self._repeated += int(np.count_nonzero(same & moving))
         if self._period_s > 0.0:

@@ -177,7 +177,8 @@ def read_blocks(path: str | Path) -> Iterator[Poses]:
         yield from _read_csv(sys.stdin, "standard input")
         return
     try:
-        with Path(path).open(encoding="utf-8-sig", newline="") as file:
+        # A byte that is no text spoils its row, not the block that is read with it.
+        with Path(path).open(encoding="utf-8-sig", errors="replace", newline="") as file:
             yield from _read_csv(file, str(path))
     except OSError as error:
         raise EdgeposeError(f"cannot read poses from {path}: {error.strerror or error}") from error
@@ -193,14 +194,15 @@ class _BadRowError(EdgeposeError):
 
 def _read_csv(file: TextIO, name: str) -> Iterator[Poses]:
     rows = csv.reader(_lines(file))
-    first, last = 2, None
+    first = 2
+    last: tuple[int, float] | None = None
     try:
         form, std, moves = _recognise(next(rows, []), name)
         columns = len(pose_columns(form, std, moves))
         while block := list(islice(rows, BLOCK)):
             poses, error = _good(block, first, last, columns, form, moves, name)
             if poses is not None:
-                first, last = first + len(poses.frames), int(poses.frames[-1])
+                first, last = first + len(poses.frames), (int(poses.frames[-1]), float(poses.time_s[-1]))
                 yield poses
             if error is not None:
                 raise error
@@ -213,7 +215,13 @@ def _read_csv(file: TextIO, name: str) -> Iterator[Poses]:
 
 
 def _good(
-    rows: list[list[str]], first: int, last: int | None, columns: int, form: str, moves: bool, name: str
+    rows: list[list[str]],
+    first: int,
+    last: tuple[int, float] | None,
+    columns: int,
+    form: str,
+    moves: bool,
+    name: str,
 ) -> tuple[Poses | None, EdgeposeError | None]:
     """The poses before the first bad row, and what is wrong with that."""
     problem = None
@@ -225,10 +233,14 @@ def _good(
     return None, problem
 
 
+_TOO_LONG = "the line is too long for a file of poses"
+
+
 def _lines(file: TextIO) -> Iterator[str]:
     while line := file.readline(MAX_LINE):
         if len(line) == MAX_LINE:
-            raise csv.Error("the line is too long for a file of poses")
+            yield _TOO_LONG  # a bad row, and the rows before it stay good
+            return
         yield line
 
 
@@ -239,6 +251,8 @@ def _recognise(header: list[str], name: str) -> tuple[str, bool, bool]:
             for moves in (False, True):
                 if header == pose_columns(form, std, moves):
                     return form, std, moves
+    if any("\ufffd" in column for column in header):
+        raise EdgeposeError(f"{name} is not a text file")
     raise EdgeposeError(
         f"{name} is not a file of poses: its first line must be 'frame,time_s,status,pelvis_...' and name "
         "the 24 joints in SMPL order"
@@ -246,11 +260,20 @@ def _recognise(header: list[str], name: str) -> tuple[str, bool, bool]:
 
 
 def _block(
-    rows: list[list[str]], first: int, last: int | None, columns: int, form: str, moves: bool, name: str
+    rows: list[list[str]],
+    first: int,
+    last: tuple[int, float] | None,
+    columns: int,
+    form: str,
+    moves: bool,
+    name: str,
 ) -> Poses:
-    """Poses of rows of which the first has number `first`, after the frame `last`."""
+    """Poses of rows of which the first has number `first`, after the frame and time `last`."""
+    frame_before, time_before = last or (None, -np.inf)
     frames, times, status, numbers = array("q"), array("d"), list[str](), array("d")
     for number, row in enumerate(rows, start=first):
+        if row == [_TOO_LONG]:
+            raise _BadRowError(name, number, _TOO_LONG)
         if len(row) != columns:
             raise _BadRowError(name, number, f"{len(row)} columns, the header has {columns}")
         try:
@@ -260,10 +283,12 @@ def _block(
             frames.append(frame)
         except (ValueError, OverflowError) as error:
             raise _BadRowError(name, number, str(error)) from error
-        if last is not None and frame <= last:
-            raise _BadRowError(name, number, f"frame {frame} comes after frame {last}")
+        if frame_before is not None and frame <= frame_before:
+            raise _BadRowError(name, number, f"frame {frame} comes after frame {frame_before}")
+        if times[-1] <= time_before:
+            raise _BadRowError(name, number, f"time {row[1]} s is not after that of the row before")
         status.append(sys.intern(row[2]))
-        last = frame
+        frame_before, time_before = frame, times[-1]
     values = np.frombuffer(numbers).reshape(len(frames), -1)
     seconds = np.frombuffer(times)
     bad = ~(np.isfinite(seconds) & np.isfinite(values).all(axis=1))
@@ -345,7 +370,9 @@ def _load(path: Path) -> tuple[dict[str, NDArray[Any]], bool]:
                 f"{path}: unpacks to {size >> 20} MB; poses are read up to {MAX_BYTES >> 20} MB"
             )
         with np.load(path, allow_pickle=False) as archive:
-            return {key: archive[key] for key in wanted if key in archive.files}, _is_recording(set(sizes))
+            # Members without the ending are no arrays.
+            arrays = {key: archive[key] for key in wanted if f"{key}.npy" in sizes}
+            return arrays, _is_recording(set(sizes))
     except OSError as error:
         raise EdgeposeError(f"cannot read poses from {path}: {error.strerror or error}") from error
     except (
@@ -376,7 +403,10 @@ def _clock(path: Path, arrays: Mapping[str, NDArray[Any]], count: int) -> tuple[
         if (np.diff(frames) <= 0).any():
             raise EdgeposeError(f"{path}: the numbers in 'frame' do not rise")
     if "time_s" in arrays:
-        return frames, _numbers(path, arrays, "time_s", (count,))
+        times = _numbers(path, arrays, "time_s", (count,))
+        if (np.diff(times) <= 0).any():
+            raise EdgeposeError(f"{path}: the times in 'time_s' do not rise")
+        return frames, times
     key = "mocap_framerate" if "mocap_framerate" in arrays else "mocap_frame_rate"
     if key not in arrays or arrays[key].size != 1:
         raise EdgeposeError(f"{path}: needs one number 'mocap_framerate', frames per second")

@@ -56,7 +56,7 @@ def pack(
     except EdgeposeError as error:
         if choice != "auto":
             raise EdgeposeError(f"{info.path}: {error}; use --precision f32") from error
-        tell(f"running in f32, slower than in fp16: {error}")
+        tell(f"running in f32: {error}")
         return "f32"
     return wanted
 

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from edgepose.angles import ANGLES, LIMBS, Walk, joint_angles, walks
 from edgepose.appending import replace_file
-from edgepose.errors import EdgeposeError
-from edgepose.figures import INK, PREDICTION, skeleton_strip
+from edgepose.figures import INK, PREDICTION, require_matplotlib, skeleton_strip
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import FILLING_WINDOW, held_sensors, longest_holds, status_bits
 from edgepose.poses import Poses
@@ -55,12 +54,7 @@ def write_report(path: Path, poses: Poses, body: Body, name: str) -> None:
     Raises:
         EdgeposeError: matplotlib is not installed, or the file cannot be written.
     """
-    try:
-        import matplotlib  # noqa: F401
-    except ImportError as error:
-        raise EdgeposeError(
-            "a report needs matplotlib: install it with pip install 'edgepose[plot]'"
-        ) from error
+    require_matplotlib("a report")
     angles = joint_angles(poses.rotations)
     found = walks(poses.rotations, body.offsets, poses.rate)
     times = poses.time_s - poses.time_s[0]

@@ -271,16 +271,17 @@ def load_engine(info: archive.ArchiveInfo, trust: bool, precision: str, mode: st
 def model_speeds(info: archive.ArchiveInfo, trust: bool) -> list[Speed]:
     """Speeds of a model in all its modes and precisions that this machine has; the reference comes first."""
     about = info.metadata
+    stored = str(about.get("precision", "f32"))
     ways: dict[tuple[str, str], Callable[[], object]] = {}
     if about["kind"] in ("birnn", "rnn"):
         ways["reference", "f32"] = _reference(about)
     orientation, acceleration = np.tile(np.eye(3), (len(PLACEMENTS), 1, 1)), np.zeros((len(PLACEMENTS), 3))
     for mode in ("stream", "window") if about["kind"] == "birnn" else ("stream",):
-        for precision in PRECISIONS:
+        for precision in PRECISIONS if stored == "f32" else (stored,):
             try:
                 engine = load_engine(info, trust, precision, mode)
             except EdgeposeError:
-                if precision == "f32":
+                if precision == stored:
                     raise
                 continue  # not on this machine, or not in this kind of network
             for _ in range(about["past"] + about["future"]):

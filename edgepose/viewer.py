@@ -6,6 +6,7 @@ The scene and its controls are viser's, which serves a page of its own; nothing 
 from __future__ import annotations
 
 import io
+import re
 import select
 import socket
 import time
@@ -178,7 +179,7 @@ class Viewer:
                 table = sensor_table(held[max(0, i + 1 - window) : i + 1], poses.rate)
                 text.content = (
                     f"pose {i + 1} of {len(times)}, {poses.rate:g} poses/s\n\n"
-                    f"**{poses.status[i]}**\n\n{table}"
+                    f"**{plain(poses.status[i])}**\n\n{table}"
                 )
             time.sleep(max(0.0, FRAME_S - (time.monotonic() - now)))
 
@@ -298,10 +299,15 @@ class Stream:
         rate = len(self._recent) / span
         held = held_sensors([status for _, status in self._recent])
         silent = now - self._newest_s
-        state = self._last.status if silent < 1.0 else f"nothing for {silent:.0f} s"
+        state = plain(self._last.status) if silent < 1.0 else f"nothing for {silent:.0f} s"
         counts = [f"{rate:.0f} poses/s", f"{self.poses} poses", f"{self.lost} lost"]
         counts += [f"{self.bad} bad"] if self.bad else []
         return f"{', '.join(counts)}\n\n**{state}**\n\n{sensor_table(held, rate or 60.0)}"
+
+
+def plain(status: str) -> str:
+    """A status, which anybody may have sent, without what a browser would act on."""
+    return re.sub(r"[^A-Za-z0-9_ ;]", "?", status[:200])
 
 
 def _beside(reference: Poses, poses: Poses, i: int) -> int:

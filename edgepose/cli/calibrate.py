@@ -17,6 +17,7 @@ from edgepose.calibration import Calibration, HeadingReset, HoldSummary
 from edgepose.cli.guide import Guide
 from edgepose.cli.measuring import ROUTINE_S, Plan, finds_forward, live, recorded
 from edgepose.cli.options import Orientations, SourceFlags, filter_options, source_options
+from edgepose.cli.outputs import check_files
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
@@ -145,6 +146,9 @@ def calibrate(
       edgepose calibrate --file walk.csv --from 2.5 --body-frame heading:0 --out walk.json
     """
     _check_use(source, heading_reset, motion, pose, from_s)
+    lying = None if heading_reset is None or not Path(heading_reset).is_file() else Path(heading_reset)
+    inputs = {"--file": source.file, "--sensors": source.sensors, "--heading-reset": lying}
+    check_files({"--out": out}, inputs)
     _check_writable(out)
     said = None if source.sensors is None else read_map(source.sensors)
     mounted = {} if said is None else {name: device.mounting for name, device in said.devices.items()}

@@ -76,6 +76,11 @@ def recorded(
     if plan.heading_reset == "motion":
         end_s = start_s + plan.hold_s
         moving = calibration.cut(everything[0], *(plan.motion or (end_s, end_s + ROUTINE_S)))
+        if not all(len(sensor.time_s) for sensor in moving):
+            raise EdgeposeError(
+                f"{source.name}: not all six sensors report where the movements should be; say where "
+                "with --motion FROM:TO, or use another --heading-reset"
+            )
         reset = calibration.headings_from_motion(moving, summary.orientation)
     return summary, reset or _mounted(plan, summary), start_s
 
@@ -111,7 +116,12 @@ def _mounted(plan: Plan, summary: HoldSummary) -> HeadingReset | None:
 
 def _check_north(orient: Orientations, plan: Plan) -> None:
     """Raises EdgeposeError if a filter has begun with any headings and nothing will bring them together."""
-    if plan.heading_reset is None and not orient.north:
+    if orient.mixed:
+        raise EdgeposeError(
+            "some sensors have a magnetometer and others none: their headings would differ; add --no-mag"
+        )
+    # Sensors that lay side by side in another recording had a north there.
+    if (plan.heading_reset is None or plan.lying is not None) and not orient.north:
         raise EdgeposeError(
             "without a magnetometer in each sensor the filter's headings are arbitrary: "
             "add --heading-reset motion, live or mounting"

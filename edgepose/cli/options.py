@@ -161,6 +161,7 @@ class Orientations:
         """
         self._filter, self._magnetometer = filter, magnetometer
         self._with_north: set[int] = set()
+        self._made: set[int] = set()  # sensors that have been oriented
         self._orienter: Orienter | None = None
         if filter != "none":
             from edgepose.orientation import Orienter
@@ -184,12 +185,37 @@ class Orientations:
         """
         return self._orienter is None or (self._magnetometer and len(self._with_north) == len(PLACEMENTS))
 
+    @property
+    def mixed(self) -> bool:
+        """Whether some sensors have sent a magnetic field and others none, all being wanted."""
+        return self._magnetometer and 0 < len(self._with_north) < len(PLACEMENTS)
+
+    def remarks(self) -> list[str]:
+        """What happened to the samples of each sensor, for the end of a run."""
+        status = {} if self._orienter is None else self._orienter.status()
+        return [
+            f"filter   {PLACEMENTS[sensor]}: "
+            + ", ".join(
+                f"{count} {str(event.name).lower().replace('_', ' ')}" for event, count in own.events.items()
+            )
+            for sensor, own in status.items()
+            if own.events
+        ]
+
     def __call__(self, samples: list[ImuSample]) -> list[ImuSample]:
-        """The samples, oriented."""
+        """The samples, oriented; without those of oriented sensors that cannot be."""
         if self._orienter is None:
             return samples
-        self._with_north.update(sample.sensor for sample in samples if sample.mag is not None)
-        return self._orienter.orient(samples)
+        if len(self._with_north) < len(PLACEMENTS):
+            self._with_north.update(sample.sensor for sample in samples if sample.mag is not None)
+        oriented = self._orienter.orient(samples)
+        self._made.update(sample.sensor for sample in oriented if sample.quat is not None)
+        # What only brought a field, or lost its rate on the way, has no orientation to give.
+        return [
+            sample
+            for sample in oriented
+            if sample.quat is not None or (sample.acc is not None and sample.sensor not in self._made)
+        ]
 
 
 def filter_options(command: Callable[..., Any]) -> Callable[..., Any]:

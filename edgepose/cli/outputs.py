@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
@@ -37,10 +38,9 @@ class OutputFlags(NamedTuple):
         return self.view or any(output is not None for output in named)
 
     @property
-    def files(self) -> dict[str, str]:
-        """The files that will be written, by flag."""
-        paths = {"--csv": self.csv, "--npz": self.npz, "--bvh": self.bvh}
-        return {flag: path for flag, path in paths.items() if path not in (None, "-")}
+    def files(self) -> dict[str, str | None]:
+        """The files that are asked for, by flag."""
+        return {"--csv": self.csv, "--npz": self.npz, "--bvh": self.bvh}
 
     def open(self, stack: ExitStack, rate: float = 60.0) -> list[Sink]:
         """The sinks, which the stack closes; `rate` is that of the poses, per second.
@@ -98,6 +98,27 @@ class OutputFlags(NamedTuple):
             if isinstance(sink, TcpSink) and sink.missed:
                 remarks.append(f"tcp      {sink.missed} poses were missed by viewers that read too slowly")
         return remarks
+
+
+def check_files(outputs: Mapping[str, str | Path | None], inputs: Mapping[str, Path | None]) -> None:
+    """Raises click.UsageError where a file to write, by flag, is one to read, or two flags name one file."""
+    written: dict[Path, str] = {}
+    for flag, output in outputs.items():
+        if output is None or str(output) == "-":
+            continue
+        for name, given in inputs.items():
+            if given is not None and _is_same_file(Path(output), given):
+                raise click.UsageError(f"{flag} would overwrite {given}, which is {name}; name another file")
+        other = written.setdefault(Path(output).resolve(), flag)
+        if other != flag:
+            raise click.UsageError(f"{other} and {flag} name the same file, {output}; name two")
+
+
+def _is_same_file(output: Path, given: Path) -> bool:
+    try:
+        return given.samefile(output)
+    except OSError:  # there is no such file yet
+        return False
 
 
 def _destination(ctx: click.Context, param: click.Parameter, value: str | None) -> Destination | None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from edgepose.cli.options import Orientations, SourceFlags, filter_options, source_options
-from edgepose.cli.outputs import OutputFlags, output_options
+from edgepose.cli.outputs import OutputFlags, check_files, output_options
 from edgepose.cli.stop import Stop
 from edgepose.cli.wishes import Wishes
 from edgepose.errors import EdgeposeError
@@ -123,12 +123,7 @@ def run(
     """
     if not outputs.any:
         raise click.UsageError("give at least one output, such as --csv FILE, --udp HOST:PORT or --view")
-    for flag, given in (("--file", source.file), ("--calibration", calibration_path)):
-        for output, path in outputs.files.items():
-            if given is not None and _is_same_file(path, given):
-                raise click.UsageError(
-                    f"{output} would overwrite {given}, which is {flag}; name another file"
-                )
+    check_files(outputs.files, {"--file": source.file, "--calibration": calibration_path})
     if control is not None and not source.live:
         raise click.UsageError("--control needs sensors that send, or --realtime")
 
@@ -168,6 +163,7 @@ def run(
         clock = FrameClock(rate)
         way = "stream" if isinstance(engine, StreamEngine) else "window"
         _say(f"running {model} ({kind}, {way}) in {precision}; Ctrl-C ends the run{wishes.hint}")
+        orient = Orientations(filter, magnetometer=calibration.north)
         headings = Headings(
             calibration,
             hold_first=source.live and _begins_anew(calibration),
@@ -179,7 +175,7 @@ def run(
         gc.freeze()
         summary = run_pipeline(
             *(opened, clock, headings, engine, sinks),
-            orient=Orientations(filter, magnetometer=calibration.north),
+            orient=orient,
             tell=_say if source.live else lambda text: None,
             on_pose=_progress(),
             stopped=lambda: stop.asked,
@@ -191,7 +187,7 @@ def run(
             except EdgeposeError as error:
                 summary.error = summary.error or error
     _report(summary, opened, clock, rate, future, live=source.live)
-    for line in (*outputs.remarks(sinks), *wishes.remarks()):
+    for line in (*orient.remarks(), *outputs.remarks(sinks), *wishes.remarks()):
         _say(line)
     if summary.error:
         raise summary.error
@@ -231,13 +227,6 @@ TOGETHER = 64
 
 BEHIND_S = 1.0
 """A run that is further behind its sensors says so, seconds."""
-
-
-def _is_same_file(output: str, given: Path) -> bool:
-    try:
-        return given.samefile(output)
-    except OSError:  # there is no such file yet
-        return False
 
 
 def _say(text: str) -> None:

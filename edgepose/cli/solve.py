@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from edgepose.cli.bodies import BodyFlags, body_options
+from edgepose.cli.outputs import check_files
 from edgepose.errors import EdgeposeError
 
 if TYPE_CHECKING:
@@ -136,10 +137,14 @@ def solve(
     """
     if not (csv or npz or bvh):
         raise click.UsageError("give at least one output: --csv FILE, --npz FILE or --bvh FILE")
-    for flag, name in {"--csv": csv, "--npz": npz, "--bvh": bvh, "--plot": plot}.items():
-        for given in (recording, calibration_path):
-            if name not in (None, "-") and Path(str(name)).resolve() == given.resolve():
-                raise click.UsageError(f"{flag} would overwrite {given}; name another file")
+    check_files(
+        {"--csv": csv, "--npz": npz, "--bvh": bvh, "--plot": plot},
+        {"IN": recording, "--calibration": calibration_path},
+    )
+    if plot is not None:
+        from edgepose.figures import check_picture
+
+        check_picture(Path(plot), "--plot")
 
     from edgepose.calibration import load_calibration
     from edgepose.offline import reading, report

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from edgepose.errors import EdgeposeError
+from edgepose.figures import require_matplotlib
 from edgepose.offline.measurements import Measurements
 from edgepose.offline.solve import Solution
 from edgepose.offline.terms import Costs
@@ -69,12 +70,8 @@ def plot(path: str | Path, solution: Solution, measurements: Measurements) -> No
     Raises:
         EdgeposeError: matplotlib is not installed, or the file cannot be written.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise EdgeposeError(
-            "--plot needs matplotlib: install it with pip install 'edgepose[plot]'"
-        ) from error
+    require_matplotlib("--plot")
+    from matplotlib.figure import Figure
 
     times = measurements.time_s[: len(solution.rotations)]
     figure = Figure(figsize=(9.0, 7.0), dpi=130, layout="constrained")

@@ -267,7 +267,9 @@ class OrientationFilter:
             variances = [s.vel**2 * max(1.0, s.vel_time / self._block_s)] * 3
         if field is not None and self._has_heading:
             tilt_var = 0.5 * float(self._kalman.P[0, 0] + self._kalman.P[1, 1])
-            heading = self._reference.heading(field.tolist(), self._field_age_s, rate, tilt_var)
+            # No reading for longer is a loss, which says nothing of the field.
+            age_s = min(self._field_age_s, s.mag_lost_s)
+            heading = self._reference.heading(field.tolist(), age_s, rate, tilt_var)
             self._field_age_s = 0.0
             if heading is not None:
                 states.append(model.HEADING)

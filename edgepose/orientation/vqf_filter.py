@@ -105,6 +105,8 @@ class VqfFilter:
             self._vqf = self._new()
             self._vqf.setBiasEstimate(*known)
             self._heading = float(rot.heading(self._quat))
+            if self._learning is not None:
+                self._learning = []  # what came before is in the heading already
         self._started = True
 
     def _new(self) -> Any:

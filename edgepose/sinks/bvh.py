@@ -99,7 +99,7 @@ class BvhSink(Sink):
         self._count, self._closed = 0, False
         if self._path == "-" or (Path(path).exists() and not Path(path).is_file()):
             raise EdgeposeError(
-                f"cannot write BVH to {path}: it must be a file, which tells its length at once"
+                f"cannot write BVH to {path}: it must be a file on a disk, as its start tells how long it is"
             )
         self._file = open_output(self._path, "poses")
         head = f"{hierarchy(offsets * 100)}MOTION\n{_COUNT}"

@@ -92,12 +92,17 @@ class NpzSink(Sink):
             translation: whether the poses have a translation.
 
         Raises:
-            EdgeposeError: it cannot be written.
+            EdgeposeError: it cannot be written, or poses of a run that was cut off are where they would go.
         """
         self._path = Path(path)
         if str(path) == "-" or self._path.is_dir():
             raise EdgeposeError(f"cannot write poses to {path}: an NPZ file needs a file's name")
         self._part = self._path.with_name(f"{self._path.stem}.part.csv")
+        if self._part.exists():
+            raise EdgeposeError(
+                f"{self._part} is there already, perhaps of a run that was cut off: keep its poses with "
+                f"edgepose convert {self._part} --to npz --out saved, then delete it"
+            )
         self._rate, self._closed = rate, False
         self._csv = CsvSink(self._part, translation=translation)
 

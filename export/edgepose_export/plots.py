@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
+from edgepose.figures import require_matplotlib
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -21,13 +22,6 @@ Array = NDArray[np.float64]
 PANEL_IN, DPI = 4.5, 150
 MOST_DEG = 60
 """Errors beyond are counted in the last bin of a histogram."""
-
-
-def check_picture(path: Path) -> None:
-    """Raises EdgeposeError unless matplotlib is there and can draw this kind of file; before long work."""
-    _panels([""])
-    if path.suffix.lower() not in (".png", ".pdf", ".svg"):
-        raise EdgeposeError(f"{path}: pictures are written as .png, .pdf or .svg")
 
 
 def histogram(path: Path, parts: Mapping[str, Mapping[str, Array]]) -> None:
@@ -88,12 +82,9 @@ def reliability_plot(path: Path, parts: Mapping[str, Mapping[str, Reliability]])
 
 def _panels(titles: list[str]) -> tuple[Figure, list[Any]]:
     """A figure with a panel for each title, side by side."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise EdgeposeError(
-            "drawing needs matplotlib: install it with pip install 'edgepose[plot]'"
-        ) from error
+    require_matplotlib("drawing")
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(PANEL_IN * len(titles) + 0.5, PANEL_IN), layout="constrained")
     axes = list(figure.subplots(1, len(titles), squeeze=False)[0])
     for ax, title in zip(axes, titles, strict=True):

@@ -11,7 +11,16 @@ import torch
 from edgepose.errors import EdgeposeError
 from edgepose.precision import PRECISIONS, pack_weights
 from edgepose_export.dataset import Take
-from edgepose_export.evaluation import Mode, Progress, collect, groups, run_archive, summarise, takes_of
+from edgepose_export.evaluation import (
+    GROUP,
+    Mode,
+    Progress,
+    collect,
+    groups,
+    run_archive,
+    summarise,
+    takes_of,
+)
 
 KEYS = ("sip_error_deg", "joint_angle_error_10_deg")
 
@@ -57,7 +66,12 @@ def _part(
         for take, pose in zip(group, run_archive(modules["f32"], group, mode), strict=True)
     ]
     methods = {
-        name: lambda group, module=module: run_archive(module, group, mode)
+        # Inputs rounded to int8 share a scale with all that is computed at once; a run has one wearer.
+        name: lambda group, module=module, size=1 if name == "int8" else GROUP: [
+            poses
+            for i in range(0, len(group), size)
+            for poses in run_archive(module, group[i : i + size], mode)
+        ]
         for name, module in modules.items()
     }
     errors, away = (summarise(collect(some, methods)) for some in (takes, reference))

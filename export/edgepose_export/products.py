@@ -10,11 +10,6 @@ from typing import Optional
 import torch
 from torch import Tensor, nn
 
-PRECISIONS = ("f32", "fp16", "int8")
-"""Of the weights: 32-bit numbers; 16-bit ones; 8-bit ones with a scale for each output, inputs turned to
-8 bits as well. Sums are f32 everywhere.
-"""
-
 
 class Product(nn.Module):
     """`x W + b`, scriptable; `pack` chooses the numbers that W is kept in."""

@@ -447,3 +447,18 @@ def test_a_whole_session_on_a_terminal(wearer: Wearer, tmp_path: Path) -> None:
     calibration = cal.load_calibration(out)
     np.testing.assert_allclose(np.degrees(calibration.heading_offset), np.degrees(ERRORS), atol=0.1)
     assert_recovers(calibration, ERRORS, 0.1)
+
+
+def test_the_recording_is_not_written_over(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "walk.csv", lambda t: worn(np.tile(np.eye(3), (6, 1, 1))))
+    before = path.read_bytes()
+    result = run("--file", path, "--hold", 1, "--out", path)
+    assert result.exit_code == 2
+    assert f"--out would overwrite {path}, which is --file" in result.output
+    assert path.read_bytes() == before
+
+
+def test_movements_that_are_not_in_the_recording(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "walk.csv", lambda t: worn(np.tile(np.eye(3), (6, 1, 1))))
+    words = ("--heading-reset", "motion", "--motion", "500:520", "--out", tmp_path / "c.json")
+    assert "with --motion FROM:TO" in error_of(run("--file", path, "--hold", 1, *words))

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import warnings
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from edgepose.errors import EdgeposeError
 from edgepose.pose import PoseFrame
-from edgepose.poses import BLOCK, Poses, is_poses, read_blocks, read_poses
+from edgepose.poses import BLOCK, Poses, is_poses, read_blocks, read_poses, salvage_poses
 from edgepose.recording import read_recording, write_csv
 from edgepose.sinks.bvh import BvhSink, depth_first
 from edgepose.sinks.csv_file import CsvSink
@@ -87,7 +88,7 @@ def test_csv_with_translation(tmp_path, std):
 
 def test_csv_in_blocks(tmp_path):
     poses = motion(10)
-    many = [poses[i % 10]._replace(index=i) for i in range(BLOCK + 5)]
+    many = [poses[i % 10]._replace(index=i, time_s=1.7e9 + i / 60) for i in range(BLOCK + 5)]
     written(CsvSink(tmp_path / "a.csv"), many)
     assert [len(block.frames) for block in read_blocks(tmp_path / "a.csv")] == [BLOCK, 5]
     assert read_poses(tmp_path / "a.csv").frames.tolist() == list(range(BLOCK + 5))
@@ -387,3 +388,49 @@ def test_bvh_to_a_device():
 def test_npz_without_poses(tmp_path):
     written(NpzSink(tmp_path / "a.npz"), [])
     assert list(tmp_path.iterdir()) == []
+
+
+def standing(index):
+    return PoseFrame(index, index / 60, "ok", np.tile(np.eye(3), (24, 1, 1)), np.zeros(24))
+
+
+def test_times_that_do_not_rise(tmp_path):
+    with CsvSink(tmp_path / "a.csv") as sink:
+        for i, time_s in enumerate([5.0, 5.1, 5.1]):
+            sink.write(standing(i)._replace(time_s=time_s))
+    with pytest.raises(EdgeposeError, match=r"a\.csv, row 4: time 5\.1\d* s is not after that of the row"):
+        read_poses(tmp_path / "a.csv")
+    assert len(salvage_poses(tmp_path / "a.csv")[0].frames) == 2
+    np.savez(tmp_path / "a.npz", poses=np.zeros((3, 72)), time_s=[1.0, 3.0, 2.0], frame=[0, 1, 2])
+    with pytest.raises(EdgeposeError, match="the times in 'time_s' do not rise"):
+        read_poses(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("end", [b"\0" * 20000, b"3000,\xff\n"])
+def test_rows_before_rubbish_are_good(tmp_path, end):
+    path = tmp_path / "a.csv"
+    with CsvSink(path) as sink:
+        for i in range(3000):
+            sink.write(standing(i))
+    with path.open("ab") as file:
+        file.write(end)
+    poses, damage = salvage_poses(path)
+    assert len(poses.frames) == 3000
+    assert "row 3002" in damage
+
+
+def test_a_member_that_is_no_array(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("poses", b"abc")
+    with pytest.raises(EdgeposeError, match="no poses in it"):
+        read_poses(tmp_path / "a.npz")
+
+
+def test_poses_of_a_run_that_was_cut_off_are_not_written_over(tmp_path):
+    part = tmp_path / "walk.part.csv"
+    with CsvSink(part) as sink:
+        sink.write(standing(0))
+    before = part.read_bytes()
+    with pytest.raises(EdgeposeError, match=r"walk\.part\.csv is there already.*edgepose convert"):
+        NpzSink(tmp_path / "walk.npz")
+    assert part.read_bytes() == before

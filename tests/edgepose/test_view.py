@@ -34,7 +34,7 @@ from edgepose.poses import read_poses
 from edgepose.sinks.csv_file import CsvSink
 from edgepose.sinks.udp import UdpSink, decode, encode_binary, encode_json
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics
-from edgepose.viewer import Stream, Viewer, sensor_table
+from edgepose.viewer import Stream, Viewer, plain, sensor_table
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "chrome"))), None)
 needs_browser = pytest.mark.skipif(
@@ -66,6 +66,14 @@ def until(asked: Callable[[], object], what: str, seconds: float = 60.0) -> None
 
 
 # --- the solids and the text --------------------------------------------------------------------------------
+
+
+def test_a_status_is_no_markup():
+    """Anybody may send one, and a browser would act on it."""
+    assert plain("held left_forearm head; filling window") == "held left_forearm head; filling window"
+    sent = plain('<img src=x onerror="alert(1)">**[a](b)' + "x" * 1000)
+    assert not re.search(r"[<>\[\]*()\"=]", sent)
+    assert len(sent) == 200
 
 
 def test_solids_join_the_joints():

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 
 from edgepose.errors import EdgeposeError
+from edgepose.figures import check_picture
 from edgepose.metrics import Measure, sip_error
 from edgepose_export import plots
 from edgepose_export.dataset import Take
@@ -110,9 +111,9 @@ def test_pictures(tmp_path):
 
 def test_pictures_that_cannot_be_drawn(tmp_path, monkeypatch):
     with pytest.raises(EdgeposeError, match=r"x\.txt: pictures are written as \.png"):
-        plots.check_picture(tmp_path / "x.txt")
+        check_picture(tmp_path / "x.txt", "drawing")
     with pytest.raises(EdgeposeError, match="cannot be written: No such file"):
         plots.histogram(tmp_path / "none" / "x.png", {"walks": {"x": np.ones(3)}})
     monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
     with pytest.raises(EdgeposeError, match=r"pip install 'edgepose\[plot\]'"):
-        plots.check_picture(tmp_path / "x.png")
+        check_picture(tmp_path / "x.png", "drawing")

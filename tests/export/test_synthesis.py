@@ -2,13 +2,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
 from edgepose import calibration
 from edgepose import rotations as rot
+from edgepose.errors import EdgeposeError
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.recording import read_recording
 from edgepose.skeleton import PARENTS, Body, default_body, local_from_global
+from edgepose_export.cli.synthesize import synthesize
 from edgepose_export.dataset import read_take
 from edgepose_export.mocap import Motion, read_motion, resample
 from edgepose_export.synthesis import (
@@ -188,3 +191,13 @@ def test_takes_come_back_as_they_were(tmp_path, path):
     np.testing.assert_allclose(take.acceleration, expected, atol=1e-4)
     np.testing.assert_allclose(take.pose, local_from_global(motion.rotations), atol=1e-5)
     assert (take.name, take.license) == ("take", "x")
+
+
+def test_motion_is_not_written_over_by_its_recording(tmp_path):
+    path = tmp_path / "walk.npz"
+    np.savez(path, poses=np.zeros((30, 72)), trans=np.zeros((30, 3)), mocap_framerate=60.0)
+    before = path.read_bytes()
+    result = CliRunner().invoke(synthesize, [str(tmp_path), "--out", str(tmp_path)])
+    assert isinstance(result.exception, EdgeposeError)
+    assert "would be overwritten by its recording" in str(result.exception)
+    assert path.read_bytes() == before

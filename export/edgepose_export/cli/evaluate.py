@@ -124,15 +124,21 @@ def evaluate(
     """
     if table and (modes or past is not None or future is not None):
         raise click.UsageError("--table says how models run: leave --online, --past and --future out")
+    if heat_map and (table or histogram or baselines):
+        raise click.UsageError(
+            "--heat-map stands in the place of tables: leave --table, --histogram, --baselines"
+        )
     if heat_map and len(names) > 1:
         raise click.UsageError("--heat-map is of one model")
-    from edgepose_export.plots import check_picture
+    from edgepose.figures import check_picture
     from edgepose_export.splits import HELD_OUT
 
     for picture in (histogram, heat_map, reliability):
         if picture:
-            check_picture(picture)
+            check_picture(picture, "drawing")
     models = [_model(name, trust, modes, past, future, table) for name in names]
+    if len({model.name for model in models}) < len(models):  # files of one name in several folders
+        models = [model._replace(name=name) for model, name in zip(models, names, strict=True)]
     chosen = parts or HELD_OUT
     if heat_map:
         _heat_map(models[0], data, chosen, every, heat_map)

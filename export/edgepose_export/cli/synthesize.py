@@ -67,14 +67,14 @@ class Job(NamedTuple):
 @click.option(
     "--mounting",
     "mounting_seed",
-    type=int,
+    type=click.IntRange(0),
     metavar="SEED",
     help="Strap the sensors on at random angles drawn with this seed  [default: along the bones]",
 )
 @click.option(
     "--seated",
     "seated_seed",
-    type=int,
+    type=click.IntRange(0),
     metavar="SEED",
     help="Keep only the upper bodies: play each to and fro while the wearer stands, sits, squats and rises "
     "as drawn with this seed; half a minute a take",
@@ -146,6 +146,8 @@ def _check_targets(tasks: list[tuple[Path, Job]]) -> None:
         target = job.out / path.relative_to(job.root).with_suffix(".npz")
         if target in seen:
             raise EdgeposeError(f"{seen[target]} and {path} would both become {target}; give one of them")
+        if target.resolve() == path.resolve():
+            raise EdgeposeError(f"{path} would be overwritten by its recording; give another --out")
         seen[target] = path
 
 

@@ -328,3 +328,25 @@ def test_unit_of_the_field_does_not_matter(worn):
 def test_settings_are_used(worn):
     calm = OrientationFilter(FilterSettings(rest_gyr=0.0)).update(*worn.measured)
     assert not calm.rest.any()
+
+
+def test_a_long_loss_says_nothing_of_the_field():
+    """Minutes without a reading, then a field that is a little stronger: it is used, not rejected."""
+    time_s = np.arange(0, 180, 0.02)
+    gyr, acc = np.zeros((len(time_s), 3)), np.tile([0.0, 0.0, 9.81], (len(time_s), 1))
+    mag = np.tile([0.0, 20.0, -40.0], (len(time_s), 1))
+    mag[(time_s > 30) & (time_s < 150)] = np.nan
+    mag[time_s >= 150] *= 1.03
+    result = OrientationFilter().update(time_s, gyr, acc, mag)
+    assert not result.disturbed[time_s > 152].any()
+
+
+@pytest.mark.parametrize("gap_at", [15, 40])
+def test_vqf_keeps_its_heading_over_a_gap_while_it_learns_the_rate(gap_at):
+    turning = np.deg2rad(100.0)
+    time_s = np.arange(200) * 0.01
+    time_s[gap_at:] += 2.0
+    gyr, acc = np.tile([0.0, 0.0, turning], (200, 1)), np.tile([0.0, 0.0, 9.81], (200, 1))
+    headings = np.unwrap(rot.heading(VqfFilter().update(time_s, gyr, acc).quat))
+    # Nobody knows how far it turned in the gap; after it, each sample turns by a degree.
+    assert np.abs(np.diff(headings[gap_at:]) - 0.01 * turning).max() < np.deg2rad(1.5)
