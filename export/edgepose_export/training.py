@@ -92,24 +92,16 @@ def read_config(path: Path) -> TrainConfig:
     Raises:
         EdgeposeError: no file, not TOML, an unknown field, or a value of a wrong type or out of its range.
     """
+    values = _toml(path)
     try:
-        return config_from(_with_bases(path, []))
+        if "base" in values:
+            name = values.pop("base")
+            if not isinstance(name, str):
+                raise ValueError(f"base is {name!r}; it takes the name of a config beside this one")
+            values = _over(_toml(path.with_name(f"{name}.toml")), values)
+        return config_from(values)
     except ValueError as error:
         raise EdgeposeError(f"{path}: {error}") from error
-
-
-def _with_bases(path: Path, above: list[Path]) -> dict[str, Any]:
-    """Values of a file over those of its base; `above` are the files that are built on it."""
-    values = _toml(path)
-    if "base" not in values:
-        return values
-    name = values.pop("base")
-    if not isinstance(name, str):
-        raise ValueError(f"base is {name!r}; it takes the name of a config beside this one")
-    base = path.with_name(f"{name}.toml")
-    if base in [*above, path]:
-        raise ValueError(f"base {name!r} leads back to itself")
-    return _over(_with_bases(base, [*above, path]), values)
 
 
 def _toml(path: Path) -> dict[str, Any]:

@@ -568,15 +568,3 @@ def test_config_that_cannot_be_read(tmp_path):
     (tmp_path / "x.toml").write_bytes(b"\xff\xfe")
     with pytest.raises(EdgeposeError, match=r"x\.toml"):
         training.read_config(tmp_path / "x.toml")
-
-
-def test_a_config_on_a_config_on_a_config(tmp_path):
-    (tmp_path / "a.toml").write_text("steps = 7\nwindow = 30\n[network]\nhidden = 16\n")
-    (tmp_path / "b.toml").write_text('base = "a"\nwindow = 40\n[network]\nkind = "rnn"\n')
-    (tmp_path / "c.toml").write_text('base = "b"\nseed = 3\n')
-    config = training.read_config(tmp_path / "c.toml")
-    assert (config.steps, config.window, config.seed) == (7, 40, 3)
-    assert (config.network.kind, config.network.hidden) == ("rnn", 16)
-    (tmp_path / "a.toml").write_text('base = "c"\n')
-    with pytest.raises(EdgeposeError, match="leads back to itself"):
-        training.read_config(tmp_path / "c.toml")
