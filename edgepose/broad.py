@@ -5,7 +5,6 @@ Data 6(7):72, 2021, https://doi.org/10.3390/data6070072; the data are CC BY 4.0.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from edgepose import rotations as rot
 from edgepose.errors import EdgeposeError
+from edgepose.npz import BROKEN
 
 Array = NDArray[np.float64]
 
@@ -86,7 +86,7 @@ def read_trial(path: Path) -> Trial:
     """
     try:
         arrays = _load(path)
-    except (OSError, ValueError, TypeError, NotImplementedError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, *BROKEN) as error:
         raise EdgeposeError(f"{path}: cannot read it: {error}") from None
     missing = [key for key in (*_COLUMNS, "movement", "sampling_rate") if key not in arrays]
     if missing:

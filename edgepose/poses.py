@@ -8,7 +8,6 @@ from __future__ import annotations
 import csv
 import sys
 import zipfile
-import zlib
 from array import array
 from collections.abc import Iterator, Mapping
 from itertools import islice
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
+from edgepose.npz import BROKEN
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import FILLING_WINDOW, PoseFrame, status_text
 from edgepose.rotations import (
@@ -375,9 +375,7 @@ def _load(path: Path) -> tuple[dict[str, NDArray[Any]], bool]:
             return arrays, _is_recording(set(sizes))
     except OSError as error:
         raise EdgeposeError(f"cannot read poses from {path}: {error.strerror or error}") from error
-    except (
-        zipfile.BadZipFile, zlib.error, EOFError, ValueError, TypeError, RuntimeError, MemoryError
-    ) as error:  # fmt: skip
+    except BROKEN as error:
         reason = " ".join(str(error).split())
         raise EdgeposeError(f"{path}: not a whole NPZ file ({reason}); copy it again") from None
 

@@ -10,7 +10,6 @@ import csv
 import heapq
 import sys
 import zipfile
-import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from math import inf, nan
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
+from edgepose.npz import BROKEN
 from edgepose.placements import PLACEMENTS
 
 Array = NDArray[np.float64]
@@ -352,7 +352,7 @@ def write_npz(path: Path | str, recording: Recording) -> None:
 def _read_npz(path: Path, salvage: bool, names: Sequence[str]) -> Recording:
     try:
         arrays = _load_arrays(path, names)
-    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, RuntimeError, MemoryError) as error:
+    except BROKEN as error:
         raise EdgeposeError(
             f"{path}: not a whole NPZ file ({error}); what is left of a cut one cannot be read: copy it again"
         ) from None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
+from edgepose.npz import BROKEN
 from edgepose.offline.kinematics import JOINT_COUNT
 
 Array = NDArray[np.float64]
@@ -86,7 +85,7 @@ def load_prior(path: str | Path | None = None) -> Prior:
                 np.asarray(data[name], float) for name in ("mean", "covariance", "lower", "upper")
             )
             prior = Prior(mean, covariance, lower, upper, str(data["about"]))
-    except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, *BROKEN) as error:
         raise EdgeposeError(
             f"{path}: not a prior of poses ({error}); make one with edgepose learn-prior"
         ) from error

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Iterable
 from itertools import accumulate
 from pathlib import Path
@@ -17,6 +15,7 @@ from torch import Tensor
 from edgepose import rotations as rot
 from edgepose.calibration import GRAVITY
 from edgepose.errors import EdgeposeError
+from edgepose.npz import BROKEN
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import PARENTS, forward_kinematics
 from edgepose_export.splits import part_of
@@ -61,7 +60,7 @@ def read_take(path: Path) -> Take:
             rate, license_note = float(data["mocap_framerate"]), str(data["license"])
         if not len(poses) == len(quats) == len(force):
             raise ValueError("sensors and poses differ in length")
-    except (OSError, EOFError, ValueError, TypeError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, *BROKEN) as error:
         raise EdgeposeError(
             f"{path}: not a recording with true poses ({error}); make it with edgepose synthesize"
         ) from error

@@ -476,8 +476,6 @@ class Trainer:
         self.network.load_state_dict(state["averaged"])
         self.averaged.load_state_dict(state["averaged"])
         before = state["data"]
-        if before == self.data:
-            return  # The same takes again are not more motion.
         self.data = {
             "summary": f"{before['summary']}, then {self.data['summary']}",
             "licenses": sorted({*before["licenses"], *self.data["licenses"]}),

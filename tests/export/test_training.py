@@ -355,9 +355,6 @@ def test_fine_tuning_starts_from_the_average(takes, tmp_path):
     assert tuned.data["licenses"] == ["free", "mine"]
     assert (tuned.data["takes"], tuned.data["hours"]) == (4, 0.501)
     assert np.isfinite(tuned.train_step())
-    again = Trainer(SMALL, tape(takes), tape(takes[-1:]), dict(state["data"]))
-    again.start_from(state)
-    assert again.data == state["data"]
     other = trainer(takes, replace(SMALL, network=SMALL.network._replace(kind="birnn")))
     for start in (other.start_from, other.load):
         with pytest.raises(EdgeposeError, match="the checkpoint holds"):

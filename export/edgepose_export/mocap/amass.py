@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
+from edgepose.npz import BROKEN
 from edgepose.rotations import about_axis, rotvec_to_matrix
 from edgepose.skeleton import PARENTS
 
@@ -74,14 +74,7 @@ def _load(path: Path) -> dict[str, Array]:
             return {key: np.asarray(archive[key], float) for key in wanted if key in archive.files}
     except OSError as error:
         raise EdgeposeError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except (
-        ValueError,
-        TypeError,
-        EOFError,
-        zipfile.BadZipFile,
-        zipfile.LargeZipFile,
-        NotImplementedError,
-    ) as error:
+    except BROKEN as error:
         raise EdgeposeError(
             f"{path}: not a readable npz archive of numbers ({error})".replace("\n", " ")
         ) from None
