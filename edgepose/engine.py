@@ -6,7 +6,8 @@ at `finish`, with the future that there is.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -36,6 +37,14 @@ class EngineOutput(NamedTuple):
     rotations: Array
     std: Array
     filling: bool
+
+
+class Body(NamedTuple):
+    """What goes into an engine: the arguments of `Engine.push`."""
+
+    tag: Any
+    orientation: Input
+    acceleration: Input
 
 
 class Engine(Protocol):
@@ -94,6 +103,23 @@ class WindowEngine:
         return EngineOutput(self._tags.popleft(), rotations[0].numpy(), std[0].numpy(), index < self._past)
 
 
+class _Row:
+    """The stream of one wearer: its state, and what waits for a pose."""
+
+    def __init__(self, state: list[torch.Tensor]) -> None:
+        self.state = state
+        self.tags: deque[Any] = deque()
+        self.done = 0
+
+    def outputs(self, rotations: Array, std: Array, past: int) -> list[EngineOutput]:
+        """The next poses of this wearer, (T, 24, 3, 3) and (T, 24)."""
+        outputs = []
+        for pose, deviation in zip(rotations, std, strict=True):
+            outputs.append(EngineOutput(self.tags.popleft(), pose, deviation, self.done < past))
+            self.done += 1
+        return outputs
+
+
 class StreamEngine:
     """Each frame once, with carried state; `future` is 0 for a unidirectional network."""
 
@@ -107,20 +133,18 @@ class StreamEngine:
             together: frames that are gathered and run at once, where nobody waits for poses.
         """
         self._module, self._past, self._together = module, past, together
-        self._tags: deque[Any] = deque()
         self._frames: list[tuple[torch.Tensor, torch.Tensor]] = []
-        self._done = 0
         with torch.inference_mode():
-            self._state = module.start(1, future)
+            self._row = _Row(module.start(1, future))
             still = (torch.eye(3).expand(6, 3, 3), torch.zeros(6, 3))
             for _ in range(WARM_UP + future):
                 self._frames = [still] * together
                 self._run()
-            self._state = module.start(1, future)
+            self._row = _Row(module.start(1, future))
 
     def push(self, tag: Any, orientation: Input, acceleration: Input) -> list[EngineOutput]:
         """See `Engine.push`; with several frames together, the poses of all of them at once."""
-        self._tags.append(tag)
+        self._row.tags.append(tag)
         self._frames.append((_tensor(orientation), _tensor(acceleration)))
         if len(self._frames) < self._together:
             return []
@@ -131,26 +155,102 @@ class StreamEngine:
         """See `Engine.finish`."""
         with torch.inference_mode():
             outputs = self._outputs(*self._run()) if self._frames else []
-            return outputs + self._outputs(*self._module.drain(self._state))
+            return outputs + self._outputs(*self._module.drain(self._row.state))
 
     def _run(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Poses that are due after the gathered frames."""
         frames, self._frames = self._frames, []
         if len(frames) == 1:
             orientation, acceleration = frames[0]
-            rotations, std, self._state = self._module.stream(
-                orientation[None], acceleration[None], self._state
+            rotations, std, self._row.state = self._module.stream(
+                orientation[None], acceleration[None], self._row.state
             )
         else:
             orientations, accelerations = (torch.stack(column)[None] for column in zip(*frames, strict=True))
-            rotations, std, self._state = self._module.stream_many(orientations, accelerations, self._state)
+            rotations, std, self._row.state = self._module.stream_many(
+                orientations, accelerations, self._row.state
+            )
         return rotations, std
 
     def _outputs(self, rotations: torch.Tensor, std: torch.Tensor) -> list[EngineOutput]:
-        outputs = []
-        for pose, deviation in zip(rotations[0].numpy(), std[0].numpy(), strict=True):
-            outputs.append(EngineOutput(self._tags.popleft(), pose, deviation, self._done < self._past))
-            self._done += 1
+        return self._row.outputs(rotations[0].numpy(), std[0].numpy(), self._past)
+
+
+class BatchEngine:
+    """`StreamEngine` for any number of wearers: those that have a frame take their step together.
+
+    Each wearer has a state of its own and gets the poses that it would get alone, whenever the others begin,
+    pause or end. A step is one pass of the network for all whose states have one shape; only those of which
+    too few frames have come for their first pose have another.
+    """
+
+    def __init__(
+        self, module: torch.jit.ScriptModule, past: int, future: int, wearers: int, apart: bool = False
+    ) -> None:
+        """Warms the module up.
+
+        Args:
+            module: an archive.
+            past: as many first poses of each wearer are marked as filling.
+            future: frames that a pose waits for.
+            wearers: how many there are; they are called 0, 1, 2 and so on.
+            apart: one pass for each wearer, where a pose would depend on who else is computed with it.
+        """
+        self._module, self._past, self._apart = module, past, apart
+        with torch.inference_mode():
+            # Which tensors of a state have a row for each wearer; the others are the same for all.
+            self._has_rows = [
+                one.shape != two.shape
+                for one, two in zip(module.start(1, future), module.start(2, future), strict=True)
+            ]
+            still = Body(None, np.tile(np.eye(3), (6, 1, 1)), np.zeros((6, 3)))
+            for count in {1, wearers}:
+                self._rows = [_Row(module.start(1, future)) for _ in range(count)]
+                for _ in range(WARM_UP + future):
+                    self.push(dict.fromkeys(range(count), still))
+            self._rows = [_Row(module.start(1, future)) for _ in range(wearers)]
+
+    def push(self, bodies: Mapping[int, Body]) -> dict[int, list[EngineOutput]]:
+        """Takes the next frame of some wearers and gives the poses that are due, by wearer."""
+        groups: defaultdict[Any, list[int]] = defaultdict(list)
+        for wearer, body in bodies.items():
+            row = self._rows[wearer]
+            row.tags.append(body.tag)
+            shapes = tuple(tensor.shape for tensor in row.state)
+            groups[(wearer, *shapes) if self._apart else shapes].append(wearer)
+        outputs = {}
+        with torch.inference_mode():
+            for wearers in groups.values():
+                outputs.update(self._step(wearers, bodies))
+        return outputs
+
+    def finish(self, wearer: int) -> list[EngineOutput]:
+        """Gives the poses of a wearer's frames that still wait for their future."""
+        row = self._rows[wearer]
+        with torch.inference_mode():
+            rotations, std = self._module.drain(row.state)
+        return row.outputs(rotations[0].numpy(), std[0].numpy(), self._past)
+
+    def _step(self, wearers: list[int], bodies: Mapping[int, Body]) -> dict[int, list[EngineOutput]]:
+        """Poses after one pass for wearers whose states have one shape."""
+        rows = [self._rows[wearer] for wearer in wearers]
+        orientation = _tensor(np.array([bodies[wearer].orientation for wearer in wearers]))
+        acceleration = _tensor(np.array([bodies[wearer].acceleration for wearer in wearers]))
+        state = [
+            torch.cat(column) if has_rows else column[0]
+            for column, has_rows in zip(
+                zip(*(row.state for row in rows), strict=True), self._has_rows, strict=True
+            )
+        ]
+        rotations, std, state = self._module.stream(orientation, acceleration, state)
+        columns = [
+            tensor.split(1) if has_rows else [tensor] * len(rows)
+            for tensor, has_rows in zip(state, self._has_rows, strict=True)
+        ]
+        poses, deviations, outputs = rotations.numpy(), std.numpy(), {}
+        for i, (wearer, row) in enumerate(zip(wearers, rows, strict=True)):
+            row.state = [column[i] for column in columns]
+            outputs[wearer] = row.outputs(poses[i], deviations[i], self._past)
         return outputs
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from edgepose.engine import EngineOutput, StreamEngine, WindowEngine
+from edgepose.engine import BatchEngine, Body, EngineOutput, StreamEngine, WindowEngine
 from edgepose_export.networks import NetworkShape
 
 BIRNN = NetworkShape("birnn", 8, "global-6d", "passed")
@@ -121,3 +121,72 @@ def test_frames_together_of_a_field(tiny, wearers):
     one, several = (run(StreamEngine(module, 0, 5, n), orientation, acceleration)[0] for n in (1, 4))
     for a, b in zip(one, several, strict=True):
         np.testing.assert_allclose(a.rotations, b.rotations, atol=2e-5)
+
+
+def together(engine, spans, orientation, acceleration):
+    """Outputs of wearers whose frames go in together; each has spans of steps in which it takes part."""
+    outputs = [[] for _ in spans]
+    seen = [0] * len(spans)
+    for step in range(max(stop for own in spans for _, stop in own)):
+        bodies = {}
+        for wearer, own in enumerate(spans):
+            if any(start <= step < stop for start, stop in own):
+                t = seen[wearer]
+                bodies[wearer] = Body(t, orientation[wearer, t].numpy(), acceleration[wearer, t].numpy())
+                seen[wearer] += 1
+        for wearer, due in engine.push(bodies).items():
+            outputs[wearer] += due
+    return [own + engine.finish(wearer) for wearer, own in enumerate(outputs)], seen
+
+
+@pytest.mark.parametrize("apart", [False, True])
+@pytest.mark.parametrize(
+    "shape",
+    [
+        BIRNN,
+        RNN,
+        BIRNN._replace(normalisation="sequence"),
+        NetworkShape("feed-forward", 8, "global-6d", "passed"),
+    ],
+    ids=str,
+)
+def test_wearers_together_get_the_poses_that_each_gets_alone(tiny, wearers, shape, apart):
+    """One from the start, one late, one that pauses, one that ends early, and one of a single frame."""
+    spans = [[(0, 14)], [(5, 12)], [(0, 4), (9, 13)], [(0, 2)], [(3, 4)]]
+    orientation, acceleration = wearers(len(spans), 14)
+    future = 0 if shape.kind == "rnn" else 3
+    module = tiny(shape)
+    engine = BatchEngine(module, 4, future, len(spans), apart)
+    outputs, seen = together(engine, spans, orientation, acceleration)
+    assert seen == [14, 7, 8, 2, 1]
+    for wearer, own in enumerate(outputs):
+        frames = slice(0, seen[wearer])
+        alone, _, _ = run(
+            StreamEngine(module, 4, future), orientation[wearer, frames], acceleration[wearer, frames]
+        )
+        assert [output.tag for output in own] == list(range(seen[wearer]))
+        assert [output.filling for output in own] == [output.filling for output in alone]
+        for a, b in zip(own, alone, strict=True):
+            np.testing.assert_allclose(a.rotations, b.rotations, atol=1e-5)
+            np.testing.assert_allclose(a.std, b.std, atol=1e-5)
+
+
+def test_a_step_is_one_pass_of_the_network_for_all(tiny, wearers):
+    """Wearers who begin later have passes of their own only until as many of their frames wait."""
+
+    class Counting:
+        def __init__(self, module):
+            self.module, self.rows = module, []
+
+        def stream(self, orientation, acceleration, state):
+            self.rows.append(len(orientation))
+            return self.module.stream(orientation, acceleration, state)
+
+        def __getattr__(self, name):
+            return getattr(self.module, name)
+
+    module = Counting(tiny(BIRNN))
+    engine = BatchEngine(module, 0, 2, 3)
+    module.rows.clear()
+    together(engine, [[(0, 6)], [(1, 6)], [(1, 6)]], *wearers(3, 6))
+    assert module.rows == [1, 1, 2, 1, 2, 3, 3, 3]
