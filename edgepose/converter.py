@@ -16,6 +16,7 @@ from edgepose import mtmanager, xio
 from edgepose.appending import replace_file
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
+from edgepose.mvnx import read_mvnx
 from edgepose.placements import PLACEMENTS
 from edgepose.pose_converter import convert_poses
 from edgepose.poses import is_poses
@@ -32,7 +33,10 @@ from edgepose.sources.files import CAN_LOGS, CAPTURES, is_recording
 WRITERS: dict[str, Callable[[Path, Recording], None]] = {"csv": write_csv, "npz": write_npz}
 """What is written, by ending."""
 
-ENDINGS = (".csv", ".npz", *CAPTURES, *CAN_LOGS)
+READERS: dict[str, Callable[[Path], Recording]] = {".mvnx": read_mvnx}
+"""Readers of other programs' files, by ending."""
+
+ENDINGS = (".csv", ".npz", *CAPTURES, *CAN_LOGS, *READERS)
 """Endings of the files that are looked for in a folder."""
 
 
@@ -188,6 +192,8 @@ def _read(path: Path, protocol: str, sensors: Path | None) -> Recording:
         return read(path, _serial_numbers(sensors))
     if is_recording(path):
         return salvage_recording(path)
+    if path.suffix.lower() in READERS:
+        return READERS[path.suffix.lower()](path)
     problems: list[str] = []
     rows = list(_samples(path, protocol, sensors, problems))
     recording = from_samples(rows, {"source": path.name}, name=str(path), salvage=True)
