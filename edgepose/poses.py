@@ -17,12 +17,13 @@ from typing import Any, NamedTuple, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
+from edgepose.bvh import tidy_rate
 from edgepose.errors import EdgeposeError
 from edgepose.npz import BROKEN
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import FILLING_WINDOW, PoseFrame, status_text
 from edgepose.rotations import (
-    about_axis,
+    Z_UP_TO_T,
     euler_to_matrix,
     nearest_rotation,
     quat_to_matrix,
@@ -44,9 +45,6 @@ MAX_BYTES = 2 << 30
 
 LARGEST = 1e6
 """Angles in radians and metres beyond this are taken for damage."""
-
-Z_UP_TO_T = about_axis("x", -np.pi / 2)
-"""Turns the world of AMASS, Z up, into the body frame T, Y up."""
 
 
 class Poses(NamedTuple):
@@ -81,13 +79,6 @@ class Poses(NamedTuple):
         for i, (frame, time_s) in enumerate(zip(self.frames.tolist(), self.time_s.tolist(), strict=True)):
             where = None if self.translation is None else self.translation[i]
             yield PoseFrame(frame, time_s, self.status[i], self.rotations[i], unknown, where)
-
-
-def tidy_rate(frame_time: float) -> float:
-    """Frames per second of a frame time in seconds that was printed with few digits: .0083333 is 120 Hz."""
-    rate = 1.0 / frame_time
-    whole = round(rate)
-    return float(whole) if abs(rate - whole) < 1e-4 * rate else rate
 
 
 def read_poses(path: str | Path) -> Poses:

@@ -174,6 +174,10 @@ def about_axis(axis: str, angle: ArrayLike) -> Array:
     return rotvec_to_matrix(np.asarray(angle, float)[..., None] * direction)
 
 
+Z_UP_TO_T = about_axis("x", -np.pi / 2)
+"""Turns a world with Z up, such as that of AMASS, into the body frame T, Y up."""
+
+
 def euler_to_matrix(angles: ArrayLike, order: str) -> Array:
     """Rotation matrices (..., 3, 3) of angles (..., len(order)) multiplied in the written order: "zyx" is Rz
     Ry Rx.

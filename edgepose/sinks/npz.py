@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from edgepose.appending import replace_file
 from edgepose.errors import EdgeposeError
 from edgepose.pose import FILLING_WINDOW, PoseFrame, held_sensors, status_bits
-from edgepose.poses import Z_UP_TO_T, Poses, read_blocks
-from edgepose.rotations import matrix_to_rotvec
+from edgepose.poses import Poses, read_blocks
+from edgepose.rotations import Z_UP_TO_T, matrix_to_rotvec
 from edgepose.sinks import Sink
 from edgepose.sinks.csv_file import CsvSink
 

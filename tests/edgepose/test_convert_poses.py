@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from edgepose.bvh import read_bvh
+from edgepose.joint_tree import forward
 from edgepose.pose import PoseFrame
 from edgepose.poses import read_poses, salvage_poses
 from edgepose.recording import read_recording
 from edgepose.sinks.csv_file import CsvSink
 from edgepose.sinks.npz import NpzSink
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics
-from edgepose_export.mocap import bvh, recording
 
 REAL = Path(__file__).parents[1] / "data" / "imu" / "six-sites-3s.npz"
 
@@ -45,10 +46,10 @@ def check(path: Path, count: int, where: bool = False) -> None:
     """The file holds `poses`; BVH is read by the reader of motion capture."""
     wanted = poses(count, where)
     if path.suffix == ".bvh":
-        read = bvh.read_bvh(path)
+        read = read_bvh(path)
         assert read.rate == 60.0
         order = [read.names.index(name) for name in JOINTS]
-        places = recording.forward(read)[1][:, order] / 100.0
+        places = forward(read)[1][:, order] / 100.0
         offsets = default_body().offsets
         true = forward_kinematics(np.stack([pose.rotations for pose in wanted]), offsets)[1]
         np.testing.assert_allclose(places - places[:, :1], true - true[:, :1], atol=1e-4)

@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from edgepose.bvh import read_bvh
 from edgepose.errors import EdgeposeError
+from edgepose.joint_tree import forward
 from edgepose.pose import PoseFrame
 from edgepose.poses import BLOCK, Poses, is_poses, read_blocks, read_poses, salvage_poses
 from edgepose.recording import read_recording, write_csv
@@ -22,7 +24,7 @@ from edgepose.sinks.bvh import BvhSink, depth_first
 from edgepose.sinks.csv_file import CsvSink
 from edgepose.sinks.npz import NpzSink
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics
-from edgepose_export.mocap import bvh, read_motion, recording
+from edgepose_export.mocap import read_motion
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", PendingDeprecationWarning)  # of PyGLM's old name, which it imports
@@ -255,10 +257,10 @@ def test_bvh_by_an_independent_reader(tmp_path):
 def test_bvh_by_the_reader_of_motion_capture(tmp_path):
     poses = motion(700)  # more than one block
     written(BvhSink(tmp_path / "a.bvh"), poses)
-    read = bvh.read_bvh(tmp_path / "a.bvh")
+    read = read_bvh(tmp_path / "a.bvh")
     assert read.rate == 60.0
     order = [read.names.index(name) for name in JOINTS]
-    places = recording.forward(read)[1][:, order] / 100.0
+    places = forward(read)[1][:, order] / 100.0
     assert np.abs(places - joints(poses, default_body().offsets)).max() < 1e-4
 
 
@@ -275,7 +277,7 @@ def test_bvh_angles_do_not_leap(tmp_path):
 def test_bvh_without_translation_stands_on_the_ground(tmp_path):
     straight = PoseFrame(0, 0.0, "ok", np.tile(np.eye(3, dtype=np.float32), (24, 1, 1)), np.zeros(24))
     written(BvhSink(tmp_path / "a.bvh"), [straight])
-    places = recording.forward(bvh.read_bvh(tmp_path / "a.bvh"))[1][0] / 100.0
+    places = forward(read_bvh(tmp_path / "a.bvh"))[1][0] / 100.0
     assert places[:, 1].min() == pytest.approx(0.0, abs=1e-4)
     assert 0.8 < places[0, 1] < 1.1
 
@@ -314,7 +316,7 @@ def test_an_interrupted_run_leaves_a_whole_file(tmp_path, name):
     if name == "a.npz":
         assert len(read_poses(tmp_path / name).frames) == 250
     else:
-        assert len(bvh.read_bvh(tmp_path / name).rotations) == 250
+        assert len(read_bvh(tmp_path / name).rotations) == 250
 
 
 @pytest.mark.parametrize("name", ["a.npz", "a.bvh"])
@@ -334,7 +336,7 @@ def test_a_killed_run_leaves_what_was_on_the_disk(tmp_path, name):
     if name == "a.npz":
         poses = len(read_poses(tmp_path / "a.part.csv").frames)
     else:
-        poses = len(bvh.read_bvh(tmp_path / name).rotations)
+        poses = len(read_bvh(tmp_path / name).rotations)
     assert 0 < poses <= 100
 
 
@@ -352,11 +354,9 @@ def test_a_disk_that_fills_up(tmp_path, name):
     said, _ = run_python(code, str(tmp_path / name)).communicate(timeout=120)
     assert re.match(r"cannot write poses to .*: File too large\n", said)
     assert [path.name for path in tmp_path.iterdir()] == [name]
-    if name == "a.npz":  # smaller than its CSV file, so that all poses of that fit
-        frames = read_poses(tmp_path / name).frames
-    else:
-        frames = bvh.read_bvh(tmp_path / name).rotations
-    assert 20 < len(frames) < 200
+    # An NPZ file is smaller than its CSV file, so that all poses of that fit.
+    read = read_poses if name == "a.npz" else read_bvh
+    assert 20 < len(read(tmp_path / name).rotations) < 200
 
 
 def test_npz_that_does_not_fit(tmp_path):

@@ -15,9 +15,11 @@ import numpy as np
 import pytest
 from pythonosc.osc_bundle import OscBundle
 
+from edgepose.bvh import read_bvh
+from edgepose.joint_tree import forward
 from edgepose.poses import read_poses
 from edgepose.skeleton import default_body, forward_kinematics
-from edgepose_export.mocap import bvh, read_motion, recording
+from edgepose_export.mocap import read_motion
 
 
 class Mailbox(threading.Thread):
@@ -68,12 +70,12 @@ def test_all_outputs_say_the_same(command, wearer, tmp_path):
     np.testing.assert_allclose(again.time_s, poses.time_s, atol=1e-9)
     np.testing.assert_allclose(again.rotations, poses.rotations, atol=2e-6)
     assert read_motion(tmp_path / "a.npz").rate == 60.0
-    read = bvh.read_bvh(tmp_path / "a.bvh")
+    read = read_bvh(tmp_path / "a.bvh")
     assert (len(read.rotations), read.rate) == (180, 60.0)
     offsets = default_body(1.9).offsets
     wanted = forward_kinematics(poses.rotations, offsets)[1]
     order = [read.names.index(name) for name in ("pelvis", "head", "left_hand", "right_foot")]
-    places = recording.forward(read)[1][:, order] / 100.0
+    places = forward(read)[1][:, order] / 100.0
     true = wanted[:, [0, 15, 22, 11]]
     np.testing.assert_allclose(places - places[:, :1], true - true[:, :1], atol=1e-4)
     assert len(datagrams) == 2 * 180
@@ -107,7 +109,7 @@ def test_an_interrupted_run_leaves_whole_files(wearer, tmp_path, number):
     assert count >= 30
     assert f"poses    {count} " in errors
     assert len(read_poses(tmp_path / "a.npz").frames) == count
-    assert len(bvh.read_bvh(tmp_path / "a.bvh").rotations) == count
+    assert len(read_bvh(tmp_path / "a.bvh").rotations) == count
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.bvh", "a.csv", "a.npz"]
 
 

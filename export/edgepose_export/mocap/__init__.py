@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from edgepose.bvh import read_bvh
 from edgepose.errors import EdgeposeError
 
 from .amass import read_amass
 from .amc import read_amc
-from .bvh import read_bvh
 from .motion import Motion, pieces, resample
 from .transfer import BANDAI, CMU_AMC, CMU_BVH, from_bandai, from_cmu_amc, from_cmu_bvh, has_names
 

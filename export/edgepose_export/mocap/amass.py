@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
+from edgepose.joint_tree import LARGEST
 from edgepose.npz import BROKEN
-from edgepose.rotations import about_axis, rotvec_to_matrix
+from edgepose.rotations import Z_UP_TO_T, rotvec_to_matrix
 from edgepose.skeleton import PARENTS
 
 from .motion import Motion
-from .recording import LARGEST
 
 Array = NDArray[np.float64]
 
@@ -57,11 +57,10 @@ def read_amass(path: str | Path) -> Motion:
     joints = 24 if poses.shape[1] == 72 else BODY_JOINTS
     local[:, :joints] = rotvec_to_matrix(poses[:, : 3 * joints].reshape(len(poses), joints, 3))
     rotations = np.empty_like(local)
-    upright = about_axis("x", -np.pi / 2)  # their Z, up, becomes our Y
-    rotations[:, 0] = upright @ local[:, 0]
+    rotations[:, 0] = Z_UP_TO_T @ local[:, 0]
     for joint, parent in enumerate(PARENTS[1:], start=1):
         rotations[:, joint] = rotations[:, parent] @ local[:, joint]
-    return Motion(rotations, trans @ upright.T, rate, "amass")
+    return Motion(rotations, trans @ Z_UP_TO_T.T, rate, "amass")
 
 
 def _load(path: Path) -> dict[str, Array]:

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
+from edgepose.joint_tree import JointTree, fail, numbers
 from edgepose.rotations import euler_to_matrix, transpose
-
-from .recording import Recording, fail, numbers
 
 Array = NDArray[np.float64]
 
@@ -62,7 +61,7 @@ def find_asf(path: str | Path) -> Path:
     raise EdgeposeError(f"{path}: needs its skeleton, {path.stem.split('_')[0]}.asf, in the same folder")
 
 
-def read_amc(path: str | Path, skeleton: str | Path | None = None, rate: float = AMC_RATE) -> Recording:
+def read_amc(path: str | Path, skeleton: str | Path | None = None, rate: float = AMC_RATE) -> JointTree:
     """All frames of an AMC file, lengths in metres.
 
     Args:
@@ -122,7 +121,7 @@ def read_amc(path: str | Path, skeleton: str | Path | None = None, rate: float =
         for i, freedom in enumerate(freedoms):
             if freedom[0] == "t":
                 positions[:, joint, "xyz".index(freedom[1])] += table[:, i] * body.metre
-    return Recording(body.names, body.parents, body.offsets, rotations, positions, rate)
+    return JointTree(body.names, body.parents, body.offsets, rotations, positions, rate)
 
 
 def read_asf(path: str | Path) -> Skeleton:

@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
+from edgepose.joint_tree import JointTree, forward
 from edgepose.rotations import about_axis, matrix_to_quat, minimal_rotation, quat_to_matrix, transpose
 
 from .motion import Motion
-from .recording import Recording, forward
 
 Array = NDArray[np.float64]
 
@@ -104,7 +104,7 @@ _CMU_T_POSE = {
 }
 
 
-def from_cmu_bvh(recording: Recording, path: object) -> Motion:
+def from_cmu_bvh(recording: JointTree, path: object) -> Motion:
     """Motion of a CMU file in cgspeed's conversion: frame 0 is the T-pose, the motion starts after it.
 
     Two takes (07_12, 09_10) go on with frames that are zero throughout before the motion starts; they are
@@ -131,7 +131,7 @@ def from_cmu_bvh(recording: Recording, path: object) -> Motion:
     )
 
 
-def from_cmu_amc(recording: Recording, path: object) -> Motion:
+def from_cmu_amc(recording: JointTree, path: object) -> Motion:
     """Motion of a CMU file in ASF/AMC; it agrees with `from_cmu_bvh` of the same take.
 
     Raises:
@@ -164,7 +164,7 @@ _BANDAI_FOOT = 39.0  # pitch of the line from ankle to toe joint on a flat sole
 _BANDAI_TOES = 23.0
 
 
-def from_bandai(recording: Recording, path: object, collars_back: bool = True) -> Motion:
+def from_bandai(recording: JointTree, path: object, collars_back: bool = True) -> Motion:
     """Motion of a Bandai-Namco file, whose zero pose is no T-pose: G0 comes from what its bone axes mean.
 
     Args:
@@ -251,7 +251,7 @@ def to_smpl(rotations: Array, t_pose: Array, ends: dict[int, Array]) -> Array:
     return result
 
 
-def has_names(names: Names, recording: Recording) -> bool:
+def has_names(names: Names, recording: JointTree) -> bool:
     """Whether a recording has the joints of a source."""
     return {*names.joints, *(end for bone in names.bones.values() for end in bone)} <= set(recording.names)
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from edgepose import rotations as rot
 from edgepose.errors import EdgeposeError
-from edgepose_export.mocap.recording import fail, numbers
+from edgepose.joint_tree import fail, numbers
 from edgepose_export.mocap.transfer import near_rest, to_smpl
 
 Array = NDArray[np.float64]

@@ -17,7 +17,7 @@ LARGEST = 1e6
 """Numbers of a file beyond this are taken for damage: no angle and no length in any unit comes near."""
 
 
-class Recording(NamedTuple):
+class JointTree(NamedTuple):
     """Poses of one skeleton over time. Lengths are in the unit of the file that was read (see the reader)."""
 
     names: tuple[str, ...]
@@ -34,17 +34,17 @@ class Recording(NamedTuple):
     """Frames per second."""
 
 
-def forward(recording: Recording) -> tuple[Array, Array]:
+def forward(tree: JointTree) -> tuple[Array, Array]:
     """Global joint rotations (T, J, 3, 3) and positions (T, J, 3) in the file's world and unit."""
-    rotations = np.empty_like(recording.rotations)
-    positions = np.empty_like(recording.positions)
-    for j, parent in enumerate(recording.parents):
+    rotations = np.empty_like(tree.rotations)
+    positions = np.empty_like(tree.positions)
+    for j, parent in enumerate(tree.parents):
         if parent < 0:
-            rotations[:, j] = recording.rotations[:, j]
-            positions[:, j] = recording.positions[:, j]
+            rotations[:, j] = tree.rotations[:, j]
+            positions[:, j] = tree.positions[:, j]
         else:
-            rotations[:, j] = rotations[:, parent] @ recording.rotations[:, j]
-            moved = rotations[:, parent] @ recording.positions[:, j, :, None]
+            rotations[:, j] = rotations[:, parent] @ tree.rotations[:, j]
+            moved = rotations[:, parent] @ tree.positions[:, j, :, None]
             positions[:, j] = positions[:, parent] + moved[..., 0]
     return rotations, positions
 

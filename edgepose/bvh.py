@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from array import array
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import NoReturn
 
@@ -9,10 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
-from edgepose.poses import tidy_rate
+from edgepose.joint_tree import JointTree, fail, numbers
 from edgepose.rotations import euler_to_matrix
-
-from .recording import LARGEST, Recording, fail, numbers
 
 Array = NDArray[np.float64]
 
@@ -20,8 +21,17 @@ _CHANNELS = {
     f"{axis}{kind}": (kind, "xyz".index(axis.lower())) for axis in "XYZ" for kind in ("position", "rotation")
 }
 
+_LONGEST_LINE = 1 << 20  # characters; that of a frame of 1000 joints has less than 50,000
 
-def read_bvh(path: str | Path) -> Recording:
+
+def tidy_rate(frame_time: float) -> float:
+    """Frames per second of a frame time in seconds that was printed with few digits: .0083333 is 120 Hz."""
+    rate = 1.0 / frame_time
+    whole = round(rate)
+    return float(whole) if abs(rate - whole) < 1e-4 * rate else rate
+
+
+def read_bvh(path: str | Path) -> JointTree:
     """All frames of a BVH file, lengths in the file's own unit (the format names none).
 
     Rotation channels are multiplied in the order in which they are listed. Position channels of a joint
@@ -33,14 +43,14 @@ def read_bvh(path: str | Path) -> Recording:
     """
     path = Path(path)
     try:
-        lines = path.read_bytes().decode("utf-8-sig").splitlines()
+        with path.open(encoding="utf-8-sig") as file:
+            lines = enumerate(iter(partial(file.readline, _LONGEST_LINE), ""))
+            names, parents, offsets, channels = _hierarchy(path, lines)
+            frame_time, table = _motion(path, lines, sum(map(len, channels)))
     except OSError as error:
         raise EdgeposeError(f"{path}: cannot be read: {error.strerror or error}") from None
     except UnicodeDecodeError:
         raise EdgeposeError(f"{path}: not a text file, so not BVH") from None
-    names, parents, offsets, channels, start = _hierarchy(path, lines)
-    frame_time, table = _motion(path, lines, start, sum(map(len, channels)))
-
     rotations = np.broadcast_to(np.eye(3), (len(table), len(names), 3, 3)).copy()
     positions = np.broadcast_to(offsets, (len(table), len(names), 3)).copy()
     column = 0
@@ -59,7 +69,7 @@ def read_bvh(path: str | Path) -> Recording:
     for order, (joints, columns) in turning.items():
         angles = np.radians(table[:, columns]).reshape(len(table), len(joints), len(order))
         rotations[:, joints] = euler_to_matrix(angles, order)
-    return Recording(tuple(names), tuple(parents), offsets, rotations, positions, tidy_rate(frame_time))
+    return JointTree(tuple(names), tuple(parents), offsets, rotations, positions, tidy_rate(frame_time))
 
 
 def _fail(path: Path, line: int, problem: str) -> NoReturn:
@@ -68,9 +78,9 @@ def _fail(path: Path, line: int, problem: str) -> NoReturn:
 
 
 def _hierarchy(
-    path: Path, lines: list[str]
-) -> tuple[list[str], list[int], Array, list[list[tuple[str, int]]], int]:
-    """Names, parents, offsets (J, 3), channels (kind, axis) of each joint, index of the line after MOTION."""
+    path: Path, lines: Iterator[tuple[int, str]]
+) -> tuple[list[str], list[int], Array, list[list[tuple[str, int]]]]:
+    """Names, parents, offsets (J, 3), channels (kind, axis) of each joint, from the lines up to MOTION."""
     names: list[str] = []
     parents: list[int] = []
     offsets: list[list[float] | None] = []
@@ -78,7 +88,7 @@ def _hierarchy(
     open_joints: list[int] = []  # -1 stands for an end site, which holds an offset that nothing here needs
     pending: int | None = None  # a joint that is named and not opened by its brace yet
     seen_header = False
-    for number, line in enumerate(lines):
+    for number, line in lines:
         words = line.split()
         if not words:
             continue
@@ -140,7 +150,7 @@ def _hierarchy(
             if open_joints or not names:
                 _fail(path, number, "MOTION before the hierarchy is closed")
             table = np.array([offset for offset in offsets if offset is not None])
-            return names, parents, table, [kinds for kinds in channels if kinds is not None], number + 1
+            return names, parents, table, [kinds for kinds in channels if kinds is not None]
         else:
             _fail(path, number, f"{key!r} is not expected here")
     raise EdgeposeError(
@@ -148,12 +158,13 @@ def _hierarchy(
     )
 
 
-def _motion(path: Path, lines: list[str], start: int, width: int) -> tuple[float, Array]:
+def _motion(path: Path, lines: Iterator[tuple[int, str]], width: int) -> tuple[float, Array]:
     """Frame time in seconds and the table (T, width) of channel values as printed."""
-    body = [(number, words) for number in range(start, len(lines)) if (words := lines[number].split())]
-    if len(body) < 2:
+    filled = ((number, words) for number, line in lines if (words := line.split()))
+    at_count, count = next(filled, (0, []))
+    at_time, time = next(filled, (0, []))
+    if not time:
         raise EdgeposeError(f"{path}: ends before the first frame")
-    (at_count, count), (at_time, time) = body[:2]
     if len(count) != 2 or count[0] != "Frames:" or not count[1].isdecimal() or len(count[1]) > 15:
         _fail(path, at_count, "'Frames: <count>' was expected")
     if time[:2] != ["Frame", "Time:"]:
@@ -161,19 +172,12 @@ def _motion(path: Path, lines: list[str], start: int, width: int) -> tuple[float
     frame_time = numbers(path, at_time + 1, time[2:], 1)[0]
     if not 1e-5 < frame_time < 1e2:
         _fail(path, at_time, f"a frame time of {frame_time:g} s is not possible")
-    frames = body[2:]
-    for number, words in frames:
+    values, frames = array("d"), 0
+    for number, words in filled:
         if len(words) != width:
             _fail(path, number, f"a frame needs {width} numbers, this line has {len(words)}")
-    if len(frames) != int(count[1]) or not frames:
-        raise EdgeposeError(f"{path}: {count[1]} frames are announced, {len(frames)} are there (cut short?)")
-    try:
-        table = np.array([words for _, words in frames], dtype=float)
-    except ValueError:
-        for number, words in frames:
-            numbers(path, number + 1, words, width)
-        raise
-    bad = np.flatnonzero(~(np.abs(table) < LARGEST).all(axis=1))
-    if len(bad):
-        _fail(path, frames[bad[0]][0], "a number is not finite, or far too large")
-    return frame_time, table
+        values.extend(numbers(path, number + 1, words, width))
+        frames += 1
+    if frames != int(count[1]) or not frames:
+        raise EdgeposeError(f"{path}: {count[1]} frames are announced, {frames} are there (cut short?)")
+    return frame_time, np.frombuffer(values).reshape(frames, width)
