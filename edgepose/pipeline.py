@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from edgepose.calibration import apply
-from edgepose.engine import Engine, EngineOutput
+from edgepose.engine import Body, Engine, EngineOutput
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuFrame, ImuSample
 from edgepose.placements import PLACEMENTS
@@ -62,15 +62,98 @@ def status(frame: ImuFrame, filling: bool) -> str:
     return "; ".join(parts) or "ok"
 
 
+class Walk:
+    """One wearer's walk from samples to sinks, but for the network, which may serve several wearers.
+
+    Attributes:
+        summary: counts so far.
+        clock: makes frames.
+        arrived: when the samples taken last had arrived, on `time.perf_counter`.
+    """
+
+    def __init__(
+        self,
+        clock: FrameClock,
+        headings: Headings,
+        sinks: list[Sink],
+        orient: Callable[[list[ImuSample]], list[ImuSample]] = lambda samples: samples,
+        tell: Callable[[str], None] = lambda text: None,
+        on_pose: Callable[[RunSummary], None] = lambda summary: None,
+    ) -> None:
+        """Nothing has come.
+
+        Args:
+            clock: makes frames.
+            headings: the calibration of each frame; frames without one give no pose.
+            sinks: written in order.
+            orient: makes raw samples oriented ones.
+            tell: hears of sensors that fall silent and are back.
+            on_pose: called after each pose was written.
+        """
+        self.summary, self.clock = RunSummary(), clock
+        self.arrived = self._started = time.perf_counter()
+        self._headings, self._sinks, self._orient, self._tell = headings, sinks, orient, tell
+        self._on_pose = on_pose
+        self._silences = Silences()
+
+    def take(self, now_s: float, samples: list[ImuSample], behind_s: float) -> Iterator[Body]:
+        """Bodies of the frames that are ready after a batch that has waited for so long, seconds."""
+        self.summary.behind_s = behind_s
+        self.arrived = time.perf_counter() - behind_s
+        if samples:
+            self.clock.push(self._orient(samples), now_s)
+        return self._bodies(self.clock.frames(now_s))
+
+    def flush(self) -> Iterator[Body]:
+        """Bodies of the last frames."""
+        return self._bodies(self.clock.flush())
+
+    def write(self, outputs: list[EngineOutput], arrived: float) -> None:
+        """Writes poses whose newest packet arrived at a time on `time.perf_counter`."""
+        summary = self.summary
+        for output in outputs:
+            frame: ImuFrame = output.tag
+            pose = PoseFrame(
+                frame.index, frame.time_s, status(frame, output.filling), output.rotations, output.std
+            )
+            for sink in self._sinks:
+                sink.write(pose)
+            summary.poses += 1
+            summary.filling += output.filling
+            if frame.held.any():
+                summary.held += 1
+                for i in np.flatnonzero(frame.held):
+                    summary.held_by_sensor[i] += 1
+            summary.latencies_s.append(time.perf_counter() - arrived)
+            self._on_pose(summary)
+
+    def end(self, error: EdgeposeError | None = None) -> None:
+        """The walk is over, by an error unless there was one before."""
+        self.summary.error = self.summary.error or error
+        self.summary.seconds = time.perf_counter() - self._started
+
+    def close(self) -> None:
+        """Closes the sinks; what goes wrong then ends the walk as any error does."""
+        for sink in self._sinks:
+            try:
+                sink.close()
+            except EdgeposeError as error:
+                self.summary.error = self.summary.error or error
+
+    def _bodies(self, frames: list[ImuFrame]) -> Iterator[Body]:
+        for frame in frames:
+            for line in self._silences.of(frame):
+                self._tell(line)
+            calibration = self._headings.at(frame)
+            if calibration is not None:
+                orientation, force = apply(calibration, frame.orientation, frame.force)
+                yield Body(frame, orientation.astype(np.float32), force.astype(np.float32))
+
+
 def run(
+    walk: Walk,
     source: Iterable[tuple[float, list[ImuSample]]],
-    clock: FrameClock,
-    headings: Headings,
     engine: Engine,
-    sinks: list[Sink],
-    orient: Callable[[list[ImuSample]], list[ImuSample]] = lambda samples: samples,
-    tell: Callable[[str], None] = lambda text: None,
-    on_pose: Callable[[RunSummary], None] = lambda summary: None,
     stopped: Callable[[], bool] = lambda: False,
     behind_s: Callable[[], float] = lambda: 0.0,
 ) -> RunSummary:
@@ -80,64 +163,29 @@ def run(
     written. An error is kept in the summary for the caller to report.
 
     Args:
+        walk: of one wearer.
         source: batches (time on the source's clock, samples that came).
-        clock: makes frames.
-        headings: the calibration of each frame; frames without one give no pose.
         engine: makes poses.
-        sinks: written in order.
-        orient: makes raw samples oriented ones.
-        tell: hears of sensors that fall silent and are back.
-        on_pose: called after each pose was written.
         stopped: asked after each batch whether to end the run. An interrupt would lose the frame under way.
         behind_s: how long the newest batch had waited for this function, seconds.
     """
-    summary, silences = RunSummary(), Silences()
-    started = arrived = time.perf_counter()
 
-    def write(outputs: list[EngineOutput]) -> None:
-        for output in outputs:
-            frame: ImuFrame = output.tag
-            pose = PoseFrame(
-                frame.index, frame.time_s, status(frame, output.filling), output.rotations, output.std
-            )
-            for sink in sinks:
-                sink.write(pose)
-            summary.poses += 1
-            summary.filling += output.filling
-            if frame.held.any():
-                summary.held += 1
-                for i in np.flatnonzero(frame.held):
-                    summary.held_by_sensor[i] += 1
-            summary.latencies_s.append(time.perf_counter() - arrived)
-            on_pose(summary)
-
-    def frames() -> Iterator[ImuFrame]:
-        """All frames; an error of the source or the clock ends the samples, not the frames made of them."""
-        nonlocal arrived
+    def bodies() -> Iterator[Body]:
+        """All bodies; an error of the source or the clock ends the samples, not the frames made of them."""
         try:
             for now_s, samples in source:
-                summary.behind_s = behind_s()
-                arrived = time.perf_counter() - summary.behind_s
-                if samples:
-                    clock.push(orient(samples), now_s)
-                yield from clock.frames(now_s)
+                yield from walk.take(now_s, samples, behind_s())
                 if stopped():
                     break
         except EdgeposeError as error:
-            summary.error = error
-        yield from clock.flush()
+            walk.end(error)
+        yield from walk.flush()
 
     try:
-        for frame in frames():
-            for line in silences.of(frame):
-                tell(line)
-            calibration = headings.at(frame)
-            if calibration is None:
-                continue
-            orientation, force = apply(calibration, frame.orientation, frame.force)
-            write(engine.push(frame, orientation.astype(np.float32), force.astype(np.float32)))
-        write(engine.finish())
+        for body in bodies():
+            walk.write(engine.push(*body), walk.arrived)
+        walk.write(engine.finish(), walk.arrived)
+        walk.end()
     except EdgeposeError as error:
-        summary.error = summary.error or error
-    summary.seconds = time.perf_counter() - started
-    return summary
+        walk.end(error)
+    return walk.summary

@@ -31,7 +31,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.features import INPUTS
 from edgepose.imu import ImuFrame, ImuSample
 from edgepose.orientation import Orienter
-from edgepose.pipeline import run, status
+from edgepose.pipeline import Walk, run, status
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseFrame
 from edgepose.precision import PRECISIONS, pack
@@ -182,11 +182,9 @@ def whole_walk(engine: Engine, paced: bool) -> Latency:
         listener.bind(("127.0.0.1", 0))
         with UdpSink("127.0.0.1", listener.getsockname()[1], "binary") as sink:
             summary = run(
+                Walk(FrameClock(RATE), Headings(_calibration()), [sink]),
                 source(),
-                FrameClock(RATE),
-                Headings(_calibration()),
                 engine,
-                [sink],
                 behind_s=lambda: time.perf_counter() - arrived[0],
             )
     if summary.error:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
-from math import asin, inf, sin, sqrt
+from math import asin, ceil, inf, sin, sqrt
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -99,23 +99,29 @@ class FrameClock:
     half a second not at all. Where a sensor had nothing new for two and a half of its periods (and a frame),
     its last values are repeated and the frame says `held`.
 
+    On a grid, t0 is the next multiple of `1 / rate` after that: the clocks of several wearers tick at once.
+
     Attributes:
         dropped: samples left out because they came after their frame, or twice.
         restarts: gaps of all sensors over a minute after which the ticks began anew; frame numbers go on.
     """
 
-    def __init__(self, rate: float = 60.0, interpolation: Interpolation = "slerp") -> None:
+    def __init__(
+        self, rate: float = 60.0, interpolation: Interpolation = "slerp", grid: bool = False
+    ) -> None:
         """Start with no sample seen.
 
         Args:
             rate: frames a second.
             interpolation: orientation at a tick: "slerp" between the samples on its two sides, or "hold" the
                 last one.
+            grid: let ticks be multiples of `1 / rate` on the source's clock.
         """
         self.dropped = 0
         self.restarts = 0
         self._rate = rate
         self._slerp = interpolation == "slerp"
+        self._grid = grid
         self._sensors = [_Sensor() for _ in PLACEMENTS]
         self._index = 0
         self._t0: float | None = None
@@ -212,12 +218,15 @@ class FrameClock:
                     f"no samples of {', '.join(missing)} {span}; switch these sensors on and check their ids"
                 )
             return False
-        self._t0 = max(sensor.pending[0].time_s for sensor in self._sensors)
+        self._t0 = self._first_tick(max(sensor.pending[0].time_s for sensor in self._sensors))
         return True
+
+    def _first_tick(self, time_s: float) -> float:
+        return ceil(time_s * self._rate) / self._rate if self._grid else time_s
 
     def _restart(self) -> None:
         queue = self._after_gap
-        self._t0, self._tick, self._newest_s = queue[0][0].time_s, 0, -inf
+        self._t0, self._tick, self._newest_s = self._first_tick(queue[0][0].time_s), 0, -inf
         self.restarts += 1
         while queue and not self._is_after_gap(queue[0][0]):
             self._take(*queue.popleft())

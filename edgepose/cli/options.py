@@ -47,18 +47,19 @@ class SourceFlags(NamedTuple):
             str(name) for name in (self.file, self.port, self.can, self.sensors) if name is not None
         )
 
-    def open(self, raw: list[tuple[float, Any]] | None = None) -> Source:
+    def open(self, raw: list[tuple[float, Any]] | None = None, waits: bool = True) -> Source:
         """The source; nothing is opened before it is entered.
 
         Args:
             raw: filled with what comes over live lines.
+            waits: see `edgepose.sources.open_source`.
 
         Raises:
             EdgeposeError: a flag or the map of sensors means nothing.
         """
         from edgepose.sources import open_source
 
-        return open_source(**self._asdict(), raw=raw)
+        return open_source(**self._asdict(), raw=raw, waits=waits)
 
 
 def _protocol(ctx: click.Context, param: click.Parameter, value: str) -> str:

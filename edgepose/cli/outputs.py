@@ -130,10 +130,13 @@ def _destination(ctx: click.Context, param: click.Parameter, value: str | None) 
         raise click.BadParameter(str(error)) from None
 
 
-def _address(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, int] | None:
+def address(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, int] | None:
+    """Host and port of a flag HOST:PORT, as click's callback."""
     from edgepose.sinks.udp import parse_address
 
     try:
+        if value is not None and "," in value:
+            raise EdgeposeError(f"{value!r} is more than HOST:PORT")
         return None if value is None else parse_address(value)
     except EdgeposeError as error:
         raise click.BadParameter(str(error)) from None
@@ -167,13 +170,13 @@ def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
         ),
         click.option(
             "--osc",
-            callback=_address,
+            callback=address,
             metavar="HOST:PORT",
             help="Send each pose by the VMC protocol, for VRM avatars; they listen at port 39539 as a rule.",
         ),
         click.option(
             "--tcp",
-            callback=_address,
+            callback=address,
             metavar="HOST:PORT",
             help="Wait here for viewers that read poses as text, as TransPose's does at port 8888.",
         ),

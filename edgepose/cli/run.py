@@ -7,49 +7,25 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from edgepose.cli.options import Orientations, SourceFlags, filter_options, source_options
-from edgepose.cli.outputs import OutputFlags, check_files, output_options
+from edgepose.cli.keys import Keys
+from edgepose.cli.opened import OpenRig, calibration_of
+from edgepose.cli.rigs import RigFlags, check_all_files, rig_options
 from edgepose.cli.stop import Stop
-from edgepose.cli.wishes import Wishes
+from edgepose.cli.wishes import heard_by
 from edgepose.errors import EdgeposeError
-from edgepose.placements import PLACEMENTS
 from edgepose.precision import CHOICES, pack
 
 if TYPE_CHECKING:
-    from edgepose.calibration import Calibration
-    from edgepose.pipeline import RunSummary
-    from edgepose.sources import Source
-    from edgepose.sync import FrameClock
+    from edgepose.engine import BatchEngine, Engine
+    from edgepose.pipeline import RunSummary, Walk
 
 
-def _address(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, int] | None:
-    from edgepose.sinks.udp import parse_destination
-
-    try:
-        if value is None:
-            return None
-        if "," in value:
-            raise EdgeposeError(f"{value!r} is more than HOST:PORT")
-        return parse_destination(value)[:2]
-    except EdgeposeError as error:
-        raise click.BadParameter(str(error)) from None
-
-
+@rig_options
 @click.command(short_help="Turn sensor data into poses.")
-@source_options
-@filter_options
-@click.option(
-    "--calibration",
-    "calibration_path",
-    required=True,
-    type=click.Path(path_type=Path),
-    help="Calibration that `edgepose calibrate` wrote.",
-)
 @click.option(
     "--model",
     default="birnn",
@@ -86,26 +62,14 @@ def _address(ctx: click.Context, param: click.Parameter, value: str | None) -> t
     help="Numbers that the model's weights are kept in: fewer bytes run faster. auto is fp16 where this "
     "machine has products for it, else f32; int8 is the fastest, about 0.2 deg from f32.",
 )
-@output_options
-@click.option(
-    "--control",
-    callback=_address,
-    metavar="HOST:PORT",
-    help="Listen here for datagrams `rezero` and OSC messages /edgepose/rezero; live only.",
-)
 def run(
-    source: SourceFlags,
-    filter: str,
-    no_mag: bool,
-    calibration_path: Path,
+    rigs: list[RigFlags],
     model: str,
     trust: bool,
     online: str,
     past: int | None,
     future: int | None,
     precision: str,
-    outputs: OutputFlags,
-    control: tuple[str, int] | None,
 ) -> None:
     """Turn packets or a recording into poses until the source ends or Ctrl-C.
 
@@ -120,106 +84,96 @@ def run(
       edgepose run --sensors rig.toml --calibration calib.json --udp 127.0.0.1:9000
       edgepose run --port /dev/ttyUSB0 --filter kalman --calibration calib.json --csv poses.csv
       edgepose run --file walk.csv --calibration calib.json --csv - | head
+      edgepose run --rig anna.toml --rig ben.toml --model rnn
     """
-    if not outputs.any:
-        raise click.UsageError("give at least one output, such as --csv FILE, --udp HOST:PORT or --view")
-    check_files(outputs.files, {"--file": source.file, "--calibration": calibration_path})
-    if control is not None and not source.live:
-        raise click.UsageError("--control needs sensors that send, or --realtime")
+    check_all_files(rigs)
+    live, several = rigs[0].source.live, len(rigs) > 1
+    if other := [rig.name for rig in rigs if rig.source.live != live]:
+        raise click.UsageError(
+            f"{rigs[0].name} and {other[0]}: beside sensors that send, a recording needs  realtime = true"
+        )
 
     from edgepose import archive
-    from edgepose.calibration import load_calibration
 
-    calibration = load_calibration(calibration_path)
-    _check_filter(calibration, filter, no_mag, source)
+    calibrations = [calibration_of(rig) for rig in rigs]
     info = archive.inspect(archive.find(model))
     kind, rate = info.metadata["kind"], float(info.metadata["rate_hz"])
     past = info.metadata["past"] if past is None else past
     future = info.metadata["future"] if future is None else future
+    windows = kind != "rnn" and online == "window"
     if kind == "rnn" and future:
         raise click.UsageError(f"{model} is unidirectional: --future must be 0")
+    if several and windows:
+        raise click.UsageError("--online window runs one wearer; use --online stream for several")
     with ExitStack() as stack:
-        # The source is opened before the model is loaded: a wrong port is told at once.
-        opened = stack.enter_context(source.open())
-        wishes = Wishes(stack, control, keys=source.live)
+        # Sources are opened before the model is loaded: a wrong port is told at once.
+        keys = Keys()
+        opened = [
+            OpenRig(stack, rig, calibration, by_key, waits=not several)
+            for rig, calibration, by_key in zip(rigs, calibrations, heard_by(len(rigs), keys), strict=True)
+        ]
+        if live:
+            stack.enter_context(keys)
         module = archive.load(info, trust)
         precision = pack(module, info, precision, _say)
-        from edgepose.engine import Engine, StreamEngine, WindowEngine
-        from edgepose.pipeline import run as run_pipeline
-        from edgepose.rezero import Headings
-        from edgepose.sync import FrameClock
+        from edgepose.engine import BatchEngine, StreamEngine, WindowEngine
 
-        engine: Engine
-        if kind != "rnn" and online == "window":
+        # What int8 weights are multiplied with is scaled with all that is computed at once.
+        apart = precision == "int8"
+        engine: Engine | BatchEngine
+        if several:
+            engine = BatchEngine(module, past, future, len(rigs), apart)
+        elif windows:
             engine = WindowEngine(module, past, future)
         else:
-            # Of a recording nobody waits for single poses. int8 goes one by one all the same: what its
-            # weights are multiplied with is scaled with all that is computed at once.
-            recorded = not source.live and source.file is not None and source.file.is_file()
-            many = recorded and precision != "int8" and hasattr(module, "stream_many")
-            engine = StreamEngine(module, past, future, TOGETHER if many else 1)
+            # Of a recording nobody waits for single poses.
+            file = rigs[0].source.file
+            many = not live and file is not None and file.is_file() and hasattr(module, "stream_many")
+            engine = StreamEngine(module, past, future, TOGETHER if many and not apart else 1)
         stop = stack.enter_context(Stop())
-        sinks = outputs.open(stack, rate)
-        clock = FrameClock(rate)
-        way = "stream" if isinstance(engine, StreamEngine) else "window"
-        _say(f"running {model} ({kind}, {way}) in {precision}; Ctrl-C ends the run{wishes.hint}")
-        orient = Orientations(filter, magnetometer=calibration.north)
-        headings = Headings(
-            calibration,
-            hold_first=source.live and _begins_anew(calibration),
-            requests=wishes.poll,
-            tell=_say,
-        )
-        # What is alive now stays: going through all of it once in a while would hold up a frame by 0.1 s.
-        gc.collect()
-        gc.freeze()
-        summary = run_pipeline(
-            *(opened, clock, headings, engine, sinks),
-            orient=orient,
-            tell=_say if source.live else lambda text: None,
-            on_pose=_progress(),
-            stopped=lambda: stop.asked,
-            behind_s=lambda: opened.behind_s,
-        )
-        for sink in sinks:
-            try:
-                sink.close()
-            except EdgeposeError as error:
-                summary.error = summary.error or error
-    _report(summary, opened, clock, rate, future, live=source.live)
-    for line in (*orient.remarks(), *outputs.remarks(sinks), *wishes.remarks()):
-        _say(line)
-    if summary.error:
-        raise summary.error
-    if opened.damage:
-        raise EdgeposeError(opened.damage)
-
-
-def _begins_anew(calibration: Calibration) -> bool:
-    """Whether a filter without a north has begun anew since the calibration."""
-    return calibration.filter != "none" and not calibration.north
-
-
-def _check_filter(calibration: Calibration, filter: str, no_mag: bool, source: SourceFlags) -> None:
-    """Raises EdgeposeError unless orientations are made as they were for the calibration.
-
-    Not a warning: another filter has other headings, and all poses would be wrong without looking so.
-    """
-    if filter != calibration.filter:
-        raise EdgeposeError(
-            f"the calibration was made with --filter {calibration.filter}, and this run has --filter "
-            f"{filter}: headings would differ; use the same one, or calibrate again"
-        )
-    if no_mag and filter != "none" and calibration.north:
-        raise EdgeposeError(
-            "the calibration was made with magnetometers: leave --no-mag out, or calibrate again with it"
-        )
-    made_from = calibration.metadata.get("source")
-    if not source.live and _begins_anew(calibration) and made_from != source.name:
+        for rig in opened:
+            rig.open_outputs(stack, rate)
+        whose = f"{len(rigs)} wearers with " if several else ""
+        hint = ", r re-zeroes headings" if keys.listening else ""
         _say(
-            f"warning: the calibration was made from {made_from}, and headings of a filter without "
-            "magnetometers begin anew in each recording: calibrate from this one"
+            f"running {whose}{model} ({kind}, {'window' if windows else 'stream'}) in {precision}; "
+            f"Ctrl-C ends the run{hint}"
         )
+        walks = _walks(opened, engine, rate, live, stop)
+    if sys.stderr.isatty():
+        _say("")
+    reports = [rig.report(walk, rate, future) for rig, walk in zip(opened, walks, strict=True)]
+    failed = {rig.name: error for rig, error in zip(rigs, reports, strict=True) if error is not None}
+    if several and failed:
+        told = "; ".join(f"{name}: {error}" for name, error in failed.items())
+        raise EdgeposeError(f"{len(failed)} of {len(rigs)} wearers failed: {told}")
+    for error in failed.values():
+        raise error
+
+
+def _walks(
+    opened: list[OpenRig], engine: Engine | BatchEngine, rate: float, live: bool, stop: Stop
+) -> list[Walk]:
+    """The wearers' walks, to their ends."""
+    from edgepose.engine import BatchEngine
+    from edgepose.pipeline import run as run_alone
+    from edgepose.wearers import LOOK_S, Wearer, run_together
+
+    progress, nothing = _progress(), lambda summary: None
+    several = isinstance(engine, BatchEngine)
+    walks = [rig.walk(rate, several, nothing if several else progress) for rig in opened]
+    # What is alive now stays: going through all of it once in a while would hold up a frame by 0.1 s.
+    gc.collect()
+    gc.freeze()
+    if isinstance(engine, BatchEngine):
+        wearers = [Wearer(rig.source, walk, rig.say) for rig, walk in zip(opened, walks, strict=True)]
+        run_together(wearers, engine, LOOK_S if live else 0.0, lambda: stop.asked, progress)
+    else:
+        source = opened[0].source
+        run_alone(walks[0], source, engine, lambda: stop.asked, lambda: source.behind_s)
+    for walk in walks:
+        walk.close()
+    return walks
 
 
 TOGETHER = 64
@@ -255,37 +209,3 @@ def _progress() -> Callable[[RunSummary], None]:
             click.echo(f"\r{text}  " if terminal else text, nl=not terminal, err=True)
 
     return show
-
-
-def _report(
-    summary: RunSummary, source: Source, clock: FrameClock, rate: float, future: int, live: bool
-) -> None:
-    """Prints the counts of a finished run."""
-    import numpy as np
-
-    if sys.stderr.isatty():
-        _say("")
-    speed = summary.poses / summary.seconds if summary.seconds else 0.0
-    _say(
-        f"poses    {summary.poses} in {summary.seconds:.1f} s, {speed:.1f} a second; "
-        f"{summary.filling} while the window was filling"
-    )
-    counts = source.counters
-    _say(
-        f"packets  {counts.packets} good, {counts.lost} lost, {counts.bad} bad; "
-        f"{clock.dropped} samples too late or twice"
-    )
-    if clock.restarts:
-        _say(
-            f"clock    began anew {clock.restarts} times, after all sensors were silent for a minute or more"
-        )
-    if summary.held:
-        worst = sorted(zip(summary.held_by_sensor, PLACEMENTS, strict=True), reverse=True)
-        _say("held     " + ", ".join(f"{name} in {count} frames" for count, name in worst if count))
-    if summary.latencies_s and live:
-        p50, p99, most = np.percentile(np.array(summary.latencies_s) * 1e3, [50, 99, 100])
-        ahead = f" plus {future} frames of look-ahead, {future / rate * 1e3:.0f} ms" if future else ""
-        _say(
-            f"latency  {p50:.1f} ms median, {p99:.1f} ms p99, {most:.1f} ms max "
-            f"from last packet to pose sent{ahead}"
-        )

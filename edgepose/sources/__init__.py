@@ -90,6 +90,7 @@ def open_source(
     sensors: Path | str | None = None,
     raw: list[tuple[float, Any]] | None = None,
     lenient: bool = False,
+    waits: bool = True,
 ) -> Source:
     """The source that the options ask for; nothing is opened before it is entered.
 
@@ -107,6 +108,8 @@ def open_source(
         raw: filled with what comes over live lines: Unix time of arrival, s, and bytes or a CAN message.
         lenient: take what there is: of a recording the good rows of any sensors, of lines those that speak;
             those that do not are told and waited for.
+        waits: a batch may take as long as the module's text says; if not, it is there at once, empty where
+            nothing has come, for those who look after several sources.
 
     Raises:
         EdgeposeError: no input or two; a protocol, kind of file or entry of the map that means nothing.
@@ -120,8 +123,8 @@ def open_source(
     if file is not None:
         from edgepose.sources.files import open_file
 
-        return open_file(Path(file), realtime, protocol, sensor_map, lenient)
+        return open_file(Path(file), realtime, protocol, sensor_map, lenient, waits)
     from edgepose.sources.links import links
     from edgepose.sources.live import LiveSource
 
-    return LiveSource(links(port, baud, can, bitrate, fd, protocol, sensor_map), raw, lenient)
+    return LiveSource(links(port, baud, can, bitrate, fd, protocol, sensor_map), raw, lenient, waits)

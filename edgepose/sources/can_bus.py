@@ -60,7 +60,13 @@ class Buffered:
 
 
 class CanBus:
-    """An open bus."""
+    """An open bus.
+
+    Attributes:
+        waiting: see `live.Handle`; python-can's interfaces differ in whether they can be looked at.
+    """
+
+    waiting = None
 
     def __init__(self, name: str, bitrate: int, fd: bool) -> None:
         """Open it.

@@ -35,17 +35,18 @@ class RecordingSource:
 
     behind_s = 0.0
 
-    def __init__(self, path: Path, realtime: bool, lenient: bool = False) -> None:
+    def __init__(self, path: Path, realtime: bool, lenient: bool = False, waits: bool = True) -> None:
         """Nothing is read yet.
 
         Args:
             path: the file.
             realtime: deliver it at its own pace.
             lenient: take the good rows of any sensors; without, all six and no bad row.
+            waits: see `open_source`.
         """
         self._path = path
         self._read = salvage_recording if lenient else read_recording
-        self._realtime = realtime
+        self._realtime, self._waits = realtime, waits
         self._recording: Recording | None = None
         self._packets = 0
 
@@ -81,7 +82,7 @@ class RecordingSource:
     def __iter__(self) -> Iterator[Batch]:
         """All samples in time order, a hundredth of a second at a time."""
         assert self._recording is not None, "the source has not been entered"
-        for batch in _batches(samples(self._recording), self._realtime):
+        for batch in _batches(samples(self._recording), self._realtime, self._waits):
             self._packets += len(batch[1])
             yield batch
 
@@ -91,7 +92,14 @@ class LogSource:
 
     behind_s = 0.0
 
-    def __init__(self, path: Path, realtime: bool, chunks: Chunks, stream: Callable[[str], Stream]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        realtime: bool,
+        chunks: Chunks,
+        stream: Callable[[str], Stream],
+        waits: bool = True,
+    ) -> None:
         """Nothing is opened yet.
 
         Args:
@@ -99,9 +107,10 @@ class LogSource:
             realtime: deliver it at its own pace.
             chunks: reads the file: name of a line, time in seconds, and what came over it.
             stream: makes the stream of a line.
+            waits: see `open_source`.
         """
         self._path = path
-        self._realtime = realtime
+        self._realtime, self._waits = realtime, waits
         self._chunks = chunks
         self._stream = stream
         self._streams: dict[str, Stream] = {}
@@ -144,7 +153,7 @@ class LogSource:
         Raises:
             EdgeposeError: the file cannot be read to its end, or there is no packet in it.
         """
-        yield from _batches(self._samples(), self._realtime)
+        yield from _batches(self._samples(), self._realtime, self._waits)
         if not self.counters.packets:
             raise EdgeposeError(f"{self._path}: {self._problem()}")
 
@@ -175,9 +184,14 @@ class LogSource:
 
 
 def open_file(
-    path: Path, realtime: bool, protocol: str, sensor_map: SensorMap | None, lenient: bool = False
+    path: Path,
+    realtime: bool,
+    protocol: str,
+    sensor_map: SensorMap | None,
+    lenient: bool = False,
+    waits: bool = True,
 ) -> Source:
-    """The source that a file is.
+    """The source that a file is; the arguments are those of `edgepose.sources.open_source`.
 
     Raises:
         EdgeposeError: its kind, or the protocol, is not known.
@@ -185,16 +199,17 @@ def open_file(
     if is_recording(path):
         if protocol != "auto":
             protocol_named(protocol)  # a wrong name is told although it would not be needed
-        return RecordingSource(path, realtime, lenient)
+        return RecordingSource(path, realtime, lenient, waits)
     named = None if protocol == "auto" else protocol_named(protocol)
     if is_can_log(path) and (named is None or named.transport == "can"):
         from edgepose.sources.can_bus import read_log
 
         protocols = candidates(protocol, "can", live=False)
-        return LogSource(path, realtime, read_log, _streams(path, protocols, sensor_map, _log_clock))
+        return LogSource(path, realtime, read_log, _streams(path, protocols, sensor_map, _log_clock), waits)
     if path.suffix.lower() in CAPTURES or (named is not None and named.transport == "bytes"):
         protocols = candidates(protocol, "bytes", live=False)
-        return LogSource(path, realtime, _read_capture, _streams(path, protocols, sensor_map, _capture_clock))
+        streams = _streams(path, protocols, sensor_map, _capture_clock)
+        return LogSource(path, realtime, _read_capture, streams, waits)
     raise EdgeposeError(
         f"{path}: unknown kind of file; recordings end in .csv or .npz, logs of CAN buses in "
         f"{', '.join(CAN_LOGS)}, raw serial captures in {' or '.join(CAPTURES)} (with --protocol in anything)"
@@ -271,9 +286,9 @@ def _read_capture(path: Path) -> Iterator[tuple[str, float, bytes]]:
         yield "", nan if arrival_s is None else arrival_s, data
 
 
-def _batches(rows: Iterator[ImuSample], realtime: bool) -> Iterator[Batch]:
+def _batches(rows: Iterator[ImuSample], realtime: bool, waits: bool) -> Iterator[Batch]:
     """Samples in slices of time; `now_s` is that of the newest sample, or goes on with the clock where
-    realtime is asked for."""
+    realtime is asked for; until a slice is due there are empty ones unless this waits."""
     now_s = end_s = -inf
     batch: list[ImuSample] = []
     offset_s = 0.0
@@ -283,6 +298,8 @@ def _batches(rows: Iterator[ImuSample], realtime: bool) -> Iterator[Batch]:
             offset_s = sample.time_s - time.monotonic()
         while sample.time_s >= end_s:
             if realtime:
+                while not waits and end_s - offset_s > time.monotonic():
+                    yield now_s, []
                 time.sleep(max(0.0, end_s - offset_s - time.monotonic()))
                 now_s = end_s
             yield now_s, batch

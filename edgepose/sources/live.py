@@ -57,6 +57,10 @@ class Handle(Protocol):
     def close(self) -> None:
         """Give it free."""
 
+    @property
+    def waiting(self) -> Callable[[], Chunk] | None:
+        """Gives what is there without waiting, and raises as `read` does; None where only `read` can."""
+
 
 class Link(NamedTuple):
     """One line to listen to.
@@ -79,7 +83,11 @@ class Link(NamedTuple):
 
 
 class _Line:
-    """Reads one line in a thread, and opens it again when it was gone."""
+    """Reads one line, and opens it again when it was gone.
+
+    A thread waits for the line; if nobody is to wait, and the line can be looked at, only while it is being
+    emptied at its start or has gone.
+    """
 
     def __init__(
         self,
@@ -88,6 +96,7 @@ class _Line:
         claimed: dict[int, str],
         queue: SimpleQueue,
         now: Callable[[], float],
+        waits: bool,
     ) -> None:
         self.link = link
         self.handle: Handle | None = handle
@@ -98,8 +107,10 @@ class _Line:
         self.told = False  # that nothing usable comes
         self._queue = queue
         self._now = now
+        self._waits = waits
+        self._look: Callable[[], Chunk] | None = None  # while no thread reads
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True, name=link.name)
+        self._thread = threading.Thread(target=self._run, args=(self._drain,), daemon=True, name=link.name)
 
     def _clock(self, wrap_us: int) -> Clock:
         self.clocks = HostClocks(wrap_us)
@@ -108,12 +119,29 @@ class _Line:
     def start(self) -> None:
         self._thread.start()
 
-    def _run(self) -> None:
+    def look(self) -> Chunk:
+        """What has come, where no thread reads; nothing where one does."""
+        if self._look is None:
+            return b""
         try:
-            self._drain()
+            return self._look()
+        except Gone:
+            self._look = None
+            self._thread = threading.Thread(
+                target=self._run, args=(self._reopen,), daemon=True, name=self.link.name
+            )
+            self._thread.start()
+            return b""
+
+    def _run(self, first: Callable[[], None]) -> None:
+        try:
+            first()
             while not self._stop.is_set():
+                assert self.handle is not None
+                if not self._waits and self.handle.waiting is not None:
+                    self._look = self.handle.waiting
+                    return
                 try:
-                    assert self.handle is not None
                     chunk, _ = self.handle.read()
                     if chunk:
                         self._queue.put((self, self._now(), chunk))
@@ -155,11 +183,19 @@ class _Line:
             self.handle.close()
 
 
+Arrival = tuple[_Line, float, Any]
+"""A line, when something came over it, and what: a chunk, or what ended its thread."""
+
+
 class LiveSource:
     """Samples from serial ports and CAN buses. A line that disappears is opened again when it is back."""
 
     def __init__(
-        self, links: Sequence[Link], raw: list[tuple[float, Any]] | None = None, lenient: bool = False
+        self,
+        links: Sequence[Link],
+        raw: list[tuple[float, Any]] | None = None,
+        lenient: bool = False,
+        waits: bool = True,
     ) -> None:
         """Nothing is opened yet.
 
@@ -167,8 +203,10 @@ class LiveSource:
             links: what to listen to.
             raw: filled with what comes: arrival in Unix time, seconds, and bytes or a CAN message.
             lenient: warn of a line on which nothing usable comes, and go on with the others.
+            waits: see `open_source`.
         """
         self.behind_s = 0.0
+        self._waits = waits
         self._lenient = lenient
         self._links = links
         self._raw = raw
@@ -208,7 +246,7 @@ class LiveSource:
             for link in self._links:
                 handle = link.open()
                 stack.callback(handle.close)
-                line = _Line(link, handle, claimed, self._queue, self._now)
+                line = _Line(link, handle, claimed, self._queue, self._now, self._waits)
                 self._lines.append(line)
             stack.pop_all()
         for line in self._lines:
@@ -233,17 +271,16 @@ class LiveSource:
             line.start()
         while True:
             samples: list[ImuSample] = []
-            try:
-                line, arrival_s, chunk = self._queue.get(timeout=POLL_S)
-            except Empty:
+            came = self._wait() if self._waits else self._look()
+            if not came:
                 now_s = self._now()
-            else:
+            for line, arrival_s, chunk in came:
                 if isinstance(chunk, BaseException):
                     raise chunk
                 if self._raw is not None:
                     pieces = [chunk] if isinstance(chunk, bytes) else chunk
                     self._raw += [(arrival_s, piece) for piece in pieces]
-                samples = line.stream.feed(chunk, arrival_s)
+                samples += line.stream.feed(chunk, arrival_s)
                 # On a machine that is behind, what has not been taken from the queue is not missing yet.
                 now_s = max(now_s, arrival_s)
             self.behind_s = self._now() - now_s
@@ -254,6 +291,21 @@ class LiveSource:
                 checked_s = now_s
                 for line in self._lines:
                     _warn_of_twins(line)
+
+    def _wait(self) -> list[Arrival]:
+        """The next that comes, if it comes within POLL_S."""
+        try:
+            return [self._queue.get(timeout=POLL_S)]
+        except Empty:
+            return []
+
+    def _look(self) -> list[Arrival]:
+        """All that has come."""
+        came: list[Arrival] = [self._queue.get() for _ in range(self._queue.qsize())]
+        for line in self._lines:
+            if chunk := line.look():
+                came.append((line, self._now(), chunk))
+        return came
 
     def _check_start(self, line: _Line, now_s: float, start_s: float) -> None:
         if line.told:

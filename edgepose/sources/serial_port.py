@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import cycle
 
 import serial
@@ -61,6 +61,17 @@ class SerialPort:
         except (OSError, _TerminalError):
             if data:
                 return data, False  # the next read tells
+            raise Gone from None
+
+    @property
+    def waiting(self) -> Callable[[], bytes] | None:
+        """See `live.Handle`; the answers of devices that are asked have to be waited for."""
+        return self._waiting if self._requests is None else None
+
+    def _waiting(self) -> bytes:
+        try:
+            return bytes(self._serial.read(self._serial.in_waiting))
+        except (OSError, _TerminalError):
             raise Gone from None
 
     def close(self) -> None:

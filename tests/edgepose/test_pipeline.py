@@ -12,7 +12,7 @@ from edgepose.calibration import load_calibration
 from edgepose.engine import StreamEngine
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuFrame
-from edgepose.pipeline import LATENCIES, RunSummary, run, status
+from edgepose.pipeline import LATENCIES, RunSummary, Walk, run, status
 from edgepose.placements import PLACEMENTS
 from edgepose.poses import read_poses_csv
 from edgepose.rezero import Headings
@@ -47,17 +47,19 @@ def module():
 def walk(wearer, module):
     """Runs the batches of the short recording, changed by a function of them, to sinks."""
 
-    def go(change=lambda batches: batches, sinks=(), past=4, future=3, **options):
+    def go(
+        change=lambda batches: batches,
+        sinks=(),
+        past=4,
+        future=3,
+        on_pose=lambda summary: None,
+        **options,
+    ):
         engine = StreamEngine(module, past, future)
+        headings = Headings(load_calibration(wearer.calibration))
+        walk = Walk(FrameClock(), headings, list(sinks), on_pose=on_pose)
         with open_source(file=wearer.short) as source:
-            return run(
-                change(source),
-                FrameClock(),
-                Headings(load_calibration(wearer.calibration)),
-                engine,
-                list(sinks),
-                **options,
-            )
+            return run(walk, change(source), engine, **options)
 
     return go
 
