@@ -69,12 +69,6 @@ def _flags(**words: Any) -> RigFlags:
 _KEYS = {param.opts[0].removeprefix("--"): param for param in _flags.params}
 
 
-def _rig(words: dict[str, Any]) -> RigFlags:
-    assert _flags.callback is not None
-    rig: RigFlags = _flags.callback(**words)
-    return rig
-
-
 def rig_options(command: click.Command) -> click.Command:
     """Adds a wearer's flags and --rig; the command gets them as `rigs: list[RigFlags]`."""
     several = click.Option(
@@ -93,7 +87,8 @@ def rig_options(command: click.Command) -> click.Command:
     def with_rigs(rigs: tuple[Path, ...], **words: Any) -> Any:
         own = {str(param.name): words.pop(str(param.name)) for param in _flags.params}
         if not rigs:
-            return run(rigs=[_rig(own)], **words)
+            assert _flags.callback is not None
+            return run(rigs=[_flags.callback(**own)], **words)
         ctx = click.get_current_context()
         for name, param in _KEYS.items():
             if ctx.get_parameter_source(str(param.name)) is ParameterSource.COMMANDLINE:
@@ -132,12 +127,10 @@ def _read(path: Path) -> RigFlags:
     name = content.pop("name", path.stem)
     if not isinstance(name, str) or not name.isprintable() or not name.strip():
         raise EdgeposeError(f"{path}: name must be text in quotes on one line, not {name!r}")
-    given = {_KEYS[key].name: _value(path, key, value) for key, value in content.items() if _known(path, key)}
-    ctx = click.Context(_flags)
+    words = [word for key, value in content.items() for word in _words(path, key, value)]
     try:
-        for param in _flags.params:
-            param.handle_parse_result(ctx, given, [])
-        return _rig(ctx.params)._replace(name=name)
+        rig: RigFlags = _flags.invoke(_flags.make_context(str(path), words))
+        return rig._replace(name=name)
     except click.MissingParameter as error:
         key = "" if error.param is None else error.param.opts[0].removeprefix("--")
         raise EdgeposeError(f"{path}: {key} is missing") from None
@@ -149,20 +142,15 @@ def _read(path: Path) -> RigFlags:
         raise EdgeposeError(f"{path}: {error.message.replace('--', '')}") from None
 
 
-def _known(path: Path, key: str) -> bool:
-    if key not in _KEYS:
-        raise EdgeposeError(f"{path}: unknown key {key!r}; keys are name, {', '.join(_KEYS)}")
-    return True
-
-
-def _value(path: Path, key: str, value: object) -> object:
-    """What a key says, as the command line would have given it.
+def _words(path: Path, key: str, value: object) -> list[str]:
+    """A key and its value as the command line has them.
 
     Raises:
-        EdgeposeError: it is of another type.
+        EdgeposeError: there is no such key, or the value is of another type.
     """
-    param = _KEYS[key]
-    assert isinstance(param, click.Option)
+    param = _KEYS.get(key)
+    if not isinstance(param, click.Option):
+        raise EdgeposeError(f"{path}: unknown key {key!r}; keys are name, {', '.join(_KEYS)}")
     kinds: tuple[type, ...] = (str,)
     what = "text in quotes"
     if param.is_flag:
@@ -174,13 +162,10 @@ def _value(path: Path, key: str, value: object) -> object:
     # A bool is an int to isinstance.
     if type(value) not in kinds:
         raise EdgeposeError(f"{path}: {key} must be {what}, not {value!r}")
-    if isinstance(value, str) and value != "-" and (key in FILES or _is_pattern(key, value)):
-        return str(path.parent / value)
-    return value
-
-
-def _is_pattern(key: str, value: str) -> bool:
-    return key == "protocol" and value.endswith(".toml")
+    if isinstance(value, bool):
+        return [f"--{key}"] if value else []
+    is_file = key in FILES or (key == "protocol" and str(value).endswith(".toml"))
+    return [f"--{key}={path.parent / str(value) if is_file and value != '-' else value}"]
 
 
 def check_all_files(rigs: Sequence[RigFlags]) -> None:
