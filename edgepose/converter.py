@@ -12,7 +12,7 @@ from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
-from edgepose import mtmanager, xio
+from edgepose import dip_imu, mtmanager, totalcapture, xio
 from edgepose.appending import replace_file
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
@@ -33,10 +33,14 @@ from edgepose.sources.files import CAN_LOGS, CAPTURES, is_recording
 WRITERS: dict[str, Callable[[Path, Recording], None]] = {"csv": write_csv, "npz": write_npz}
 """What is written, by ending."""
 
-READERS: dict[str, Callable[[Path], Recording]] = {".mvnx": read_mvnx}
+READERS: dict[str, Callable[[Path], Recording]] = {
+    ".mvnx": read_mvnx,
+    ".pkl": dip_imu.read_recording,
+    ".sensors": totalcapture.read_recording,
+}
 """Readers of other programs' files, by ending."""
 
-ENDINGS = (".csv", ".npz", *CAPTURES, *CAN_LOGS, *READERS)
+ENDINGS = (".csv", ".npz", *CAPTURES, *CAN_LOGS, *READERS, ".bvh")
 """Endings of the files that are looked for in a folder."""
 
 
@@ -50,6 +54,25 @@ class Job(NamedTuple):
 
     source: Path
     target: Path
+
+
+class Options(NamedTuple):
+    """How recordings are converted.
+
+    Attributes:
+        protocol: what raw captures and CAN logs speak.
+        sensors: map of devices to placements, for captures, CAN logs and sessions.
+        filter: what makes orientations, see `orient_recording`; "none" leaves them as they are.
+        height_m: the wearer's stature, for the bones of BVH files, metres.
+    """
+
+    protocol: str = "auto"
+    sensors: Path | None = None
+    filter: str = "none"
+    height_m: float = 1.75
+
+
+_DEFAULTS = Options()
 
 
 class Result(NamedTuple):
@@ -145,29 +168,22 @@ def _walk(folder: Path, out: Path) -> Iterator[Path]:
             yield path
 
 
-def convert(job: Job, protocol: str = "auto", sensors: Path | None = None, filter: str = "none") -> Result:
-    """Write what is good in a recording.
-
-    Args:
-        job: the recording.
-        protocol: what a raw capture or a CAN log speaks.
-        sensors: map of devices to placements, for captures, CAN logs and x-io sessions.
-        filter: what makes orientations, see `orient_recording`; "none" leaves them as they are.
-    """
+def convert(job: Job, options: Options = _DEFAULTS) -> Result:
+    """Write what is good in a recording."""
     try:
         if job.target.suffix == ".bvh" or is_poses(job.source):
-            if filter != "none":
+            if options.filter != "none":
                 raise EdgeposeError(f"{job.source}: --filter is for recordings, not for poses; leave it out")
             job.target.parent.mkdir(parents=True, exist_ok=True)
-            return Result(job, *convert_poses(job.source, job.target))
-        recording = _read(job.source, protocol, sensors)
+            return Result(job, *convert_poses(job.source, job.target, options.height_m))
+        recording = _read(job.source, options.protocol, options.sensors)
         data = recording.sensors.values()
         if not data:
             raise EdgeposeError(recording.damage or f"{job.source}: no samples")
-        if filter != "none":
+        if options.filter != "none":
             from edgepose.orientation.recorded import orient_recording
 
-            recording = orient_recording(recording, filter, name=str(job.source))
+            recording = orient_recording(recording, options.filter, name=str(job.source))
         job.target.parent.mkdir(parents=True, exist_ok=True)
         write = WRITERS[job.target.suffix[1:]]
         replace_file(job.target, lambda path: write(path, recording), "recording")
@@ -222,23 +238,18 @@ def _serial_numbers(sensors: Path | None) -> Mapping[int, str] | None:
     return {device.id: name for name, device in devices.items() if device.id is not None}
 
 
-def convert_all(
-    jobs: Sequence[Job],
-    protocol: str = "auto",
-    sensors: Path | None = None,
-    workers: int = 1,
-    filter: str = "none",
-) -> Iterator[Result]:
+def convert_all(jobs: Sequence[Job], options: Options = _DEFAULTS, workers: int = 1) -> Iterator[Result]:
     """Results as they come.
 
     Args:
         jobs: recordings.
-        protocol: see `convert`.
-        sensors: see `convert`.
+        options: of all of them.
         workers: processes; one works in this process.
-        filter: see `convert`.
     """
-    work = partial(convert, protocol=protocol, sensors=sensors, filter=filter)
+    work = partial(convert, options=options)
+    # Other processes have no standard input.
+    yield from map(work, (job for job in jobs if str(job.source) == "-"))
+    jobs = [job for job in jobs if str(job.source) != "-"]
     if workers == 1 or len(jobs) < 2:
         yield from map(work, jobs)
         return

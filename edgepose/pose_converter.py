@@ -2,46 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 from edgepose.appending import replace_file
 from edgepose.poses import Poses, salvage_poses
+from edgepose.sinks import Sink
 from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.csv_file import CsvSink
 from edgepose.sinks.npz import write_npz
+from edgepose.skeleton import default_body
 
 
-def _write_csv(path: Path, poses: Poses) -> None:
-    with CsvSink(path, translation=poses.translation is not None) as sink:
+def _write(path: Path, poses: Poses, height_m: float) -> None:
+    if path.suffix == ".npz":
+        write_npz(path, [poses], len(poses.frames), poses.rate)
+        return
+    sink: Sink
+    if path.suffix == ".bvh":
+        sink = BvhSink(path, poses.rate, default_body(height_m))
+    else:
+        sink = CsvSink(path, translation=poses.translation is not None)
+    with sink:
         for pose in poses.pose_frames():
             sink.write(pose)
 
 
-def _write_npz(path: Path, poses: Poses) -> None:
-    write_npz(path, [poses], len(poses.frames), poses.rate)
-
-
-def _write_bvh(path: Path, poses: Poses) -> None:
-    with BvhSink(path, poses.rate) as sink:
-        for pose in poses.pose_frames():
-            sink.write(pose)
-
-
-WRITERS: dict[str, Callable[[Path, Poses], None]] = {
-    "csv": _write_csv,
-    "npz": _write_npz,
-    "bvh": _write_bvh,
-}
-"""What is written, by ending."""
-
-
-def convert_poses(source: Path, target: Path) -> tuple[int, float, str | None]:
+def convert_poses(source: Path, target: Path, height_m: float) -> tuple[int, float, str | None]:
     """Write what is good in a file of poses; the target appears when it is whole.
 
     Args:
         source: file that `edgepose.poses.read_poses` reads.
-        target: file whose ending is a key of WRITERS.
+        target: .csv, .npz or .bvh file.
+        height_m: the wearer's stature, for the bones of a BVH file, metres.
 
     Returns:
         Number of poses, seconds from the first to the last, and one line on what was not good.
@@ -50,5 +42,5 @@ def convert_poses(source: Path, target: Path) -> tuple[int, float, str | None]:
         EdgeposeError: nothing is good, or it cannot be written.
     """
     poses, damage = salvage_poses(source)
-    replace_file(target, lambda path: WRITERS[target.suffix[1:]](path, poses), "poses")
+    replace_file(target, lambda path: _write(path, poses, height_m), "poses")
     return len(poses.frames), float(poses.time_s[-1] - poses.time_s[0]), damage

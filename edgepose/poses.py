@@ -1,4 +1,5 @@
-"""Reading poses back from files: CSV as `edgepose.sinks.csv_file` writes it, and NPZ with the keys of AMASS.
+"""Reading poses back from files: CSV and BVH as edgepose writes them, NPZ with the keys of AMASS, and DIP's
+pickles with true poses.
 
 Files are hostile until checked: what comes out is finite, in order and made of rotations.
 """
@@ -9,16 +10,19 @@ import csv
 import sys
 import zipfile
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from io import BufferedReader
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple, TextIO
+from typing import Any, NamedTuple, TextIO, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edgepose.bvh import tidy_rate
+from edgepose import dip_imu
+from edgepose.bvh import read_bvh, tidy_rate
 from edgepose.errors import EdgeposeError
+from edgepose.joint_tree import JointTree
 from edgepose.npz import BROKEN
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import FILLING_WINDOW, PoseFrame, status_text
@@ -30,7 +34,7 @@ from edgepose.rotations import (
     rotvec_to_matrix,
 )
 from edgepose.sinks.csv_file import FORMS, pose_columns
-from edgepose.skeleton import JOINTS
+from edgepose.skeleton import JOINTS, PARENTS
 
 Array = NDArray[np.float64]
 
@@ -82,7 +86,8 @@ class Poses(NamedTuple):
 
 
 def read_poses(path: str | Path) -> Poses:
-    """Poses of a .npz file with the keys of AMASS, or of a CSV file, whatever its ending.
+    """Poses of a .npz file with the keys of AMASS, a .bvh file with SMPL's joints, a .pkl of DIP's with true
+    poses, or of a CSV file, whatever its ending.
 
     Args:
         path: file to read; "-" is CSV on standard input.
@@ -90,9 +95,8 @@ def read_poses(path: str | Path) -> Poses:
     Raises:
         EdgeposeError: no such file, or not a file of poses.
     """
-    if Path(path).suffix.lower() == ".npz":
-        return _read_npz(Path(path))
-    return _joined(list(read_blocks(path)))
+    read = _READERS.get(Path(path).suffix.lower())
+    return _joined(list(read_blocks(path))) if read is None else read(Path(path))
 
 
 def salvage_poses(path: Path) -> tuple[Poses, str | None]:
@@ -101,8 +105,8 @@ def salvage_poses(path: Path) -> tuple[Poses, str | None]:
     Raises:
         EdgeposeError: nothing is.
     """
-    if path.suffix.lower() == ".npz":
-        return _read_npz(path), None
+    if path.suffix.lower() in _READERS:
+        return read_poses(path), None
     blocks: list[Poses] = []
     try:
         blocks.extend(read_blocks(path))  # one by one: what has come before an error stays
@@ -126,16 +130,24 @@ def _joined(blocks: list[Poses]) -> Poses:
 
 
 def is_poses(path: Path) -> bool:
-    """Whether a .csv or .npz file seems to hold poses and not a recording of sensors."""
+    """Whether a file seems to hold poses and not a recording of sensors; "-" is standard input."""
+    if path.suffix.lower() == ".bvh":
+        return True
     try:
+        if str(path) == "-":
+            return _starts_as_poses(cast(BufferedReader, sys.stdin.buffer).peek(32))
         if path.suffix.lower() == ".npz":
             with zipfile.ZipFile(path) as archive:
                 names = set(archive.namelist())
             return "poses.npy" in names and not _is_recording(names)
         with path.open("rb") as file:
-            return file.read(32).removeprefix(b"\xef\xbb\xbf").startswith(b"frame,time_s,status,")
+            return _starts_as_poses(file.read(32))
     except (OSError, zipfile.BadZipFile):
         return False
+
+
+def _starts_as_poses(start: bytes) -> bool:
+    return start.removeprefix(b"\xef\xbb\xbf").startswith(b"frame,time_s,status,")
 
 
 # --- CSV ----------------------------------------------------------------------------------------------------
@@ -413,3 +425,73 @@ def _status(path: Path, arrays: Mapping[str, NDArray[Any]], count: int) -> list[
     masks = held @ (1 << np.arange(len(PLACEMENTS)))
     pairs = zip((filling * FILLING_WINDOW).tolist(), masks.tolist(), strict=True)
     return [status_text(flags, mask) for flags, mask in pairs]
+
+
+# --- other files --------------------------------------------------------------------------------------------
+
+
+_LIMBS = {
+    "left_knee": (0, -1, 0),
+    "right_knee": (0, -1, 0),
+    "left_elbow": (1, 0, 0),
+    "right_elbow": (-1, 0, 0),
+}
+"""Joints at the far ends of limbs, and where the limbs point in the T-pose."""
+
+
+def _read_bvh(path: Path) -> Poses:
+    """Poses of a BVH file with SMPL's joints, whose world has the axes of T."""
+    tree = read_bvh(path)
+    places = _smpl_joints(path, tree)
+    count = len(tree.rotations)
+    rotations = np.broadcast_to(np.eye(3), (count, len(JOINTS), 3, 3)).copy()
+    for joint, name in enumerate(JOINTS):
+        if name in places:
+            rotations[:, joint] = tree.rotations[:, places[name]]
+    root = tree.positions[:, 0]
+    # A file that knows no place has the root at one and the same.
+    moves = (root != root[0]).any()
+    translation = root * _metres(tree.offsets[places["left_ankle"]]) if moves else None
+    return Poses(np.arange(count), np.arange(count) / tree.rate, ["ok"] * count, rotations, translation)
+
+
+def _smpl_joints(path: Path, tree: JointTree) -> dict[str, int]:
+    """Places in a tree of SMPL's joints by name; only hands may be missing, and case does not matter.
+
+    Raises:
+        EdgeposeError: it has other joints, or they turn from another pose than the T-pose.
+    """
+    places = {name.lower(): place for place, name in enumerate(tree.names)}
+    missing = [name for name in JOINTS[:22] if name not in places]
+    if missing:
+        more = " ..." if len(missing) > 3 else ""
+        raise EdgeposeError(f"{path}: its joints are not SMPL's: no {', '.join(missing[:3])}{more}")
+    for joint, parent in enumerate(PARENTS):
+        if (place := places.get(JOINTS[joint])) is not None:
+            wanted = -1 if parent < 0 else places[JOINTS[parent]]
+            if tree.parents[place] != wanted:
+                raise EdgeposeError(f"{path}: its joint {JOINTS[joint]} does not hang where SMPL's does")
+    for name, direction in _LIMBS.items():
+        offset = tree.offsets[places[name]]
+        if not offset @ direction > 0.7 * np.linalg.norm(offset):
+            raise EdgeposeError(
+                f"{path}: where all angles are zero, its {name} is not where a T-pose has it (Y up, facing Z)"
+            )
+    return places
+
+
+def _metres(shank: Array) -> float:
+    """Metres in the unit of a shank (3,): BVH names none, and m, cm and mm are common."""
+    length = max(float(np.linalg.norm(shank)), 1e-9)
+    return min((1.0, 0.01, 0.001), key=lambda metres: abs(np.log(length * metres / 0.4)))
+
+
+def _read_dip(path: Path) -> Poses:
+    """True poses of DIP-IMU or of DIP's TotalCapture."""
+    rotations = dip_imu.read_true_pose(path)
+    count = len(rotations)
+    return Poses(np.arange(count), np.arange(count) / dip_imu.RATE, ["ok"] * count, rotations, None)
+
+
+_READERS: dict[str, Callable[[Path], Poses]] = {".npz": _read_npz, ".bvh": _read_bvh, ".pkl": _read_dip}
+"""Readers of whole files, by ending; all others are CSV."""

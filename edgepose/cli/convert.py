@@ -40,6 +40,13 @@ if TYPE_CHECKING:
     help="Make orientations of gyroscope, accelerometer and, where there is one, magnetometer; smoother uses "
     "what comes later, too. none: leave the devices' own.",
 )
+@click.option(
+    "--height",
+    type=float,
+    default=1.75,
+    show_default=True,
+    help="The wearer's stature, for the bones of BVH files, metres.",
+)
 @protocol_option
 @sensors_option
 @click.option(
@@ -55,21 +62,22 @@ def convert(
     to: str,
     out: Path,
     filter: str,
+    height: float,
     protocol: str,
     sensors: Path | None,
     jobs: int,
     skip_existing: bool,
 ) -> None:
     """Convert recordings: CSV, NPZ, raw captures of a port, logs of a CAN bus, sessions of x-io's
-    software and of Xsens' MT Manager.
+    software and of Xsens' MT Manager, MVNX of Xsens' MVN, TotalCapture's .sensors and DIP-IMU's .pkl.
 
     IN are files, patterns and folders. A folder stands for the recordings in it, at any depth; one that holds
     a folder for each x-io sensor is one recording, whose sensors' folders have placements in their names (or,
     with --sensors, their serial numbers as ids: id = 0x64F61CB3). Of a damaged recording what is good is
     written, and the exit code is 1.
 
-    Files of poses, CSV as `run` writes it or NPZ with the keys of AMASS, become CSV, NPZ or BVH; of a
-    recording that holds true poses, --to bvh takes these.
+    Files of poses, CSV and BVH as `run` writes them or NPZ with the keys of AMASS, become CSV, NPZ or BVH; of
+    a recording that holds true poses, as DIP-IMU's do, --to bvh takes these. - is CSV on standard input.
 
     \b
     Examples:
@@ -77,18 +85,23 @@ def convert(
       edgepose convert sessions/ "more/*.bin" --to npz --out recordings --jobs 4
       edgepose convert walk.part.csv --to npz --out saved
       edgepose convert raw.csv --to npz --out oriented --filter smoother
-      edgepose convert poses/ --to bvh --out for-blender --jobs 2
+      edgepose convert poses/ --to bvh --out for-blender --jobs 2 --height 1.68
+      edgepose run --file walk.npz --calibration calib.json --csv - | edgepose convert - --to bvh --out .
     """
-    from edgepose.converter import Result, convert_all, plan
+    from edgepose.converter import Options, Result, convert_all, plan
+    from edgepose.skeleton import default_body
     from edgepose.sources.sensor_map import read_map
 
+    # A mistake in one of these is told once.
+    default_body(height)
     if sensors is not None:
-        read_map(sensors)  # a mistake in it is told once
+        read_map(sensors)
     planned = plan(inputs, to, out)
     done = {job: Result(job, skipped=True) for job in planned if skip_existing and job.target.exists()}
     todo = [job for job in planned if job not in done]
     try:
-        for result in _with_progress(convert_all(todo, protocol, sensors, jobs, filter), len(todo)):
+        options = Options(protocol, sensors, filter, height)
+        for result in _with_progress(convert_all(todo, options, jobs), len(todo)):
             done[result.job] = result
     finally:
         click.echo(_table([done[job] for job in planned if job in done]))

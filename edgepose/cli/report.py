@@ -22,8 +22,8 @@ import click
     help="The wearer's stature, for the figures and for telling steps, metres.",
 )
 def report(poses: Path, out: Path | None, height: float) -> None:
-    """Make one HTML page about the poses of a file (CSV, or NPZ with the keys of AMASS): figures, steps and
-    cadence, joint angles over time, ranges of motion, and how often each sensor was silent.
+    """Make one HTML page about the poses of a file (CSV, BVH, or NPZ with the keys of AMASS): figures, steps
+    and cadence, joint angles over time, ranges of motion, and how often each sensor was silent.
 
     The page has everything in it. It needs `pip install 'edgepose[plot]'`.
 

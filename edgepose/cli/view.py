@@ -45,8 +45,8 @@ def view(
     height: float,
     with_parent: bool,
 ) -> None:
-    """Show poses as a 3-D figure in the browser until Ctrl-C: those of a file (CSV, or NPZ with the keys of
-    AMASS) with a time line, or those that come over UDP.
+    """Show poses as a 3-D figure in the browser until Ctrl-C: those of a file (CSV, BVH, or NPZ with the keys
+    of AMASS) with a time line, or those that come over UDP.
 
     The page needs `pip install 'edgepose[view]'`. Beside the figure is what each sensor does: how many new
     values a second, the longest gap, whether its last values are being repeated.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +12,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from edgepose.bvh import read_bvh
+from edgepose.errors import EdgeposeError
 from edgepose.joint_tree import forward
 from edgepose.pose import PoseFrame
-from edgepose.poses import read_poses, salvage_poses
+from edgepose.poses import is_poses, read_poses, salvage_poses
 from edgepose.recording import read_recording
+from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.csv_file import CsvSink
 from edgepose.sinks.npz import NpzSink
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics
@@ -43,7 +47,7 @@ def write(path: Path, count: int = 20, where: bool = False, form: str = "axis-an
 
 
 def check(path: Path, count: int, where: bool = False) -> None:
-    """The file holds `poses`; BVH is read by the reader of motion capture."""
+    """The file holds `poses`; BVH as the reader of any BVH file sees it."""
     wanted = poses(count, where)
     if path.suffix == ".bvh":
         read = read_bvh(path)
@@ -67,6 +71,112 @@ def check(path: Path, count: int, where: bool = False) -> None:
 def lines(output: str) -> dict[str, str]:
     """Result by file name, of the table at the end."""
     return {Path(line.split()[0]).name: line.split(maxsplit=3)[3] for line in output.splitlines()[1:]}
+
+
+@pytest.mark.parametrize("where", [False, True])
+def test_bvh_comes_back(tmp_path, where):
+    path = tmp_path / "a.bvh"
+    with BvhSink(path, body=default_body(1.6)) as sink:
+        for pose in poses(20, where):
+            sink.write(pose)
+    assert is_poses(path)
+    read, damage = salvage_poses(path)
+    assert damage is None
+    assert read.rate == 60.0
+    assert read.frames.tolist() == list(range(20))
+    assert read.status == ["ok"] * 20
+    np.testing.assert_allclose(read.time_s, np.arange(20) / 60)
+    np.testing.assert_allclose(read.rotations, [pose.rotations for pose in poses(20)], atol=3e-6)
+    if where:
+        np.testing.assert_allclose(
+            read.translation, [pose.translation for pose in poses(20, True)], atol=1e-6
+        )
+    else:
+        assert read.translation is None
+
+
+@pytest.mark.parametrize("metre", [1.0, 100.0, 1000.0])
+def test_bvh_of_others_in_any_unit(tmp_path, metre):
+    """Names in other cases, more joints, no hands, other channels."""
+    path = tmp_path / "a.bvh"
+    with BvhSink(path) as sink:
+        for pose in poses(3, True):
+            sink.write(pose)
+    text = path.read_text().replace("pelvis", "Pelvis").replace("left_knee", "Left_Knee")
+    text = text.replace("left_hand", "left_thumb").replace("right_hand", "right_thumb")
+    head, *rows = text.partition("Frame Time: ")[0], *text.splitlines()[-3:]
+    offsets = re.sub(r"-?\d+\.\d{4}", lambda number: f"{float(number[0]) * metre / 100:.6f}", head)
+    scaled = [" ".join(f"{float(v) * metre / 100:.6f}" for v in row.split()[:3]) for row in rows]
+    lines = [f"{places} {' '.join(row.split()[3:])}" for places, row in zip(scaled, rows, strict=True)]
+    path.write_text(f"{offsets}Frame Time: 0.016667\n" + "\n".join(lines) + "\n")
+    read = read_poses(path)
+    np.testing.assert_allclose(read.translation, [pose.translation for pose in poses(3, True)], atol=1e-5)
+    wanted = np.stack([pose.rotations for pose in poses(3)])
+    np.testing.assert_allclose(read.rotations[:, :22], wanted[:, :22], atol=3e-6)
+    np.testing.assert_array_equal(read.rotations[:, 22:], np.broadcast_to(np.eye(3), (3, 2, 3, 3)))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("JOINT spine2", "JOINT chest", "its joints are not SMPL's: no spine2$"),
+        ("JOINT left_", "JOINT l_", r"its joints are not SMPL's: no left_hip, left_knee, left_ankle \.\.\.$"),
+        ("JOINT neck", "JOINT x", "no neck$"),
+        ("Frames: 3", "Frames: 4", "4 frames are announced, 3 are there"),
+        ("left_", "right_", "joint name 'right_hip' is missing or used twice"),
+    ],
+)
+def test_other_bvh_files(tmp_path, old, new, message):
+    path = tmp_path / "a.bvh"
+    with BvhSink(path) as sink:
+        for pose in poses(3):
+            sink.write(pose)
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(EdgeposeError, match=message):
+        read_poses(path)
+
+
+def test_bvh_with_another_zero_pose_or_tree(tmp_path):
+    path = tmp_path / "a.bvh"
+    with BvhSink(path) as sink:
+        sink.write(poses(1)[0])
+    text = path.read_text()
+    swapped = (
+        text.replace("left_elbow", "X")
+        .replace("left_wrist", "left_elbow")
+        .replace("JOINT X", "JOINT left_wrist")
+    )
+    path.write_text(swapped)
+    with pytest.raises(EdgeposeError, match="its joint left_elbow does not hang where SMPL's does"):
+        read_poses(path)
+    z_up = re.sub(r"OFFSET (\S+) (\S+) (\S+)", r"OFFSET \1 \3 \2", text)
+    path.write_text(z_up)
+    with pytest.raises(EdgeposeError, match="its left_knee is not where a T-pose has it"):
+        read_poses(path)
+
+
+def test_poses_on_standard_input(tmp_path):
+    text = write(tmp_path / "a.csv", where=True).read_text()
+    edgepose = [sys.executable, "-m", "edgepose", "convert"]
+    out = tmp_path / "out"
+    for words in (["--to", "bvh"], ["--to", "npz", str(tmp_path / "a.csv"), "--jobs", "2"]):
+        command = [*edgepose, "-", *words, "--out", str(out)]
+        result = subprocess.run(command, input=text, text=True, capture_output=True, check=False)
+        assert result.returncode == 0, result.stdout + result.stderr
+        check(out / f"stdin.{words[1]}", 20, True)
+
+
+def test_bones_of_the_wearer(command, tmp_path):
+    write(tmp_path / "a.csv")
+    out = tmp_path / "out"
+    result = command("convert", tmp_path / "a.csv", "--to", "bvh", "--out", out, "--height", 1.5)
+    assert result.returncode == 0, result.stderr
+    tree = read_bvh(out / "a.bvh")
+    order = [tree.names.index(name) for name in JOINTS]
+    np.testing.assert_allclose(tree.offsets[order][1:] / 100, default_body(1.5).offsets[1:], atol=1e-6)
+    result = command("convert", tmp_path / "a.csv", "--to", "bvh", "--out", out, "--height", 150)
+    assert result.returncode == 1
+    assert result.stderr.startswith("edgepose: height 150 m is not between")
 
 
 @pytest.mark.parametrize("where", [False, True])

@@ -1,10 +1,8 @@
 """Reader for TotalCapture's own files (cvssp.org/data/totalcapture): Xsens sensors and their calibration.
 
-`NAME_Xsens_AuxFields.sensors`: the number of sensors and of frames, then for each frame its number from 1 and
-a line a sensor: name, quaternion w x y z to the inertial frame, acceleration with gravity in the sensor's
-frame, and more; 60 Hz. `sN_NAME_calib_imu_ref.txt` and `_bone.txt`: the number of sensors, then name and
-quaternion x y z w of inertial to global frame, and of sensor to bone; both are those of `vicon`. True poses
-are DIP's SMPL poses, which end with the sensors, or else TotalCapture's own.
+What the sensors say is read by `edgepose.totalcapture`. `sN_NAME_calib_imu_ref.txt` and `_bone.txt`: the
+number of sensors, then name and quaternion x y z w of inertial to global frame, and of sensor to bone; both
+are those of `vicon`. True poses are DIP's SMPL poses, which end with the sensors, or else TotalCapture's own.
 """
 
 from __future__ import annotations
@@ -18,22 +16,18 @@ from numpy.typing import NDArray
 
 from edgepose import rotations as rot
 from edgepose.calibration import GRAVITY
+from edgepose.dip_imu import read_true_pose
 from edgepose.errors import EdgeposeError
 from edgepose.placements import BONES
 from edgepose.skeleton import local_from_global
+from edgepose.totalcapture import NAMES, read_sensors
 from edgepose_export.dataset import Take
-from edgepose_export.published.dip_imu import read_true_pose
 from edgepose_export.published.vicon import BODY_FROM_GLOBAL, THEIR_BONE_FROM_OURS, read_vicon
 
 Array = NDArray[np.float64]
 
 LICENSE = "TotalCapture (cvssp.org/data/totalcapture), for non-commercial research"
 
-NAMES = ("L_LowArm", "R_LowArm", "L_LowLeg", "R_LowLeg", "Head", "Pelvis")
-"""TotalCapture's names of the six placements, in their order."""
-
-MAX_FRAMES = 1_000_000
-_NUMBERS = 7  # of each line: quaternion and acceleration; AuxFields has more behind them
 _APART = 30.0  # degrees; sensors and Vicon of one take are 2 to 8 apart in the median, a user of both found
 
 
@@ -108,62 +102,6 @@ def _shared_frames(path: Path, r_tb: Array, true: Array) -> slice:
             f"it belongs to another take, or is not laid out as TotalCapture's"
         )
     return choices[best]
-
-
-def read_sensors(path: Path) -> tuple[Array, Array]:
-    """R_IS (T, 6, 3, 3) and specific force (T, 6, 3) in the sensors' frames of a .sensors file.
-
-    Raises:
-        EdgeposeError: not such a file; names the line.
-    """
-    try:
-        with path.open(encoding="ascii", errors="replace") as file:
-            lines = iter(enumerate(file, start=1))
-            sensors, frames = _counts(path, next(lines, (1, ""))[1])
-            values = np.empty((frames, len(NAMES), _NUMBERS))
-            for frame in range(frames):
-                number, line = next(lines, (0, ""))
-                if line.strip() != str(frame + 1):
-                    raise EdgeposeError(
-                        f"{path}, line {number or 'at the end'}: expected frame {frame + 1} of {frames}, "
-                        f"found {line.strip()[:40]!r}"
-                    )
-                found = {}
-                for _ in range(sensors):
-                    number, line = next(lines, (0, ""))
-                    name, *cells = line.split()[: 1 + _NUMBERS] or [""]
-                    if name in NAMES:
-                        found[name] = _row(path, number, cells)
-                if missing := [name for name in NAMES if name not in found]:
-                    raise EdgeposeError(f"{path}: frame {frame + 1} has no {', '.join(missing)}")
-                values[frame] = [found[name] for name in NAMES]
-    except OSError as error:
-        raise EdgeposeError(f"{path}: cannot be read: {error.strerror or error}") from error
-    quats = values[..., :4]
-    return rot.quat_to_matrix(quats / np.linalg.norm(quats, axis=-1, keepdims=True)), values[..., 4:]
-
-
-def _counts(path: Path, line: str) -> tuple[int, int]:
-    """Numbers of sensors and of frames in a file's first line."""
-    cells = line.split()
-    if len(cells) == 2 and all(cell.isdecimal() and len(cell) < 9 for cell in cells):
-        sensors, frames = map(int, cells)
-        if len(NAMES) <= sensors <= 100 and 0 < frames <= MAX_FRAMES:
-            return sensors, frames
-    raise EdgeposeError(
-        f"{path}, line 1: expected the numbers of sensors and frames, found {line.strip()[:40]!r}"
-    )
-
-
-def _row(path: Path, number: int, cells: list[str]) -> list[float]:
-    """Quaternion and acceleration of a line."""
-    try:
-        row = [float(cell) for cell in cells]
-    except ValueError:
-        row = []
-    if len(row) != _NUMBERS or not np.abs(row).max() < 1e4 or not abs(np.linalg.norm(row[:4]) - 1.0) < 0.1:
-        raise EdgeposeError(f"{path}, line {number}: expected a unit quaternion and an acceleration")
-    return row
 
 
 def _calibration(folder: Path, name: str) -> Array:

@@ -1,0 +1,85 @@
+"""Sensors of DIP-IMU as recordings, on small pickles of its layout."""
+
+from __future__ import annotations
+
+import pickle
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edgepose.calibration import GRAVITY
+from edgepose.dip_imu import read_recording
+from edgepose.placements import BONES, PLACEMENTS
+from edgepose.poses import read_poses
+from edgepose.recording import read_recording as read_npz
+from edgepose.rotations import Z_UP_TO_T, quat_to_matrix, rotvec_to_matrix
+from edgepose.skeleton import forward_kinematics
+
+FRAMES = 12
+PLACES = [7, 8, 11, 12, 0, 2]
+
+
+@pytest.fixture
+def content() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(1)
+    gt = np.cumsum(0.05 * rng.normal(size=(FRAMES, 72)), axis=0)
+    bones = forward_kinematics(rotvec_to_matrix(gt.reshape(-1, 24, 3)), np.zeros((24, 3)))[0]
+    result = {"imu_ori": np.zeros((FRAMES, 17, 3, 3)), "imu_acc": np.zeros((FRAMES, 17, 3)), "gt": gt}
+    result["imu_ori"][:, PLACES] = bones[:, list(BONES)]
+    result["imu_acc"][:, PLACES] = rng.normal(size=(FRAMES, 6, 3))
+    return result
+
+
+def written(path: Path, content: dict[str, object]) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(pickle.dumps(content, 2))
+    return path
+
+
+def test_sensors_lie_along_their_bones(content, tmp_path):
+    recording = read_recording(written(tmp_path / "01.pkl", content))
+    assert recording.damage is None
+    for place, name in zip(PLACES, PLACEMENTS, strict=True):
+        data = recording.sensors[name]
+        np.testing.assert_allclose(data.time_s, np.arange(FRAMES) / 60)
+        turned = Z_UP_TO_T @ quat_to_matrix(data.quat)
+        np.testing.assert_allclose(turned, content["imu_ori"][:, place], atol=1e-9)
+        in_body = (turned @ data.acc[..., None])[..., 0] - [0.0, GRAVITY, 0.0]
+        np.testing.assert_allclose(in_body, content["imu_acc"][:, place], atol=1e-9)
+
+
+def test_lost_packets_are_not_there(content, tmp_path):
+    content["imu_ori"][3:5, PLACES[0]] = np.nan
+    content["imu_acc"][4:6, PLACES[0]] = np.nan
+    recording = read_recording(written(tmp_path / "01.pkl", content))
+    kept = [i for i in range(FRAMES) if i not in (3, 4, 5)]
+    np.testing.assert_allclose(recording.sensors["left_forearm"].time_s, np.array(kept) / 60)
+    assert len(recording.sensors["head"].time_s) == FRAMES
+
+
+class Attack:
+    def __reduce__(self):
+        return (print, ("run!",))
+
+
+def test_by_the_command(content, command, tmp_path):
+    folder = tmp_path / "in"
+    written(folder / "s_09" / "01.pkl", content)
+    written(folder / "s_09" / "02.pkl", {**content, "more": Attack()})
+    result = command("convert", folder, "--to", "npz", "--out", tmp_path / "out")
+    assert result.returncode == 1
+    assert re.search(r"01\.pkl +72 +0\.2  ok\n", result.stdout)
+    assert "print, which arrays do not need; it was not run" in result.stdout
+    assert "run!" not in result.stdout
+    assert list(read_npz(tmp_path / "out" / "s_09" / "01.npz").sensors) == list(PLACEMENTS)
+    # Its true poses, as of every recording that has any.
+    source = folder / "s_09" / "01.pkl"
+    result = command("convert", source, "--to", "bvh", "--out", tmp_path / "out")
+    assert result.returncode == 0, result.stdout
+    read = read_poses(tmp_path / "out" / "01.bvh")
+    wanted = rotvec_to_matrix(content["gt"].reshape(-1, 24, 3))
+    np.testing.assert_allclose(read.rotations, wanted, atol=3e-6)
+    np.testing.assert_allclose(read_poses(source).rotations, wanted, atol=1e-9)
+    assert read.rate == read_poses(source).rate == 60.0
