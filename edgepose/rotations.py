@@ -120,13 +120,11 @@ def quat_to_matrix(q: ArrayLike) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def matrix_to_quat(r: ArrayLike) -> Array:
-    """Unit quaternions (..., 4), w >= 0, of rotations (..., 3, 3); stable everywhere (Shepperd 1978)."""
-    r = np.asarray(r, float)
+def _four_outer(r: Array) -> Array:
+    """4 q q^T (..., 4, 4) of the quaternions q of rotations (..., 3, 3)."""
     m = {(i, j): r[..., i, j] for i in range(3) for j in range(3)}
     trace = m[0, 0] + m[1, 1] + m[2, 2]
-    # The four rows of 4 q q^T; the one with the largest diagonal has the least rounding error.
-    rows = np.stack(
+    return np.stack(
         [
             np.stack([1 + trace, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]], -1),
             np.stack([m[2, 1] - m[1, 2], 1 + 2 * m[0, 0] - trace, m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]], -1),
@@ -135,6 +133,18 @@ def matrix_to_quat(r: ArrayLike) -> Array:
         ],
         axis=-2,
     )
+
+
+# The same as one product, which takes half the time: but for ones on its diagonal it is linear in the matrix.
+_ONES = np.eye(4).ravel()
+_BY_ENTRY = _four_outer(np.eye(9).reshape(9, 3, 3)).reshape(9, 16) - _ONES
+
+
+def matrix_to_quat(r: ArrayLike) -> Array:
+    """Unit quaternions (..., 4), w >= 0, of rotations (..., 3, 3); stable everywhere (Shepperd 1978)."""
+    r = np.asarray(r, float)
+    rows = (r.reshape(*r.shape[:-2], 9) @ _BY_ENTRY + _ONES).reshape(*r.shape[:-2], 4, 4)
+    # The row with the largest diagonal has the least rounding error.
     best = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
     q = _unit(np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :])
     return np.where(q[..., :1] < 0, -q, q)

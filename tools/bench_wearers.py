@@ -1,0 +1,299 @@
+"""Measures how many wearers one core holds: the network alone, and `edgepose run --rig ... --rig ...` whole.
+
+\b
+    bench_wearers.py                           both shipped models, 1 to 64 wearers
+    bench_wearers.py --model rnn --seconds 5 8 16 32
+
+Six sensors of 100 Hz a wearer send native packets over a pseudo terminal each; `edgepose run` has one core
+to itself and sends binary datagrams, and what simulates and listens has the others. A run holds if no pose
+is lost and 99 of 100 arrive within two frames of the instant that they show. Costs are processor time; ages
+are times of the clock: leave the machine alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+import tty
+from collections import defaultdict
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import NamedTuple
+
+import click
+import numpy as np
+import simulate
+import torch
+
+from edgepose import archive
+from edgepose.calibration import Calibration, save
+from edgepose.engine import BatchEngine, Body
+from edgepose.placements import PLACEMENTS
+from edgepose.precision import pack
+from edgepose.sinks.udp import decode_binary
+from firmware_protocols.registry import PROTOCOLS
+
+CLIP = Path(__file__).parent / "data" / "09_12.bvh"
+RATE = 60.0
+PERIOD_S = 0.01
+LATE_S = 2.0 / RATE
+START_S = 60.0
+"""How long the program may take until its first pose, seconds."""
+
+SETTLE_S = 2.0
+"""Left out at the start: caches fill, and all wearers begin at once."""
+
+
+class Whole(NamedTuple):
+    """A run of the whole program.
+
+    Attributes:
+        core: share of a core.
+        p50_ms: from the instant that a pose shows to its arrival, median.
+        p99_ms: 99 of 100 arrive sooner.
+        late: share of poses that came after two frames or more.
+        lost: poses that did not come.
+        per_s: poses of a wearer a second.
+    """
+
+    core: float
+    p50_ms: float
+    p99_ms: float
+    late: float
+    lost: int
+    per_s: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether poses keep coming at their pace."""
+        return not self.lost and self.p99_ms <= 1e3 * LATE_S and self.per_s > 0.99 * RATE
+
+
+def network_us(model: str, wearers: int) -> float:
+    """Processor time of a step of the network a frame a wearer, microseconds; median over rounds."""
+    info = archive.inspect(archive.find(model))
+    module = archive.load(info)
+    pack(module, info)
+    engine = BatchEngine(module, info.metadata["past"], info.metadata["future"], wearers)
+    body = Body(None, np.tile(np.eye(3, dtype=np.float32), (6, 1, 1)), np.zeros((6, 3), np.float32))
+    bodies = dict.fromkeys(range(wearers), body)
+    costs = []
+    for _ in range(15):
+        started = time.thread_time()
+        for _ in range(20):
+            engine.push(bodies)
+        costs.append(1e6 * (time.thread_time() - started) / (20 * wearers))
+    return statistics.median(costs)
+
+
+# --- wearers ------------------------------------------------------------------------------------------------
+
+
+def packets(seconds: float) -> list[bytes]:
+    """What the six sensors of a wearer send, a chunk each hundredth of a second; the clip over and over."""
+    sensors = [simulate.rows_of(data) for data in simulate.read_input(CLIP).sensors.values()]
+    encode = PROTOCOLS["native"].encode
+    return [
+        b"".join(
+            encode(rows[k % len(rows)]._replace(sensor=i, time_us=round(1e6 * k * PERIOD_S)), k)
+            for i, rows in enumerate(sensors)
+        )
+        for k in range(int(seconds / PERIOD_S))
+    ]
+
+
+def send(wearers: int, seconds: float, names: Connection) -> None:
+    """Sends for so many wearers, each at its own phase, until this process is ended."""
+    chunks = packets(seconds)
+    masters = []
+    for _ in range(wearers):
+        master, slave = os.openpty()
+        tty.setraw(slave)
+        os.set_blocking(master, False)
+        masters.append((master, slave))
+    names.send([os.ttyname(slave) for _, slave in masters])
+    start_s = time.monotonic()
+    for k, chunk in enumerate(chunks):
+        for i, (master, _) in enumerate(masters):
+            left_s = start_s + (k + i / wearers) * PERIOD_S - time.monotonic()
+            # Sensors are not late: what cannot be sent in time, or is not read, is lost as on a real line.
+            if left_s > -PERIOD_S:
+                time.sleep(max(0.0, left_s))
+                with contextlib.suppress(BlockingIOError):
+                    os.write(master, chunk)
+
+
+def write_rigs(folder: Path, ports: list[str], address: str) -> list[str]:
+    """Rig files; gives the words that name them."""
+    none, zero = np.tile([1.0, 0.0, 0.0, 0.0], (len(PLACEMENTS), 1)), np.zeros(len(PLACEMENTS))
+    up = np.array([0.5, -0.5, -0.5, -0.5])
+    save(Calibration(up, zero, none, zero, "t-pose", "heading:0", "", {}), folder / "calib.json")
+    words = []
+    for i, port in enumerate(ports):
+        file = folder / f"wearer{i}.toml"
+        file.write_text(
+            f'port = "{port}"\nprotocol = "native"\ncalibration = "calib.json"\n'
+            f'udp = "{address},format=binary"\n'
+        )
+        words += ["--rig", str(file)]
+    return words
+
+
+# --- the whole program --------------------------------------------------------------------------------------
+
+
+def processor_s(process: int) -> float:
+    """Processor time of a process so far, seconds."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def listen(receiver: socket.socket, seconds: float) -> dict[int, list[tuple[int, float]]]:
+    """Poses that come in some seconds: by the sender's port, number and age of each."""
+    came: defaultdict[int, list[tuple[bytes, float]]] = defaultdict(list)
+    end_s = time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        data, (_, port) = receiver.recvfrom(2048)
+        came[port].append((data, time.time()))
+    poses = {port: [(decode_binary(data), at_s) for data, at_s in own] for port, own in came.items()}
+    return {port: [(pose.index, at_s - pose.time_s) for pose, at_s in own] for port, own in poses.items()}
+
+
+def all_begin(receiver: socket.socket, wearers: int) -> None:
+    """Returns when poses of so many wearers have come.
+
+    Raises:
+        TimeoutError: they do not.
+    """
+    end_s = time.monotonic() + START_S
+    begun: set[int] = set()
+    while len(begun) < wearers:
+        begun.add(receiver.recvfrom(2048)[1][1])
+        if time.monotonic() > end_s:
+            raise TimeoutError
+
+
+def whole(model: str, wearers: int, seconds: float, core: int) -> Whole:
+    """Runs the program on simulated wearers.
+
+    Raises:
+        click.ClickException: it ends early.
+    """
+    context = multiprocessing.get_context("spawn")
+    names, at_sender = context.Pipe(duplex=False)
+    sender = context.Process(
+        target=send, args=(wearers, START_S + SETTLE_S + seconds, at_sender), daemon=True
+    )
+    sender.start()
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver,
+    ):
+        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(START_S)
+        rigs = write_rigs(Path(folder), names.recv(), f"127.0.0.1:{receiver.getsockname()[1]}")
+        process = subprocess.Popen(
+            [sys.executable, "-m", "edgepose", "run", "--model", model, *rigs],
+            preexec_fn=lambda: os.sched_setaffinity(0, {core}),
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        try:
+            all_begin(receiver, wearers)
+            listen(receiver, SETTLE_S)
+            started_s, before_s = time.monotonic(), processor_s(process.pid)
+            came = listen(receiver, seconds)
+            passed_s, spent_s = time.monotonic() - started_s, processor_s(process.pid) - before_s
+        except TimeoutError:
+            process.kill()
+            raise click.ClickException(f"{wearers} wearers: not all give poses") from None
+        finally:
+            process.send_signal(signal.SIGINT)
+            process.communicate()
+            sender.terminate()
+            sender.join()
+    ages = np.array([age for own in came.values() for _, age in own])
+    expected = [own[-1][0] - own[0][0] + 1 for own in came.values()]
+    p50, p99 = np.percentile(1e3 * ages, [50, 99])
+    return Whole(
+        spent_s / passed_s,
+        p50,
+        p99,
+        float((ages > LATE_S).mean()),
+        sum(expected) - len(ages),
+        len(ages) / passed_s / wearers,
+    )
+
+
+# --- the page -----------------------------------------------------------------------------------------------
+
+
+def draw(file: Path, rows: dict[str, dict[int, tuple[float, Whole]]]) -> None:
+    """Share of the core and ages against the number of wearers."""
+    import matplotlib.pyplot as plt
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
+    for model, own in rows.items():
+        counts = list(own)
+        line = left.plot(counts, [100 * run.core for _, run in own.values()], "o-", label=f"{model}, whole")
+        color = line[0].get_color()
+        share = [us * RATE * count / 1e4 for count, (us, _) in own.items()]
+        left.plot(counts, share, ":", color=color, label=f"{model}, network")
+        right.plot(counts, [run.p99_ms for _, run in own.values()], "o-", color=color, label=f"{model}, p99")
+        right.plot(counts, [run.p50_ms for _, run in own.values()], ":", color=color, label=f"{model}, p50")
+    right.axhline(1e3 * LATE_S, color="grey", linewidth=0.8)
+    right.set_yscale("log")
+    left.set_ylabel("% of a core")
+    right.set_ylabel("age of a pose when it arrives, ms")
+    for axes in (left, right):
+        axes.set_xscale("log", base=2)
+        axes.set_xticks(counts, [str(count) for count in counts])
+        axes.set_xlabel("wearers, 60 poses a second each")
+        axes.legend()
+        axes.grid(alpha=0.3)
+    figure.savefig(file, dpi=110)
+
+
+@click.command(help=__doc__)
+@click.argument("counts", nargs=-1, type=click.IntRange(1), metavar="[WEARERS]...")
+@click.option("--model", "models", multiple=True, help="[default: rnn and birnn]")
+@click.option("--seconds", type=click.FloatRange(1), default=10.0, show_default=True, help="Of each run.")
+@click.option("--core", type=click.IntRange(0), default=0, show_default=True, help="That the program has.")
+@click.option("--draw", "picture", type=click.Path(path_type=Path), metavar="FILE", help="Draw a curve.")
+def main(
+    counts: tuple[int, ...], models: tuple[str, ...], seconds: float, core: int, picture: Path | None
+) -> None:
+    """The command line."""
+    torch.set_num_threads(1)
+    others = os.sched_getaffinity(0) - {core}
+    if not others:
+        raise click.ClickException("this machine has one core; the simulator needs another")
+    os.sched_setaffinity(0, others)
+    rows: dict[str, dict[int, tuple[float, Whole]]] = {}
+    heads = ["model", "wearers", "network us", "all us", "core", "p50 ms", "p99 ms", "late", "lost", "holds"]
+    click.echo("| " + " | ".join(heads) + " |\n" + "|---" * len(heads) + "|")
+    for model in models or ("rnn", "birnn"):
+        own = rows[model] = {}
+        for count in counts or (1, 2, 4, 8, 16, 32, 64):
+            us, run = network_us(model, count), whole(model, count, seconds, core)
+            own[count] = us, run
+            all_us = 1e6 * run.core / (count * run.per_s)
+            cells = [model, count, f"{us:.0f}", f"{all_us:.0f}", f"{run.core:.0%}"]
+            cells += [f"{run.p50_ms:.1f}", f"{run.p99_ms:.1f}", f"{run.late:.1%}", run.lost]
+            cells.append("yes" if run.holds else "no")
+            click.echo("| " + " | ".join(map(str, cells)) + " |")
+    if picture is not None:
+        draw(picture, rows)
+
+
+if __name__ == "__main__":
+    main()
