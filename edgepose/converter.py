@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -138,6 +140,8 @@ def _expand(given: Path, out: Path) -> Iterator[tuple[Path, Path]]:
             # The session that is itself given has its own name.
             yield path, Path(given.resolve().name) if path == given else path.relative_to(given)
     elif str(given) == "-":
+        if sys.stdin is None:
+            raise EdgeposeError("-: there is no standard input; name a file")
         yield given, Path("stdin")
     elif given.exists():
         yield given, Path(given.name)
@@ -164,7 +168,7 @@ def _walk(folder: Path, out: Path) -> Iterator[Path]:
         if path.is_dir():
             if not path.is_symlink() and path.resolve() != out:
                 yield from _walk(path, out)
-        elif path.suffix.lower() in ENDINGS:
+        elif path.suffix.lower() in ENDINGS and not path.is_fifo():  # which could be waited for in vain
             yield path
 
 
@@ -174,7 +178,7 @@ def convert(job: Job, options: Options = _DEFAULTS) -> Result:
         if job.target.suffix == ".bvh" or is_poses(job.source):
             if options.filter != "none":
                 raise EdgeposeError(f"{job.source}: --filter is for recordings, not for poses; leave it out")
-            job.target.parent.mkdir(parents=True, exist_ok=True)
+            _make(job.target.parent)
             return Result(job, *convert_poses(job.source, job.target, options.height_m))
         recording = _read(job.source, options.protocol, options.sensors)
         data = recording.sensors.values()
@@ -184,7 +188,7 @@ def convert(job: Job, options: Options = _DEFAULTS) -> Result:
             from edgepose.orientation.recorded import orient_recording
 
             recording = orient_recording(recording, options.filter, name=str(job.source))
-        job.target.parent.mkdir(parents=True, exist_ok=True)
+        _make(job.target.parent)
         write = WRITERS[job.target.suffix[1:]]
         replace_file(job.target, lambda path: write(path, recording), "recording")
     except EdgeposeError as error:
@@ -202,6 +206,14 @@ def convert(job: Job, options: Options = _DEFAULTS) -> Result:
     )
 
 
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = error.strerror or error
+        raise EdgeposeError(f"cannot make the folder {folder}: {reason}; choose another --out") from None
+
+
 def _read(path: Path, protocol: str, sensors: Path | None) -> Recording:
     if path.is_dir():
         read = mtmanager.read_session if mtmanager.is_session(path) else xio.read_session
@@ -212,7 +224,9 @@ def _read(path: Path, protocol: str, sensors: Path | None) -> Recording:
         return READERS[path.suffix.lower()](path)
     problems: list[str] = []
     rows = list(_samples(path, protocol, sensors, problems))
-    recording = from_samples(rows, {"source": path.name}, name=str(path), salvage=True)
+    # Names need not be text.
+    name = os.fsencode(path.name).decode(errors="replace")
+    recording = from_samples(rows, {"source": name}, name=str(path), salvage=True)
     problems += [recording.damage] if recording.damage else []
     return recording._replace(damage="; ".join(problems) or None)
 

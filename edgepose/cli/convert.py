@@ -124,7 +124,7 @@ def _with_progress(results: Iterable[Result], count: int) -> Iterator[Result]:
         return
     for number, result in enumerate(results, start=1):
         yield result  # first: what is told must be in the table, whenever Ctrl-C comes
-        click.echo(f"{number} of {count}  {result.job.source}: {describe(result)}", err=True)
+        click.echo(_printable(f"{number} of {count}  {result.job.source}: {describe(result)}"), err=True)
 
 
 def _table(results: Sequence[Result]) -> str:
@@ -134,5 +134,10 @@ def _table(results: Sequence[Result]) -> str:
     lines = [f"{'file':{width}}  {'samples':>9}  {'seconds':>9}  result"]
     for result in results:
         counts = f"{result.samples:9d}  {result.seconds:9.1f}" if result.samples else f"{'-':>9}  {'-':>9}"
-        lines.append(f"{result.job.source!s:{width}}  {counts}  {describe(result)}")
+        lines.append(_printable(f"{result.job.source!s:{width}}  {counts}  {describe(result)}"))
     return "\n".join(lines)
+
+
+def _printable(line: str) -> str:
+    """A line in which the names of files may have any bytes, without what would break it."""
+    return "".join(character if character.isprintable() else "?" for character in line)

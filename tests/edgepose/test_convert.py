@@ -383,6 +383,37 @@ def test_patterns_folders_and_names(tmp_path, monkeypatch):
     ]
 
 
+def test_names_that_are_no_text_and_a_pipe(command, tmp_path):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    names = [b"na\xefme.bin", "n\u00e4.bin".encode(), b"new\nline.bin"]
+    for name in names:
+        (folder / os.fsdecode(name)).write_bytes(b"".join(map(encode, packets())))
+    os.mkfifo(folder / "pipe.csv")  # nobody writes to it
+    for to in ("csv", "npz"):
+        result = command("convert", folder, "--to", to, "--out", tmp_path / to)
+        assert result.returncode == 0, result.stderr
+        shown = [line.split("/")[-1] for line in result.stdout.splitlines()[1:]]
+        assert [line[:12].rstrip() for line in sorted(shown)] == ["na?me.bin", "new?line.bin", "n\u00e4.bin"]
+        written = sorted(os.fsencode(path.name) for path in (tmp_path / to).iterdir())
+        assert written == sorted(name.replace(b"bin", to.encode()) for name in names)
+        for path in (tmp_path / to).iterdir():
+            assert read_recording(path).metadata["source"].encode()
+
+
+def test_no_place_to_write_and_no_standard_input(command, tmp_path):
+    (tmp_path / "a.csv").touch()
+    result = command("convert", REAL, "--to", "csv", "--out", tmp_path / "a.csv" / "b")
+    assert result.returncode == 1
+    folder = re.escape(str(tmp_path / "a.csv" / "b"))
+    assert re.search(rf"failed: cannot make the folder {folder}: .*; choose another --out\n", result.stdout)
+    words = [sys.executable, "-m", "edgepose", "convert", "-", "--to", "csv", "--out", str(tmp_path / "o")]
+    closed = ["sh", "-c", 'exec "$@" <&-', "sh", *words]
+    result = subprocess.run(closed, text=True, capture_output=True, check=False)
+    assert result.returncode == 1
+    assert result.stderr == "edgepose: -: there is no standard input; name a file\n"
+
+
 @pytest.mark.parametrize(
     ("inputs", "out", "says"),
     [
