@@ -7,6 +7,7 @@ frame, and more; 60 Hz.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ RATE = 60.0
 
 MAX_FRAMES = 1_000_000
 _NUMBERS = 7  # of each line: quaternion and acceleration; AuxFields has more behind them
+_LONGEST_LINE = 4096
 _TILT_DEG = 30.0  # of what a sensor measures on average over a take
 _METADATA = {
     "rate": f"{RATE:g}",
@@ -64,7 +66,7 @@ def read_sensors(path: Path) -> tuple[Array, Array]:
     """
     try:
         with path.open(encoding="ascii", errors="replace") as file:
-            lines = iter(enumerate(file, start=1))
+            lines = enumerate(iter(partial(file.readline, _LONGEST_LINE), ""), start=1)
             sensors, frames = _counts(path, next(lines, (1, ""))[1])
             values = np.empty((frames, len(NAMES), _NUMBERS))
             for frame in range(frames):

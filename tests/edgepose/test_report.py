@@ -21,6 +21,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.pose import PoseFrame, longest_holds
 from edgepose.poses import read_poses
 from edgepose.report import write_report
+from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.csv_file import CsvSink
 from edgepose.skeleton import JOINTS, default_body, local_from_global
 from edgepose_export.mocap import read_motion
@@ -195,6 +196,19 @@ def test_page_of_a_single_pose_to_another_file(command, tmp_path):
     page = Page((tmp_path / "b.html").read_text(encoding="utf-8"))
     assert "No walking was found." in page.words
     assert re.search(r"1 poses, 0\.0 s", page.words)
+
+
+def test_page_of_a_bvh_file(command, tmp_path):
+    local, rate = motion(WALK)
+    with BvhSink(tmp_path / "a.bvh", rate) as sink:
+        for i, rotations in enumerate(local):
+            sink.write(PoseFrame(i, i / rate, "ok", rotations, np.zeros(24)))
+    result = command("report", tmp_path / "a.bvh")
+    assert result.returncode == 0, result.stderr
+    page = Page((tmp_path / "a.html").read_text(encoding="utf-8"))
+    (walk,) = walks(local, default_body().offsets, rate)
+    steps = {row[0]: row[1:] for row in page.rows}["steps"][0]
+    assert steps.startswith(f"{len(walk.frames)} in ")
 
 
 @pytest.mark.parametrize(

@@ -31,6 +31,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.mannequin import TIPS, build, ground
 from edgepose.pose import PoseFrame, held_sensors
 from edgepose.poses import read_poses
+from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.csv_file import CsvSink
 from edgepose.sinks.udp import UdpSink, decode, encode_binary, encode_json
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics
@@ -304,6 +305,15 @@ def test_poses_of_a_file_in_the_browser(browser, tmp_path):
             until(lambda: number() == 1, "the first pose")
         time.sleep(0.6)
         assert number() == 1
+
+
+def test_poses_of_a_bvh_file(tmp_path):
+    with BvhSink(tmp_path / "poses.bvh") as sink:
+        for i in range(60):
+            sink.write(standing(i))
+    port = free_port()
+    with started("view", tmp_path / "poses.bvh", "--port", port) as process:
+        assert f"open http://127.0.0.1:{port} in a browser" in process.stderr.readline()
 
 
 @needs_browser
