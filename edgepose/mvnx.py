@@ -72,14 +72,17 @@ def _samples(path: Path, frames: _Frames, problems: list[str]) -> Iterator[ImuSa
     except OSError as error:
         raise EdgeposeError(f"{path}: cannot read it: {error.strerror or error}") from None
     if not frames.count:
-        raise EdgeposeError(f"{path}: no frame of an MVNX recording ({broken or 'of the type normal'})")
+        why = broken or "of the type normal"
+        raise EdgeposeError(f"{path}: no frame of an MVNX recording ({why}); export it from MVN again")
     if frames.bad == frames.count:
         raise EdgeposeError(
             f"{path}: no frame has whole lists of its sensors' numbers; export sensorOrientation and "
             "sensorFreeAcceleration, too"
         )
     if broken:
-        problems.append(f"{path} breaks off ({broken}); the {frames.count} frames before that are taken")
+        problems.append(
+            f"{path}: breaks off ({broken}), {frames.count} frames before that are good; copy the file again"
+        )
     if frames.bad:
         problems.append(f"{path}: {frames.bad} bad frames left out")
 

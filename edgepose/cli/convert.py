@@ -86,7 +86,7 @@ def convert(
       edgepose convert walk.part.csv --to npz --out saved
       edgepose convert raw.csv --to npz --out oriented --filter smoother
       edgepose convert poses/ --to bvh --out for-blender --jobs 2 --height 1.68
-      edgepose run --file walk.npz --calibration calib.json --csv - | edgepose convert - --to bvh --out .
+      edgepose run --file walk.npz ... --csv - | edgepose convert - --to bvh --out .
     """
     from edgepose.converter import Options, Result, convert_all, plan
     from edgepose.skeleton import default_body
