@@ -72,6 +72,7 @@ class PoseNetwork(nn.Module):
         """Random weights for a shape."""
         super().__init__()
         self.shape = shape
+        self.dropout = nn.Dropout(0.0)  # between the layers; how much is the training's business
         both = shape.kind == "birnn"
         width = shape.hidden * (2 if both else 1)
         outputs = shape.pose_outputs + ACCELERATIONS
@@ -84,8 +85,9 @@ class PoseNetwork(nn.Module):
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Normalised means and standard deviations (B, T, outputs) of z-scored inputs (B, T, inputs)."""
         x = torch.relu(self.dense(x))
-        x, _ = self.lstm1(x)
-        x, _ = self.lstm2(x)
+        x, _ = self.lstm1(self.dropout(x))
+        x, _ = self.lstm2(self.dropout(x))
+        x = self.dropout(x)
         return self.mean(x), nn.functional.softplus(self.deviation(x)) + SIGMA_FLOOR
 
 

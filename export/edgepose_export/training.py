@@ -22,7 +22,7 @@ from edgepose.skeleton import PARENTS
 from edgepose_export.archive import KINDS, Statistics, new_network
 from edgepose_export.augmentation import Augmentation, augment
 from edgepose_export.dataset import Tape, describe
-from edgepose_export.networks import NetworkShape
+from edgepose_export.networks import NetworkShape, PoseNetwork
 from edgepose_export.normalisation import SCHEMES, network_inputs, seen_from_first
 from edgepose_export.processes import ALONE, Processes
 
@@ -53,6 +53,9 @@ class TrainConfig:
         seated_share: share of the sequences taken from takes with made sitting, where there are any; the
             other shares are of the rest.
         input_dropout: share of the inputs set to zero (DIP: 0.2).
+        dropout: share of the numbers between the layers of an RNN or BiRNN set to zero.
+        smoothness: weight of the squared second differences in time of the pose's error, in normalised units:
+            what it costs to tremble where the wearer does not.
         learning_rate: of Adam.
         warm_up: steps in which the learning rate rises to its first value.
         schedule: "exponential" (DIP: times 0.96 every 2000 steps) or "cosine" down to zero at the last step.
@@ -74,6 +77,8 @@ class TrainConfig:
     free_share: float = 0.0
     seated_share: float = 0.0
     input_dropout: float = 0.2
+    dropout: float = 0.0
+    smoothness: float = 0.0
     learning_rate: float = 1e-3
     warm_up: int = 200
     schedule: str = "exponential"
@@ -144,6 +149,8 @@ def config_from(values: dict[str, Any]) -> TrainConfig:
         raise ValueError('measured = "passed" needs targets = "global-6d"')
     if config.acceleration_loss and not config.network.acceleration:
         raise ValueError("a network without accelerations cannot give them back: acceleration_loss = false")
+    if config.dropout and KINDS[config.network.kind] is not PoseNetwork:
+        raise ValueError('dropout is for the layers of kind = "birnn" or "rnn"')
     return config
 
 
@@ -166,6 +173,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "warm_up": (0, 10**9),
     "averaging": (0.0, 1.0),
     "input_dropout": (0.0, 0.99),
+    "dropout": (0.0, 0.99),
     "free_share": (0.0, 1.0),
     "seated_share": (0.0, 1.0),
     "aligned": (0.0, 1.0),
@@ -252,6 +260,16 @@ def likelihood_loss(mean: Tensor, deviation: Tensor, target: Tensor, beta: float
     if beta:
         loss = loss * deviation.detach() ** (2.0 * beta)
     return loss.mean()
+
+
+def tremble_loss(mean: Tensor, target: Tensor) -> Tensor:
+    """Mean square of the second differences in time of the error of (B, T, numbers); a scalar.
+
+    Of two poses that are as wrong it prefers that whose error changes slowly, so that motion stays as smooth
+    as it was.
+    """
+    error = mean - target
+    return (error[:, 2:] - 2.0 * error[:, 1:-1] + error[:, :-2]).square().mean()
 
 
 # --- batches ------------------------------------------------------------------------------------------------
@@ -349,6 +367,8 @@ class Trainer:
         self.network = new_network(config.network).to(processes.device)
         self.averaged = new_network(config.network).to(processes.device)
         self.averaged.load_state_dict(self.network.state_dict())
+        if isinstance(self.network, PoseNetwork):
+            self.network.dropout.p = config.dropout
         self.parallel = processes.wrapped(self.network)
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate)
         self._seed(0)
@@ -366,7 +386,13 @@ class Trainer:
     def _placed(self, statistics: Statistics) -> Statistics:
         return Statistics(*(numbers.to(self.processes.device) for numbers in statistics))
 
-    def _loss(self, network: nn.Module, batch: tuple[Tensor, Tensor, Tensor], dropout: float) -> Tensor:
+    def _loss(
+        self,
+        network: nn.Module,
+        batch: tuple[Tensor, Tensor, Tensor],
+        dropout: float = 0.0,
+        smoothness: float = 0.0,
+    ) -> Tensor:
         config, s = self.config, self.statistics
         orientation, acceleration, relative = (part.to(self.processes.device) for part in batch)
         x = (inputs_of(orientation, acceleration, config.network) - s.input_mean) / s.input_std
@@ -375,10 +401,12 @@ class Trainer:
             target = torch.cat([target, x[..., -ACCELERATIONS:]], dim=-1)
         with torch.autocast(x.device.type, torch.bfloat16, enabled=config.bf16):
             mean, deviation = network(nn.functional.dropout(x, dropout, training=dropout > 0))
-        numbers = target.shape[-1]
-        return likelihood_loss(
-            mean[..., :numbers].float(), deviation[..., :numbers].float(), target, config.beta
-        )
+        numbers, pose = target.shape[-1], config.network.pose_outputs
+        mean = mean[..., :numbers].float()
+        loss = likelihood_loss(mean, deviation[..., :numbers].float(), target, config.beta)
+        if smoothness:
+            loss = loss + smoothness * tremble_loss(mean[..., :pose], target[..., :pose])
+        return loss
 
     def train_step(self) -> float:
         """One optimiser step; gives its loss."""
@@ -396,7 +424,7 @@ class Trainer:
         if seated:
             starts = torch.cat([starts, draw(self.seated_starts, seated, 0.0, self.generator)])
         batch = augment(windows(self.train_tape, starts, config.window), config.augmentation, self.generator)
-        loss = self._loss(self.parallel, batch, config.input_dropout)
+        loss = self._loss(self.parallel, batch, config.input_dropout, config.smoothness)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
@@ -415,11 +443,11 @@ class Trainer:
 
     @torch.no_grad()
     def validate(self) -> float:
-        """Loss of the averaged weights on undisturbed validation windows."""
+        """Likelihood loss of the averaged weights on undisturbed validation windows."""
         starts, total = self._validation_starts(), torch.zeros(2)
         for part in starts.split(128) if len(starts) else ():
             batch = windows(self.validation_tape, part, self.config.window)
-            total += torch.stack([self._loss(self.averaged, batch, 0.0).cpu(), torch.tensor(1.0)]) * len(part)
+            total += torch.stack([self._loss(self.averaged, batch).cpu(), torch.tensor(1.0)]) * len(part)
         loss, count = self.processes.total(total)
         return float(loss / count)
 

@@ -138,6 +138,34 @@ def test_loss_is_the_likelihood():
     torch.testing.assert_close(deviation.grad, (plain * deviation / 35).detach())
 
 
+def test_trembling_costs_and_a_steady_error_does_not(takes):
+    true = torch.linspace(0, 1, 9)[None, :, None].expand(2, 9, 3)
+    steady = true + torch.linspace(0.1, 0.5, 9)[:, None]
+    trembling = true + 0.1 * torch.tensor([1.0, -1.0]).repeat(5)[:9, None]
+    assert training.tremble_loss(steady, true) < 1e-12
+    torch.testing.assert_close(training.tremble_loss(trembling, true), torch.tensor(0.4**2))
+    smooth = replace(SMALL, smoothness=100.0)
+
+    def trembles(config, takes):
+        one = trainer(takes, replace(config, warm_up=0, learning_rate=1e-2))
+        for _ in range(60):
+            one.train_step()
+        x, _ = one.averaged(torch.randn(4, 20, 60, generator=torch.Generator().manual_seed(1)))
+        return training.tremble_loss(x, torch.zeros_like(x))
+
+    assert trembles(smooth, takes) < 0.5 * trembles(SMALL, takes)
+
+
+def test_dropout_is_between_the_layers_and_in_training_only(takes):
+    whole, dropped = (trainer(takes, replace(SMALL, dropout=share)) for share in (0.0, 0.5))
+    assert whole.validate() == dropped.validate()
+    assert whole.train_step() != dropped.train_step()
+    batch = training.windows(dropped.train_tape, torch.tensor([0]), 20)
+    first, again = (dropped._loss(dropped.network, batch) for _ in range(2))
+    assert first != again
+    assert whole._loss(whole.network, batch) == whole._loss(whole.network, batch)
+
+
 def test_accelerations_are_reconstructed_too(takes):
     """The loss of a network that says 0 +- 1 for everything is half the mean square of all its targets."""
     one = trainer(takes, replace(SMALL, beta=0.0))
@@ -537,6 +565,7 @@ def test_config_that_differs_from_another(tmp_path):
         ("schedule = 'linear'", "schedule is 'linear'; it takes 'exponential' or 'cosine'"),
         ("schedule = []", "schedule is []; it takes a text"),
         ("speed = 1", "unknown field 'speed'"),
+        ('dropout = 0.1\n[network]\nkind = "wavenet"', "dropout is for the layers of"),
         ("network = 3", r"network is 3; it takes a table [network]"),
         ("[network]\nkind = 'gru'", "kind is 'gru'; it takes 'birnn' or 'rnn'"),
         ("[network]\nhidden = 0", "hidden is 0; it takes 1 to"),
