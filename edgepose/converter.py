@@ -118,7 +118,8 @@ def plan(inputs: Sequence[Path], to: str, out: Path) -> list[Job]:
             other = jobs.setdefault(job.target, job)
             if other.source != source:
                 raise EdgeposeError(
-                    f"{other.source} and {source} would both become {job.target}; convert them apart"
+                    f"{other.source} and {source} would both become {job.target}; convert them apart, each "
+                    "with an --out of its own"
                 )
     sources = {job.source.resolve() for job in jobs.values()}
     for job in jobs.values():
