@@ -204,8 +204,7 @@ def whole(model: str, wearers: int, seconds: float, core: int) -> Whole:
         process = subprocess.Popen(
             [sys.executable, "-m", "edgepose", "run", "--model", model, *rigs],
             preexec_fn=lambda: os.sched_setaffinity(0, {core}),
-            stderr=subprocess.PIPE,
-            text=True,
+            stderr=subprocess.DEVNULL,
         )
         try:
             all_begin(receiver, wearers)
@@ -218,7 +217,7 @@ def whole(model: str, wearers: int, seconds: float, core: int) -> Whole:
             raise click.ClickException(f"{wearers} wearers: not all give poses") from None
         finally:
             process.send_signal(signal.SIGINT)
-            process.communicate()
+            process.wait()
             sender.terminate()
             sender.join()
     ages = np.array([age for own in came.values() for _, age in own])

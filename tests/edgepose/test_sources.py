@@ -119,6 +119,32 @@ def test_silent_port_still_gives_batches(port):
     assert all(b[0] > a[0] for a, b in pairwise(times))
 
 
+def test_a_source_that_does_not_wait(port, caplog):
+    """Looked at whenever one likes; also while its port is gone and after it is back."""
+    master, name = port
+    got = []
+
+    def look_until(wanted):
+        while not wanted():
+            now_s, batch = next(batches)
+            assert abs(now_s - time.time()) < 1.0
+            got.extend(batch)
+            time.sleep(0.004)
+
+    with open_source(port=name, waits=False) as source:
+        batches = iter(source)
+        assert [next(batches)[1] for _ in range(100)] == [[]] * 100
+        with Device(master, chunks(300)):
+            look_until(lambda: len(got) > 300)
+        os.close(master)
+        look_until(lambda: "gone; the run goes on" in caplog.text)
+    assert {s.sensor for s in got} == set(range(6))
+    for sensor in range(6):
+        assert all(b > a for a, b in pairwise(s.time_s for s in got if s.sensor == sensor))
+    assert source.counters.packets == len(got)
+    assert source.counters.lost == 0
+
+
 def test_unknown_ids_are_counted_and_told_once(port, caplog):
     master, name = port
     with open_source(port=name) as source, Device(master, chunks(200, ids=(0, 9))):
@@ -536,6 +562,16 @@ def test_capture_without_packets(tmp_path):
 def test_missing_file(tmp_path, name):
     with pytest.raises(EdgeposeError, match="No such file"):
         everything(file=tmp_path / name)
+
+
+def test_realtime_without_waiting_gives_the_same_and_empty_batches_between(tmp_path):
+    (tmp_path / "a.bin").write_bytes(b"".join(chunks(20)))
+    with open_source(file=tmp_path / "a.bin", realtime=True, waits=False) as source:
+        batches = list(source)
+    _, _, alone = everything(file=tmp_path / "a.bin")
+    assert [sample for _, batch in batches for sample in batch] == alone
+    assert [] in [batch for _, batch in batches]
+    assert all(b[0] >= a[0] for a, b in pairwise(batches))
 
 
 def test_realtime_takes_its_time(tmp_path):

@@ -191,6 +191,18 @@ def test_no_drift_and_no_missing_index_in_ten_minutes():
     assert clock.dropped == clock.restarts == 0
 
 
+@pytest.mark.parametrize("start_s", [0.0, 0.013, 1.7e9 + 0.021])
+def test_on_a_grid_ticks_are_those_of_other_clocks(start_s):
+    clock = FrameClock(grid=True)
+    for sensor in rig(offsets=(start_s,) * 6, seconds=0.5):
+        clock.push(sensor, start_s)
+    (first, *_), frames = clock.frames(start_s + 0.2), clock.flush()
+    assert 0.0 <= first.time_s - start_s < 1.0 / 60.0
+    ticks = np.array([frame.time_s for frame in frames]) * 60.0
+    np.testing.assert_allclose(ticks, np.round(ticks), atol=1e-4)
+    np.testing.assert_allclose(np.diff(ticks), 1.0, atol=1e-4)
+
+
 def test_hold_takes_the_last_sample():
     streams = rig()
     clock = FrameClock(60.0, "hold")
