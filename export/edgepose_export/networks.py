@@ -85,10 +85,16 @@ class PoseNetwork(nn.Module):
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Normalised means and standard deviations (B, T, outputs) of z-scored inputs (B, T, inputs)."""
         x = torch.relu(self.dense(x))
-        x, _ = self.lstm1(self.dropout(x))
-        x, _ = self.lstm2(self.dropout(x))
-        x = self.dropout(x)
+        x, _ = self.lstm1(self._dropped(x))
+        x, _ = self.lstm2(self._dropped(x))
+        x = self._dropped(x)
         return self.mean(x), nn.functional.softplus(self.deviation(x)) + SIGMA_FLOOR
+
+    def _dropped(self, x: Tensor) -> Tensor:
+        """The same units of (B, T, units) for a whole sequence (Gal, Ghahramani 2016), so that outputs do not
+        tremble.
+        """
+        return x * self.dropout(torch.ones_like(x[:, :1])) if self.training and self.dropout.p else x
 
 
 class PoseDecoder(nn.Module):

@@ -53,7 +53,7 @@ class TrainConfig:
         seated_share: share of the sequences taken from takes with made sitting, where there are any; the
             other shares are of the rest.
         input_dropout: share of the inputs set to zero (DIP: 0.2).
-        dropout: share of the numbers between the layers of an RNN or BiRNN set to zero.
+        dropout: share of the units between the layers of an RNN or BiRNN set to zero, others a sequence.
         smoothness: weight of the squared second differences in time of the pose's error, in normalised units:
             what it costs to tremble where the wearer does not.
         learning_rate: of Adam.
