@@ -156,15 +156,22 @@ def processor_s(process: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def listen(receiver: socket.socket, seconds: float) -> dict[int, list[tuple[int, float]]]:
-    """Poses that come in some seconds: by the sender's port, number and age of each."""
-    came: defaultdict[int, list[tuple[bytes, float]]] = defaultdict(list)
+class Datagram(NamedTuple):
+    """A pose as it came: the sender's port, which tells wearers apart, the bytes, and Unix time, seconds."""
+
+    port: int
+    data: bytes
+    at_s: float
+
+
+def listen(receiver: socket.socket, seconds: float) -> list[Datagram]:
+    """What comes in some seconds."""
+    came = []
     end_s = time.monotonic() + seconds
     while time.monotonic() < end_s:
         data, (_, port) = receiver.recvfrom(2048)
-        came[port].append((data, time.time()))
-    poses = {port: [(decode_binary(data), at_s) for data, at_s in own] for port, own in came.items()}
-    return {port: [(pose.index, at_s - pose.time_s) for pose, at_s in own] for port, own in poses.items()}
+        came.append(Datagram(port, data, time.time()))
+    return came
 
 
 def all_begin(receiver: socket.socket, wearers: int) -> None:
@@ -220,15 +227,19 @@ def whole(model: str, wearers: int, seconds: float, core: int) -> Whole:
             process.wait()
             sender.terminate()
             sender.join()
-    ages = np.array([age for own in came.values() for _, age in own])
-    expected = [own[-1][0] - own[0][0] + 1 for own in came.values()]
+    poses = [decode_binary(datagram.data) for datagram in came]
+    ages = np.array([datagram.at_s - pose.time_s for datagram, pose in zip(came, poses, strict=True)])
+    numbers: defaultdict[int, list[int]] = defaultdict(list)
+    for datagram, pose in zip(came, poses, strict=True):
+        numbers[datagram.port].append(pose.index)
+    expected = sum(own[-1] - own[0] + 1 for own in numbers.values())
     p50, p99 = np.percentile(1e3 * ages, [50, 99])
     return Whole(
         spent_s / passed_s,
         p50,
         p99,
         float((ages > LATE_S).mean()),
-        sum(expected) - len(ages),
+        expected - len(ages),
         len(ages) / passed_s / wearers,
     )
 

@@ -20,6 +20,8 @@ from edgepose.errors import EdgeposeError
 from edgepose.precision import CHOICES, pack
 
 if TYPE_CHECKING:
+    import torch
+
     from edgepose.engine import BatchEngine, Engine
     from edgepose.pipeline import RunSummary, Walk
 
@@ -116,20 +118,7 @@ def run(
             stack.enter_context(keys)
         module = archive.load(info, trust)
         precision = pack(module, info, precision, _say)
-        from edgepose.engine import BatchEngine, StreamEngine, WindowEngine
-
-        # What int8 weights are multiplied with is scaled with all that is computed at once.
-        apart = precision == "int8"
-        engine: Engine | BatchEngine
-        if several:
-            engine = BatchEngine(module, past, future, len(rigs), apart)
-        elif windows:
-            engine = WindowEngine(module, past, future)
-        else:
-            # Of a recording nobody waits for single poses.
-            file = rigs[0].source.file
-            many = not live and file is not None and file.is_file() and hasattr(module, "stream_many")
-            engine = StreamEngine(module, past, future, TOGETHER if many and not apart else 1)
+        engine = _engine(module, past, future, rigs, windows, precision)
         stop = stack.enter_context(Stop())
         for rig in opened:
             rig.open_outputs(stack, rate)
@@ -149,6 +138,30 @@ def run(
         raise EdgeposeError(f"{len(failed)} of {len(rigs)} wearers failed: {told}")
     for error in failed.values():
         raise error
+
+
+def _engine(
+    module: torch.jit.ScriptModule,
+    past: int,
+    future: int,
+    rigs: list[RigFlags],
+    windows: bool,
+    precision: str,
+) -> Engine | BatchEngine:
+    """What makes poses of these wearers' frames."""
+    from edgepose.engine import BatchEngine, StreamEngine, WindowEngine
+
+    # What int8 weights are multiplied with is scaled with all that is computed at once.
+    apart = precision == "int8"
+    if len(rigs) > 1:
+        return BatchEngine(module, past, future, len(rigs), apart)
+    if windows:
+        return WindowEngine(module, past, future)
+    # Of a recording nobody waits for single poses.
+    source = rigs[0].source
+    recorded = not source.live and source.file is not None and source.file.is_file()
+    many = recorded and not apart and hasattr(module, "stream_many")
+    return StreamEngine(module, past, future, TOGETHER if many else 1)
 
 
 def _walks(
