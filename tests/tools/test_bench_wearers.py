@@ -37,13 +37,14 @@ def test_a_row_says_what_wearers_cost(rows):
         "holds",
     ]
     assert len(line) == len(head)
-    (row,) = own
+    row, most = own
     assert row[:2] == ["rnn", "2"]
     network_us, all_us, p50_ms, p99_ms = (
         float(row[head.index(name)]) for name in ("network us", "all us", "p50 ms", "p99 ms")
     )
     assert 0.0 < network_us < all_us
     assert 0.0 < p50_ms <= p99_ms
+    assert most == [f"rnn: most that hold {2 if row[-1] == 'yes' else 0}"]
 
 
 def test_the_curve_is_drawn(rows):
