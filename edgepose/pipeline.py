@@ -8,10 +8,12 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edgepose.calibration import apply
 from edgepose.engine import Body, Engine, EngineOutput
 from edgepose.errors import EdgeposeError
+from edgepose.held import carried
 from edgepose.imu import ImuFrame, ImuSample
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseFrame
@@ -95,6 +97,7 @@ class Walk:
         self._headings, self._sinks, self._orient, self._tell = headings, sinks, orient, tell
         self._on_pose = on_pose
         self._silences = Silences()
+        self._bones: NDArray[np.float64] | None = None  # of the frame before
 
     def take(self, now_s: float, samples: list[ImuSample], behind_s: float) -> Iterator[Body]:
         """Bodies of the frames that are ready after a batch that has waited for so long, seconds."""
@@ -146,8 +149,10 @@ class Walk:
                 self._tell(line)
             calibration = self._headings.at(frame)
             if calibration is not None:
-                orientation, force = apply(calibration, frame.orientation, frame.force)
-                yield Body(frame, orientation.astype(np.float32), force.astype(np.float32))
+                bones, acceleration = apply(calibration, frame.orientation, frame.force)
+                bones, acceleration = carried(bones, acceleration, frame.held, self._bones)
+                self._bones = bones
+                yield Body(frame, bones.astype(np.float32), acceleration.astype(np.float32))
 
 
 def run(

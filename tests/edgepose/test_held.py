@@ -1,0 +1,56 @@
+import numpy as np
+import pytest
+
+from edgepose import rotations as rot
+from edgepose.held import carried
+from edgepose.placements import PLACEMENTS, ROOT
+
+
+@pytest.fixture
+def walk():
+    """A body (30, 6, 3, 3) that turns as one, and accelerations (30, 6, 3)."""
+    random = np.random.default_rng(3)
+    bones = rot.rotvec_to_matrix(random.normal(size=(6, 3)))
+    turns = rot.about_axis("y", np.linspace(0.0, 2.0, 30))[:, None]
+    return turns @ bones, random.normal(size=(30, 6, 3))
+
+
+def through(orientation, acceleration, held):
+    result, before = [], None
+    for frame in zip(orientation, acceleration, held, strict=True):
+        before, a = carried(*frame, before)
+        result.append((before, a))
+    return [np.stack(column) for column in zip(*result, strict=True)]
+
+
+def test_a_silent_bone_turns_with_the_pelvis(walk):
+    true, acceleration = walk
+    measured, held = true.copy(), np.zeros((30, 6), bool)
+    head, arm = PLACEMENTS.index("head"), PLACEMENTS.index("left_forearm")
+    for sensor, start in ((head, 10), (arm, 20)):
+        measured[start:, sensor], held[start:, sensor] = measured[start, sensor], True
+    given = measured.copy()
+    orientation, a = through(measured, acceleration, held)
+    np.testing.assert_allclose(orientation, true, atol=1e-12)
+    np.testing.assert_array_equal(a[held], np.repeat(acceleration[:, ROOT : ROOT + 1], 6, 1)[held])
+    np.testing.assert_array_equal(a[~held], acceleration[~held])
+    np.testing.assert_array_equal(measured, given)  # the frames themselves are not changed
+
+
+def test_what_measures_again_counts_at_once(walk):
+    true, acceleration = walk
+    held = np.zeros((30, 6), bool)
+    held[5:15, 0] = True
+    measured = true.copy()
+    measured[15:, 0] = measured[15:, 0] @ rot.about_axis("x", 1.0)  # it bent meanwhile
+    orientation, _ = through(measured, acceleration, held)
+    np.testing.assert_array_equal(orientation[15:], measured[15:])
+
+
+def test_without_the_pelvis_nothing_moves(walk):
+    true, acceleration = walk
+    held = np.zeros((30, 6), bool)
+    held[5:, [0, ROOT]] = True
+    orientation, a = through(true, acceleration, held)
+    np.testing.assert_array_equal(orientation, true)
+    np.testing.assert_array_equal(a, acceleration)

@@ -1,0 +1,158 @@
+"""What a lost sensor, a slipped sensor or a wrong heading costs in accuracy.
+
+    OMP_NUM_THREADS=1 python tools/bench_robustness.py --data recordings --model birnn --model rnn
+
+Held-out takes (recordings of `edgepose synthesize`) run through an archive as `edgepose run` runs them, once
+as they are and once with each fault. Of the rows of a lost sensor only the frames in which it is lost count;
+what the same frames give without the fault stands beside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from edgepose import archive
+from edgepose import rotations as rot
+from edgepose.held import carried
+from edgepose.metrics import joint_angle_error, sip_error
+from edgepose.placements import PLACEMENTS, ROOT
+from edgepose_export.dataset import RATE, Take
+from edgepose_export.evaluation import Mode, groups, modes_of, run_archive, takes_of
+from edgepose_export.splits import HELD_OUT
+
+Array = NDArray[np.float64]
+
+LOST_S, BACK_S = 5.0, 5.0
+"""How long a sensor is lost, and there again, by turns; a take begins with all sensors."""
+
+ERROR_DEG = 10.0
+"""Of each sensor against its bone, or of each heading against the pelvis'."""
+
+
+class Fault(NamedTuple):
+    """Something that goes wrong.
+
+    Attributes:
+        apply: gives the take as the sensors then measure it.
+        counts: (T,) which frames of a take of T frames show it.
+    """
+
+    apply: Callable[[Take], Take]
+    counts: Callable[[int], NDArray[np.bool_]]
+
+
+def lost(frames: int) -> NDArray[np.bool_]:
+    """(frames,) whether a sensor that goes and comes is lost; a short take loses its second half."""
+    time_s = np.arange(frames) / RATE
+    if time_s[-1] < BACK_S:
+        return time_s > 0.5 * time_s[-1]
+    return time_s % (BACK_S + LOST_S) >= BACK_S
+
+
+def without(sensor: int) -> Fault:
+    """A sensor that is lost now and then; the bone is then treated as in a run."""
+
+    def apply(take: Take) -> Take:
+        gone = lost(len(take.pose))
+        last = np.maximum.accumulate(np.where(gone, 0, np.arange(len(gone))))
+        orientation, acceleration = take.orientation.copy(), take.acceleration.copy()
+        orientation[:, sensor], acceleration[:, sensor] = (
+            orientation[last, sensor],
+            acceleration[last, sensor],
+        )
+        here, before = np.arange(len(PLACEMENTS)) == sensor, None
+        for t, held in enumerate(gone[:, None] & here):
+            before, acceleration[t] = carried(orientation[t], acceleration[t], held, before)
+            orientation[t] = before
+        return take._replace(orientation=orientation, acceleration=acceleration)
+
+    return Fault(apply, lost)
+
+
+def always(frames: int) -> NDArray[np.bool_]:
+    """(frames,) all of them."""
+    return np.ones(frames, bool)
+
+
+def _random(take: Take) -> np.random.Generator:
+    return np.random.default_rng([*take.name.encode()])
+
+
+def slipped(take: Take) -> Take:
+    """Each sensor turned against its bone about a random axis, another in each take."""
+    axes = _random(take).normal(size=(len(PLACEMENTS), 3))
+    axes *= np.radians(ERROR_DEG) / np.linalg.norm(axes, axis=-1, keepdims=True)
+    turned = take.orientation @ rot.rotvec_to_matrix(axes)
+    return take._replace(orientation=turned.astype(np.float32))
+
+
+def misheaded(take: Take) -> Take:
+    """The heading of each sensor but the pelvis' turned to a random side, other sides in each take."""
+    vectors = np.zeros((len(PLACEMENTS), 3))
+    vectors[:ROOT, 1] = np.radians(ERROR_DEG) * _random(take).choice([-1.0, 1.0], ROOT)
+    turns = rot.rotvec_to_matrix(vectors)
+    return take._replace(
+        orientation=(turns @ take.orientation).astype(np.float32),
+        acceleration=np.einsum("sij,tsj->tsi", turns, take.acceleration).astype(np.float32),
+    )
+
+
+FAULTS = {
+    **{f"{name} lost": without(i) for i, name in enumerate(PLACEMENTS)},
+    f"each sensor slipped by {ERROR_DEG:g} deg": Fault(slipped, always),
+    f"each heading wrong by {ERROR_DEG:g} deg": Fault(misheaded, always),
+}
+
+
+def errors(poses: Sequence[Array], takes: Sequence[Take], fault: Fault) -> list[Array]:
+    """(N, 2) for each take: error of 15 joints and SIP error, degrees, of the frames that show the fault."""
+    return [
+        np.stack([joint_angle_error(pose, take.pose), sip_error(pose, take.pose)], 1)[
+            fault.counts(len(take.pose))
+        ]
+        for pose, take in zip(poses, takes, strict=True)
+    ]
+
+
+@click.command()
+@click.option("--data", type=click.Path(path_type=Path), required=True, help="What synthesize wrote.")
+@click.option("--model", "models", multiple=True, default=["birnn", "rnn"], help="Name or path; repeatable.")
+@click.option("--part", "parts", multiple=True, default=list(HELD_OUT), help="Of the split; repeatable.")
+@click.option("--every", default=1, help="Take only every so many takes.")
+def main(data: Path, models: tuple[str, ...], parts: tuple[str, ...], every: int) -> None:
+    """What a lost sensor, a slipped sensor or a wrong heading costs in accuracy."""
+    for model in models:
+        info = archive.inspect(archive.find(model))
+        module = archive.load(info, trust=True)
+        mode: Mode = next(mode for mode in modes_of(info.metadata) if mode.name == "stream")
+        for part in parts:
+            pairs: dict[str, list[tuple[Array, Array]]] = {}
+            for group in groups(list(takes_of(data, part))[::every]):
+                healthy = run_archive(module, group, mode)
+                for name, fault in FAULTS.items():
+                    ill = run_archive(module, [fault.apply(take) for take in group], mode)
+                    pairs.setdefault(name, []).extend(
+                        zip(errors(healthy, group, fault), errors(ill, group, fault), strict=True)
+                    )
+            table(f"{model}, {mode}, {part}", pairs)
+
+
+def table(title: str, pairs: dict[str, list[tuple[Array, Array]]]) -> None:
+    """Prints means without and with each fault."""
+    click.echo(f"\n{title}\n")
+    click.echo("| fault | 15 joints, deg | without it | costs | SIP, deg | without it | costs | frames |")
+    click.echo("|---|---|---|---|---|---|---|---|")
+    for name, rows in pairs.items():
+        before, after = (np.concatenate(side).mean(axis=0) for side in zip(*rows, strict=True))
+        cells = [f"{after[i]:.1f} | {before[i]:.1f} | {after[i] - before[i]:+.1f}" for i in range(2)]
+        click.echo(f"| {name} | {cells[0]} | {cells[1]} | {sum(len(row) for row, _ in rows)} |")
+
+
+if __name__ == "__main__":
+    main()
