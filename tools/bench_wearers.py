@@ -264,7 +264,7 @@ def draw(file: Path, rows: dict[str, dict[int, tuple[float, Whole]]]) -> None:
         left.plot(counts, share, ":", color=color, label=f"{model}, network")
         right.plot(counts, [run.p99_ms for _, run in own.values()], "o-", color=color, label=f"{model}, p99")
         right.plot(counts, [run.p50_ms for _, run in own.values()], ":", color=color, label=f"{model}, p50")
-    right.axhline(1e3 * LATE_S, color="grey", linewidth=0.8)
+    right.axhline(1e3 * LATE_S, color="grey", linewidth=0.8, label="two frames")
     right.set_yscale("log")
     left.set_ylabel("% of a core")
     right.set_ylabel("age of a pose when it arrives, ms")
