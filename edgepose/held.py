@@ -1,7 +1,8 @@
-"""Bones whose sensors are silent: they go on with the pelvis, in the attitude in which they last stood to it.
+"""Bones whose sensors are silent: they go on with the rest of the body.
 
-A bone that kept its orientation in the room would turn against a wearer who turns: over held-out takes that
-costs 4 to 6 degrees of joint angle, this 3 to 5 (`tools/bench_robustness.py`).
+A bone that kept its orientation in the room would turn against a wearer who turns. So it keeps the attitude
+in which it last stood to the pelvis, and a silent pelvis turns with the lower legs, whose turns add up to its
+own. What that is worth: `tools/bench_robustness.py`.
 """
 
 from __future__ import annotations
@@ -9,17 +10,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from edgepose.placements import ROOT
+from edgepose.placements import PLACEMENTS, ROOT
+from edgepose.rotations import about_axis, matrix_to_rotvec, transpose
 
 Array = NDArray[np.float64]
+
+_LOWER_LEGS = np.array([name.endswith("lower_leg") for name in PLACEMENTS])
 
 
 def carried(
     orientation: Array, acceleration: Array, held: NDArray[np.bool_], before: Array | None
 ) -> tuple[Array, Array]:
-    """Bones with those of silent sensors moved along with the pelvis.
-
-    While the pelvis' own sensor is silent nothing is moved: there is nothing to go by.
+    """Bones with those of silent sensors moved along.
 
     Args:
         orientation: (6, 3, 3) R_TB, of silent sensors the last that was measured.
@@ -28,11 +30,18 @@ def carried(
         before: (6, 3, 3) what this gave for the frame before; None for the first.
 
     Returns:
-        The same shapes; a silent sensor accelerates as the pelvis does.
+        The same shapes; a silent pelvis does not accelerate, other silent bones do as the pelvis does.
     """
-    if before is None or held[ROOT] or not held.any():
+    if before is None or not held.any():
         return orientation, acceleration
     orientation, acceleration = orientation.copy(), acceleration.copy()
-    orientation[held] = orientation[ROOT] @ before[ROOT].T @ before[held]
-    acceleration[held] = acceleration[ROOT]
+    if held[ROOT]:
+        legs = _LOWER_LEGS & ~held
+        turns = matrix_to_rotvec(orientation[legs] @ transpose(before[legs]))[:, 1]
+        orientation[ROOT] = about_axis("y", turns.mean() if legs.any() else 0.0) @ before[ROOT]
+        acceleration[ROOT] = 0.0
+    others = held.copy()
+    others[ROOT] = False
+    orientation[others] = orientation[ROOT] @ before[ROOT].T @ before[others]
+    acceleration[others] = acceleration[ROOT]
     return orientation, acceleration

@@ -47,10 +47,21 @@ def test_what_measures_again_counts_at_once(walk):
     np.testing.assert_array_equal(orientation[15:], measured[15:])
 
 
-def test_without_the_pelvis_nothing_moves(walk):
+def test_a_silent_pelvis_turns_with_the_lower_legs(walk):
     true, acceleration = walk
     held = np.zeros((30, 6), bool)
-    held[5:, [0, ROOT]] = True
-    orientation, a = through(true, acceleration, held)
-    np.testing.assert_array_equal(orientation, true)
-    np.testing.assert_array_equal(a, acceleration)
+    held[5:, [0, ROOT]] = True  # the arm goes on with the pelvis that goes on with the legs
+    held[20:, PLACEMENTS.index("left_lower_leg")] = True
+    measured = np.where(held[..., None, None], true[4], true)
+    orientation, a = through(measured, acceleration, held)
+    np.testing.assert_allclose(orientation, true, atol=1e-12)
+    assert not a[5:, [0, ROOT]].any()
+
+
+def test_without_pelvis_and_legs_nothing_moves(walk):
+    true, acceleration = walk
+    held = np.zeros((30, 6), bool)
+    held[5:, [2, 3, ROOT]] = True
+    measured = np.where(held[..., None, None], true[4], true)
+    orientation, _ = through(measured, acceleration, held)
+    np.testing.assert_allclose(orientation, measured, atol=1e-12)
