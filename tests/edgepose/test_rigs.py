@@ -243,10 +243,10 @@ def test_a_wearer_whose_input_is_broken_costs_only_his_own(command, wearer, rig,
 
 
 @contextlib.contextmanager
-def simulator(recording: Path):
-    """Simulated sensors that stand still, and their port; killing them unplugs it."""
+def simulator(recording: Path, protocol: str = "native"):
+    """Simulated sensors that stand still, and their port or bus; killing them unplugs it."""
     process = subprocess.Popen(
-        [sys.executable, str(SIMULATOR), str(recording), "--stand"],
+        [sys.executable, str(SIMULATOR), str(recording), "--stand", "--protocol", protocol],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     with process:
@@ -282,22 +282,24 @@ class Receiver:
         self.socket.close()
 
 
-def test_a_port_that_is_unplugged_and_comes_back_costs_only_its_wearer(wearer, rig, tmp_path):
+def test_a_port_that_is_unplugged_and_comes_back_costs_only_its_wearer(wearer, rig, tmp_path, monkeypatch):
+    """The other has a CAN bus, which is read in another way."""
+    monkeypatch.setenv("CAN_CONFIG", '{"sleep_after_open": 0.01}')  # python-can's own way to set this
     link, log = tmp_path / "hub", tmp_path / "told.txt"
     with contextlib.ExitStack() as stack:
         receivers = [stack.enter_context(Receiver()) for _ in range(2)]
-        _, port = stack.enter_context(simulator(wearer.short))
+        _, bus = stack.enter_context(simulator(wearer.short, "native-can"))
         unplugged, first = stack.enter_context(simulator(wearer.short))
         link.symlink_to(first)
+        anna, ben = receivers
         rigs = [
-            rig(name, file=None, port=own, protocol="native", udp=receiver.address)
-            for name, own, receiver in zip(("anna", "ben"), (port, str(link)), receivers, strict=True)
+            rig("anna", file=None, can=bus, protocol="native-can", udp=anna.address),
+            rig("ben", file=None, port=str(link), protocol="native", udp=ben.address),
         ]
         command = [sys.executable, "-m", "edgepose", "run", "--model", "rnn", *map(str, words(*rigs))]
         process = subprocess.Popen(command, stderr=stack.enter_context(log.open("w")))
         stack.callback(process.wait)
         stack.callback(process.kill)
-        anna, ben = receivers
         anna.wait_for("ok")
         ben.wait_for("ok")
         link.unlink()
