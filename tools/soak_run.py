@@ -1,0 +1,104 @@
+"""`edgepose run` for minutes on six simulated sensors of 100 Hz behind a pty, 60 poses a second.
+
+A clip is walked over and over in native packets. The table says what the run uses at five times; below are
+the run's own closing lines, with what it lost and how long poses took from the last packet to the send. Needs
+Linux. The program has core 0 to itself (`--core`), the simulator the others; leave the machine alone, or give
+both priority over other programs with `chrt -r 5 python tools/soak_run.py`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import numpy as np
+from soak_viewer import RATE, cpu_s, make_recording, megabytes
+
+from edgepose.poses import read_poses
+
+LOOKS = (0.1, 0.25, 0.5, 0.75, 0.95)
+"""Parts of the time at which the run is looked at."""
+
+
+@click.command()
+@click.option("--minutes", type=click.FloatRange(0.2), default=10.0, show_default=True, help="How long.")
+@click.option("--model", default="rnn", show_default=True, help="Name or path.")
+@click.option("--core", type=click.IntRange(0), default=0, show_default=True, help="That the program has.")
+def soak(minutes: float, model: str, core: int) -> None:
+    """Run the soak and print its table."""
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        length_s = make_recording(folder, 60.0 * minutes)
+        port = stack.enter_context(simulator(folder / "walk.npz", core))
+        run = stack.enter_context(running(folder, port, model, core))
+        time.sleep(3.0)  # the model is loaded
+        started, used_s = time.monotonic(), cpu_s(run.pid)
+        click.echo(f"{'minute':>6}  {'of the core':>11}  {'memory':>9}")
+        for part in LOOKS:
+            time.sleep(max(0.0, started + part * length_s - time.monotonic()))
+            passed_s, now_s = time.monotonic() - started, cpu_s(run.pid)
+            click.echo(
+                f"{passed_s / 60:6.1f}  {(now_s - used_s) / passed_s:11.1%}  {megabytes(run.pid):6.1f} MB"
+            )
+        time.sleep(max(0.0, started + length_s - time.monotonic()))
+        run.send_signal(2)
+        told = run.communicate()[1]
+        if run.returncode:
+            raise click.ClickException(told)
+        click.echo(told.splitlines()[-1])
+        poses = read_poses(folder / "poses.csv")
+        held = sum("held" in status for status in poses.status)
+        lost = int(np.sum(np.diff(poses.frames) - 1))
+        wanted = round(float(poses.time_s[-1] - poses.time_s[0]) * RATE) + 1
+        click.echo(
+            f"{len(poses.frames)} of {wanted} frames came out, {lost} lost, {held} with a silent sensor"
+        )
+
+
+@contextlib.contextmanager
+def simulator(recording: Path, core: int) -> Iterator[str]:
+    """The name of a pty on which the sensors of a recording are heard, in real time."""
+    others = os.sched_getaffinity(0) - {core} or {core}
+    child = subprocess.Popen(
+        [sys.executable, Path(__file__).parent / "simulate.py", recording],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: os.sched_setaffinity(0, others),
+    )
+    try:
+        yield child.stdout.readline().removeprefix("port ").strip()
+    finally:
+        child.kill()
+        child.communicate()
+
+
+@contextlib.contextmanager
+def running(folder: Path, port: str, model: str, core: int) -> Iterator[subprocess.Popen[str]]:
+    """The run on a port."""
+    command = ["run", "--port", port, "--protocol", "native", "--model", model]
+    command += ["--calibration", folder / "calib.json", "--csv", folder / "poses.csv"]
+    run = subprocess.Popen(
+        [sys.executable, "-m", "edgepose", *map(str, command)],
+        text=True,
+        stderr=subprocess.PIPE,
+        start_new_session=True,  # `cpu_s` counts a group
+        preexec_fn=lambda: os.sched_setaffinity(0, {core}),
+    )
+    try:
+        yield run
+    finally:
+        run.terminate()  # does nothing to one that has ended
+        run.wait()
+        run.stderr.close()
+
+
+if __name__ == "__main__":
+    soak()
