@@ -72,7 +72,6 @@ class PoseNetwork(nn.Module):
         """Random weights for a shape."""
         super().__init__()
         self.shape = shape
-        self.dropout = nn.Dropout(0.0)  # between the layers; how much is the training's business
         both = shape.kind == "birnn"
         width = shape.hidden * (2 if both else 1)
         outputs = shape.pose_outputs + ACCELERATIONS
@@ -85,16 +84,9 @@ class PoseNetwork(nn.Module):
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Normalised means and standard deviations (B, T, outputs) of z-scored inputs (B, T, inputs)."""
         x = torch.relu(self.dense(x))
-        x, _ = self.lstm1(self._dropped(x))
-        x, _ = self.lstm2(self._dropped(x))
-        x = self._dropped(x)
+        x, _ = self.lstm1(x)
+        x, _ = self.lstm2(x)
         return self.mean(x), nn.functional.softplus(self.deviation(x)) + SIGMA_FLOOR
-
-    def _dropped(self, x: Tensor) -> Tensor:
-        """The same units of (B, T, units) for a whole sequence (Gal, Ghahramani 2016), so that outputs do not
-        tremble.
-        """
-        return x * self.dropout(torch.ones_like(x[:, :1])) if self.training and self.dropout.p else x
 
 
 class PoseDecoder(nn.Module):

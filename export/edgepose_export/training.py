@@ -22,7 +22,7 @@ from edgepose.skeleton import PARENTS
 from edgepose_export.archive import KINDS, Statistics, new_network
 from edgepose_export.augmentation import Augmentation, augment
 from edgepose_export.dataset import Tape, describe
-from edgepose_export.networks import NetworkShape, PoseNetwork
+from edgepose_export.networks import NetworkShape
 from edgepose_export.normalisation import SCHEMES, network_inputs, seen_from_first
 from edgepose_export.processes import ALONE, Processes
 
@@ -53,7 +53,6 @@ class TrainConfig:
         seated_share: share of the sequences taken from takes with made sitting, where there are any; the
             other shares are of the rest.
         input_dropout: share of the inputs set to zero (DIP: 0.2).
-        dropout: share of the units between the layers of an RNN or BiRNN set to zero, others a sequence.
         smoothness: weight of the squared second differences in time of the pose's error, in normalised units:
             what it costs to tremble where the wearer does not.
         learning_rate: of Adam.
@@ -77,7 +76,6 @@ class TrainConfig:
     free_share: float = 0.0
     seated_share: float = 0.0
     input_dropout: float = 0.2
-    dropout: float = 0.0
     smoothness: float = 0.0
     learning_rate: float = 1e-3
     warm_up: int = 200
@@ -149,8 +147,6 @@ def config_from(values: dict[str, Any]) -> TrainConfig:
         raise ValueError('measured = "passed" needs targets = "global-6d"')
     if config.acceleration_loss and not config.network.acceleration:
         raise ValueError("a network without accelerations cannot give them back: acceleration_loss = false")
-    if config.dropout and KINDS[config.network.kind] is not PoseNetwork:
-        raise ValueError('dropout is for the layers of kind = "birnn" or "rnn"')
     return config
 
 
@@ -173,7 +169,6 @@ _RANGES: dict[str, tuple[float, float]] = {
     "warm_up": (0, 10**9),
     "averaging": (0.0, 1.0),
     "input_dropout": (0.0, 0.99),
-    "dropout": (0.0, 0.99),
     "free_share": (0.0, 1.0),
     "seated_share": (0.0, 1.0),
     "aligned": (0.0, 1.0),
@@ -367,8 +362,6 @@ class Trainer:
         self.network = new_network(config.network).to(processes.device)
         self.averaged = new_network(config.network).to(processes.device)
         self.averaged.load_state_dict(self.network.state_dict())
-        if isinstance(self.network, PoseNetwork):
-            self.network.dropout.p = config.dropout
         self.parallel = processes.wrapped(self.network)
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate)
         self._seed(0)

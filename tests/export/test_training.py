@@ -156,16 +156,6 @@ def test_trembling_costs_and_a_steady_error_does_not(takes):
     assert trembles(smooth, takes) < 0.5 * trembles(SMALL, takes)
 
 
-def test_dropout_is_between_the_layers_and_in_training_only(takes):
-    whole, dropped = (trainer(takes, replace(SMALL, dropout=share)) for share in (0.0, 0.5))
-    assert whole.validate() == dropped.validate()
-    assert whole.train_step() != dropped.train_step()
-    batch = training.windows(dropped.train_tape, torch.tensor([0]), 20)
-    first, again = (dropped._loss(dropped.network, batch) for _ in range(2))
-    assert first != again
-    assert whole._loss(whole.network, batch) == whole._loss(whole.network, batch)
-
-
 def test_accelerations_are_reconstructed_too(takes):
     """The loss of a network that says 0 +- 1 for everything is half the mean square of all its targets."""
     one = trainer(takes, replace(SMALL, beta=0.0))
@@ -565,7 +555,6 @@ def test_config_that_differs_from_another(tmp_path):
         ("schedule = 'linear'", "schedule is 'linear'; it takes 'exponential' or 'cosine'"),
         ("schedule = []", "schedule is []; it takes a text"),
         ("speed = 1", "unknown field 'speed'"),
-        ('dropout = 0.1\n[network]\nkind = "wavenet"', "dropout is for the layers of"),
         ("network = 3", r"network is 3; it takes a table [network]"),
         ("[network]\nkind = 'gru'", "kind is 'gru'; it takes 'birnn' or 'rnn'"),
         ("[network]\nhidden = 0", "hidden is 0; it takes 1 to"),
