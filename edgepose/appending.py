@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import secrets
 import select
 import stat
 import sys
@@ -187,9 +188,10 @@ def replace_file(path: Path, write: Callable[[Path], None], what: str) -> None:
     Raises:
         EdgeposeError: it cannot be written.
     """
-    # The ending stays: writers look at it.
-    part = path.with_name(f"{path.stem}.new{path.suffix}")
+    # A name that nobody else has; the ending stays, because writers look at it.
+    part = path.with_name(f".{secrets.token_hex(8)}{path.suffix}")
     try:
+        part.touch(exist_ok=False)
         try:
             write(part)
             with part.open("rb+") as file:
@@ -200,4 +202,6 @@ def replace_file(path: Path, write: Callable[[Path], None], what: str) -> None:
             raise
     except OSError as error:
         raise EdgeposeError(explain(error, str(path), what)) from error
+    except EdgeposeError as error:  # of a sink, which knows the file by its other name
+        raise EdgeposeError(str(error).replace(str(part), str(path))) from error
     _sync_folder(path.parent)

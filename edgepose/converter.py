@@ -198,6 +198,8 @@ def convert(job: Job, options: Options = _DEFAULTS) -> Result:
         return Result(job, problem=f"{job.source}: not enough memory; convert it with fewer --jobs")
     except OSError as error:
         return Result(job, problem=f"{error.filename or job.target}: {error.strerror or error}")
+    except Exception as error:  # a fault of ours, which must not cost the other files
+        return Result(job, problem=f"{job.source}: cannot be converted, please report it: {error!r}")
     return Result(
         job,
         samples=sum(len(d.time_s) for d in data),

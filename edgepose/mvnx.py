@@ -121,7 +121,7 @@ class _Frames:
         self._fed += len(chunk)
         try:
             self._parser.Parse(chunk, not chunk)
-        except (expat.ExpatError, LookupError) as error:  # the latter: an encoding that nobody knows
+        except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two: odd encodings
             return str(error)
         if self._fed - self._parser.CurrentByteIndex > _LONGEST:
             raise EdgeposeError(f"{self._path}: not an MVNX file: it has a tag of more than {_LONGEST} bytes")

@@ -332,6 +332,31 @@ def test_a_disk_that_fills_up(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_fault_of_the_program_costs_one_file(tmp_path):
+    """There is no writer of that ending, which only the command line checks."""
+    result = convert(Job(REAL, tmp_path / "a.xyz"))
+    assert result.problem == f"{REAL}: cannot be converted, please report it: KeyError('xyz')"
+
+
+def test_outputs_touch_no_other_file(command, tmp_path):
+    """Names of files on the way to their own are nobody's."""
+    folder, out = tmp_path / "in", tmp_path / "out"
+    folder.mkdir()
+    out.mkdir()
+    for name in ("a.npz", "a.new.npz"):
+        shutil.copy(REAL, folder / name)
+    (out / "b.new.csv").write_text("precious")
+    os.umask(umask := os.umask(0))
+    result = command("convert", folder, REAL, "--to", "csv", "--out", out, "--jobs", 2)
+    assert result.returncode == 0, result.stdout
+    assert sorted(path.name for path in out.iterdir()) == [
+        *("a.csv", "a.new.csv", "b.new.csv", "six-sites-3s.csv")
+    ]
+    assert (out / "b.new.csv").read_text() == "precious"
+    same(read_recording(out / "a.csv"), read_recording(out / "a.new.csv"))
+    assert (out / "a.csv").stat().st_mode & 0o777 == 0o666 & ~umask
+
+
 def test_a_bar_on_a_terminal(tmp_path):
     terminal, other = pty.openpty()
     process = subprocess.Popen(

@@ -200,6 +200,15 @@ def test_other_files(tmp_path, old, new, message):
     assert "\n" not in str(info.value)
 
 
+@pytest.mark.parametrize("encoding", ["shift_jis", "utf-7", "utf-32", "idna", "undefined"])
+def test_odd_encodings(tmp_path, encoding):
+    path = tmp_path / "walk.mvnx"
+    write(path)
+    path.write_text(path.read_text().replace('encoding="UTF-8"', f'encoding="{encoding}"'))
+    with pytest.raises(EdgeposeError, match="no frame of an MVNX recording"):
+        read_mvnx(path)
+
+
 def test_frames_without_sensor_data(tmp_path):
     path = tmp_path / "walk.mvnx"
     write(path)

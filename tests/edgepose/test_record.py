@@ -391,12 +391,14 @@ def test_a_disk_that_is_full(command, tmp_path):
 
 
 def test_no_room_for_the_whole_file_leaves_its_journal(tmp_path):
-    # The file under its working name cannot be made where a folder of that name is.
-    (tmp_path / "walk.new.npz").mkdir()
     with open_source(file=REAL) as source:
-        summary = record(source, open_output(str(tmp_path / "walk.npz"), {}), [])
+        output = open_output(str(tmp_path / "walk.npz"), {})
+        # No file can be put where a folder is.
+        (tmp_path / "walk.npz").mkdir()
+        summary = record(source, output, [])
     assert f"the recording is whole in {tmp_path / 'walk.part.csv'}" in str(summary.error)
     assert good(read_recording(tmp_path / "walk.part.csv")) == 1800
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["walk.npz", "walk.part.csv"]
 
 
 def test_nothing_came(tmp_path, monkeypatch):
