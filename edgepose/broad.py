@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from edgepose import rotations as rot
 from edgepose.errors import EdgeposeError
-from edgepose.npz import BROKEN
+from edgepose.npz import BROKEN, open_npz
 
 Array = NDArray[np.float64]
 
@@ -119,8 +119,7 @@ def read_trial(path: Path) -> Trial:
 
 def _load(path: Path) -> dict[str, Any]:
     if path.suffix == ".npz":
-        # A file of ours, because numpy leaves its own open where there is no archive in it.
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+        with open_npz(path) as archive:
             return dict(archive)
     try:
         from scipy.io import loadmat

@@ -6,13 +6,13 @@ from array import array
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
 from edgepose.joint_tree import JointTree, fail, numbers
+from edgepose.npz import check_size
 from edgepose.rotations import euler_to_matrix
 
 Array = NDArray[np.float64]
@@ -21,7 +21,12 @@ _CHANNELS = {
     f"{axis}{kind}": (kind, "xyz".index(axis.lower())) for axis in "XYZ" for kind in ("position", "rotation")
 }
 
+FRAME_TIMES = (1e-5, 1e2)
+"""Shortest and longest time of a frame that is believed, seconds."""
+
 _LONGEST_LINE = 1 << 20  # characters; that of a frame of 1000 joints has less than 50,000
+_MOST_JOINTS = 10_000
+_JOINT_BYTES = 8 * (9 + 3)  # that a joint of a frame takes
 
 
 def tidy_rate(frame_time: float) -> float:
@@ -41,12 +46,25 @@ def read_bvh(path: str | Path) -> JointTree:
         EdgeposeError: the file cannot be read, breaks the format, is cut short, or holds a number that is not
             finite.
     """
+    tree, problem = salvage_bvh(path)
+    if problem is not None:
+        raise EdgeposeError(problem)
+    return tree
+
+
+def salvage_bvh(path: str | Path) -> tuple[JointTree, str | None]:
+    """The frames before the first bad one, and one line on what is wrong with the file; see `read_bvh`.
+
+    Raises:
+        EdgeposeError: no frame is good.
+    """
     path = Path(path)
     try:
         with path.open(encoding="utf-8-sig") as file:
-            lines = enumerate(iter(partial(file.readline, _LONGEST_LINE), ""))
+            lines = enumerate(iter(partial(file.readline, _LONGEST_LINE), ""), start=1)
             names, parents, offsets, channels = _hierarchy(path, lines)
-            frame_time, table = _motion(path, lines, sum(map(len, channels)))
+            frame_time, table, problem = _motion(path, lines, sum(map(len, channels)))
+        check_size(path, len(table) * len(names) * _JOINT_BYTES)
     except OSError as error:
         raise EdgeposeError(f"{path}: cannot be read: {error.strerror or error}") from None
     except UnicodeDecodeError:
@@ -69,12 +87,8 @@ def read_bvh(path: str | Path) -> JointTree:
     for order, (joints, columns) in turning.items():
         angles = np.radians(table[:, columns]).reshape(len(table), len(joints), len(order))
         rotations[:, joints] = euler_to_matrix(angles, order)
-    return JointTree(tuple(names), tuple(parents), offsets, rotations, positions, tidy_rate(frame_time))
-
-
-def _fail(path: Path, line: int, problem: str) -> NoReturn:
-    """Raise the error for a problem in a line, counted from 0 here and from 1 in the message."""
-    fail(path, line + 1, problem)
+    tree = JointTree(tuple(names), tuple(parents), offsets, rotations, positions, tidy_rate(frame_time))
+    return tree, problem
 
 
 def _hierarchy(
@@ -95,29 +109,31 @@ def _hierarchy(
         key, rest = words[0], words[1:]
         if not seen_header:
             if key != "HIERARCHY":
-                _fail(path, number, "not a BVH file: HIERARCHY was expected")
+                fail(path, number, "not a BVH file: HIERARCHY was expected")
             seen_header = True
         elif key == "{":
             if pending is None:
-                _fail(path, number, "a brace opens without a joint")
+                fail(path, number, "a brace opens without a joint")
             open_joints.append(pending)
             pending = None
         elif pending is not None:
-            _fail(path, number, "an opening brace was expected")
+            fail(path, number, "an opening brace was expected")
         elif key == "}":
             if not open_joints:
-                _fail(path, number, "a brace closes that was not opened")
+                fail(path, number, "a brace closes that was not opened")
             joint = open_joints.pop()
             if joint >= 0 and (offsets[joint] is None or channels[joint] is None):
-                _fail(path, number, f"joint {names[joint]} has no OFFSET or no CHANNELS")
+                fail(path, number, f"joint {names[joint]} has no OFFSET or no CHANNELS")
         elif key in ("ROOT", "JOINT"):
             if (key == "ROOT") != (not names) or (key == "JOINT") != bool(open_joints):
-                _fail(path, number, f"{key} at this place: one ROOT is expected, with each JOINT inside it")
+                fail(path, number, f"{key} at this place: one ROOT is expected, with each JOINT inside it")
             name = " ".join(rest)
             if not name or name in names:
-                _fail(path, number, f"joint name {name!r} is missing or used twice")
+                fail(path, number, f"joint name {name!r} is missing or used twice")
             if open_joints[-1:] == [-1]:
-                _fail(path, number, "a joint inside an end site")
+                fail(path, number, "a joint inside an end site")
+            if len(names) == _MOST_JOINTS:
+                fail(path, number, f"more than {_MOST_JOINTS} joints")
             pending = len(names)
             names.append(name)
             parents.append(open_joints[-1] if open_joints else -1)
@@ -125,10 +141,10 @@ def _hierarchy(
             channels.append(None)
         elif key == "End":
             if not open_joints or open_joints[-1] == -1:
-                _fail(path, number, "an end site outside a joint")
+                fail(path, number, "an end site outside a joint")
             pending = -1
         elif key == "OFFSET" and open_joints:
-            values = numbers(path, number + 1, rest, 3)
+            values = numbers(path, number, rest, 3)
             if open_joints[-1] >= 0:
                 offsets[open_joints[-1]] = values
         elif key == "CHANNELS" and open_joints and open_joints[-1] >= 0:
@@ -140,7 +156,7 @@ def _hierarchy(
                 or len(known) != len(kinds)
                 or len(set(known)) != len(known)
             ):
-                _fail(
+                fail(
                     path,
                     number,
                     "CHANNELS needs their count, then that many different names such as Xrotation",
@@ -148,36 +164,48 @@ def _hierarchy(
             channels[open_joints[-1]] = known
         elif key == "MOTION":
             if open_joints or not names:
-                _fail(path, number, "MOTION before the hierarchy is closed")
+                fail(path, number, "MOTION before the hierarchy is closed")
             table = np.array([offset for offset in offsets if offset is not None])
             return names, parents, table, [kinds for kinds in channels if kinds is not None]
         else:
-            _fail(path, number, f"{key!r} is not expected here")
+            fail(path, number, f"{key!r} is not expected here")
     raise EdgeposeError(
         f"{path}: ends within the hierarchy, before MOTION" if seen_header else f"{path}: empty file"
     )
 
 
-def _motion(path: Path, lines: Iterator[tuple[int, str]], width: int) -> tuple[float, Array]:
-    """Frame time in seconds and the table (T, width) of channel values as printed."""
-    filled = ((number, words) for number, line in lines if (words := line.split()))
-    at_count, count = next(filled, (0, []))
-    at_time, time = next(filled, (0, []))
+def _motion(path: Path, lines: Iterator[tuple[int, str]], width: int) -> tuple[float, Array, str | None]:
+    """Frame time in seconds, the table (T, width) of channel values as printed before the first bad row, and
+    what is wrong with the rest.
+    """
+    filled = ((number, line, words) for number, line in lines if (words := line.split()))
+    at_count, _, count = next(filled, (0, "", []))
+    at_time, _, time = next(filled, (0, "", []))
     if not time:
         raise EdgeposeError(f"{path}: ends before the first frame")
     if len(count) != 2 or count[0] != "Frames:" or not count[1].isdecimal() or len(count[1]) > 15:
-        _fail(path, at_count, "'Frames: <count>' was expected")
+        fail(path, at_count, "'Frames: <count>' was expected")
     if time[:2] != ["Frame", "Time:"]:
-        _fail(path, at_time, "'Frame Time: <seconds>' was expected")
-    frame_time = numbers(path, at_time + 1, time[2:], 1)[0]
-    if not 1e-5 < frame_time < 1e2:
-        _fail(path, at_time, f"a frame time of {frame_time:g} s is not possible")
-    values, frames = array("d"), 0
-    for number, words in filled:
-        if len(words) != width:
-            _fail(path, number, f"a frame needs {width} numbers, this line has {len(words)}")
-        values.extend(numbers(path, number + 1, words, width))
-        frames += 1
-    if frames != int(count[1]) or not frames:
-        raise EdgeposeError(f"{path}: {count[1]} frames are announced, {frames} are there (cut short?)")
-    return frame_time, np.frombuffer(values).reshape(frames, width)
+        fail(path, at_time, "'Frame Time: <seconds>' was expected")
+    frame_time = numbers(path, at_time, time[2:], 1)[0]
+    if not FRAME_TIMES[0] < frame_time < FRAME_TIMES[1]:
+        fail(path, at_time, f"a frame time of {frame_time:g} s is not possible")
+    announced = int(count[1])
+    values, frames, whole, problem = array("d"), 0, True, None
+    try:
+        for number, line, words in filled:
+            if len(words) != width:
+                fail(path, number, f"a frame needs {width} numbers, this line has {len(words)}")
+            values.extend(numbers(path, number, words, width))
+            frames, whole = frames + 1, line.endswith("\n")
+        if frames != announced or not frames:
+            problem = f"{path}: {announced} frames are announced, {frames} are there (cut short?)"
+            # Digits may be missing in the last row, which nobody can see.
+            frames -= frames < announced and not whole
+    except EdgeposeError as error:
+        problem = str(error)
+    except UnicodeDecodeError:
+        problem = f"{path}: not a text file after frame {frames}"
+    if not frames:
+        raise EdgeposeError(problem)
+    return frame_time, np.frombuffer(values)[: frames * width].reshape(frames, width), problem

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import sys
-import zipfile
 from array import array
 from collections.abc import Callable, Iterator, Mapping
 from io import BufferedReader
@@ -20,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose import dip_imu
-from edgepose.bvh import read_bvh, tidy_rate
+from edgepose.bvh import FRAME_TIMES, salvage_bvh, tidy_rate
 from edgepose.errors import EdgeposeError
-from edgepose.joint_tree import JointTree
-from edgepose.npz import BROKEN
+from edgepose.joint_tree import LARGEST, JointTree
+from edgepose.npz import BROKEN, check_size, member_names, open_npz
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import FILLING_WINDOW, PoseFrame, status_text
 from edgepose.rotations import (
@@ -34,7 +33,7 @@ from edgepose.rotations import (
     rotvec_to_matrix,
 )
 from edgepose.sinks.csv_file import FORMS, pose_columns
-from edgepose.skeleton import JOINTS, PARENTS
+from edgepose.skeleton import JOINTS, PARENTS, standing_place
 
 Array = NDArray[np.float64]
 
@@ -44,11 +43,12 @@ MAX_LINE = 16_384
 BLOCK = 4096
 """Poses that are read from a CSV file at a time."""
 
-MAX_BYTES = 2 << 30
-"""That an NPZ file may unpack to: hours of poses. What is far more is no file of them."""
+LARGEST_TIME = 1e12
+"""Seconds, and numbers of frames, beyond this are taken for damage."""
 
-LARGEST = 1e6
-"""Angles in radians and metres beyond this are taken for damage."""
+_POSE_BYTES = 8 * 9 * len(JOINTS)  # that a pose takes
+_HEADER = b"frame,time_s,status,"
+_SAME_PLACE_M = 1e-5  # BVH has four decimals of a centimetre
 
 
 class Poses(NamedTuple):
@@ -69,13 +69,16 @@ class Poses(NamedTuple):
     translation: Array | None
 
     @property
+    def frame_time(self) -> float:
+        """Seconds from a frame to the next; 1/60 where there is but one."""
+        steps = np.diff(self.frames)
+        # The median, because time leaps where all sensors were silent for long.
+        return float(np.median(np.diff(self.time_s) / steps)) if len(steps) else 1.0 / 60.0
+
+    @property
     def rate(self) -> float:
         """Frames per second; 60 where there is but one frame."""
-        steps = np.diff(self.frames)
-        if not len(steps):
-            return 60.0
-        # The median, because time leaps where all sensors were silent for long.
-        return tidy_rate(float(np.median(np.diff(self.time_s) / steps)))
+        return tidy_rate(self.frame_time)
 
     def pose_frames(self) -> Iterator[PoseFrame]:
         """The poses one by one, as a sink takes them; files hold no standard deviations of joints here."""
@@ -95,27 +98,28 @@ def read_poses(path: str | Path) -> Poses:
     Raises:
         EdgeposeError: no such file, or not a file of poses.
     """
-    read = _READERS.get(Path(path).suffix.lower())
-    return _joined(list(read_blocks(path))) if read is None else read(Path(path))
+    poses, problem = _read(Path(path))
+    if problem is not None:
+        raise EdgeposeError(problem)
+    return poses
 
 
 def salvage_poses(path: Path) -> tuple[Poses, str | None]:
-    """What is good in a file of poses, and one line on what is not; see `read_poses`.
+    """The poses before the first bad one, and one line on what is bad; see `read_poses`.
 
     Raises:
-        EdgeposeError: nothing is.
+        EdgeposeError: there is none.
     """
-    if path.suffix.lower() in _READERS:
-        return read_poses(path), None
-    blocks: list[Poses] = []
-    try:
-        blocks.extend(read_blocks(path))  # one by one: what has come before an error stays
-    except EdgeposeError as error:
-        if not blocks:
-            raise
-        poses = _joined(blocks)
-        return poses, f"{error}; only the {len(poses.frames)} poses before it are taken"
-    return _joined(blocks), None
+    poses, problem = _read(path)
+    return poses, problem and f"{problem}; {len(poses.frames)} poses are taken"
+
+
+def _read(path: Path) -> tuple[Poses, str | None]:
+    """The poses before the first bad one, and what is wrong with the file."""
+    poses, problem = _READERS.get(path.suffix.lower(), _read_csv_file)(path)
+    if not FRAME_TIMES[0] < poses.frame_time < FRAME_TIMES[1]:
+        raise EdgeposeError(f"{path}: {poses.frame_time:g} s from pose to pose is not possible")
+    return poses, problem
 
 
 def _joined(blocks: list[Poses]) -> Poses:
@@ -137,40 +141,43 @@ def is_poses(path: Path) -> bool:
         if str(path) == "-":
             return _starts_as_poses(cast(BufferedReader, sys.stdin.buffer).peek(32))
         if path.suffix.lower() == ".npz":
-            with zipfile.ZipFile(path) as archive:
-                names = set(archive.namelist())
+            names = member_names(path)
             return "poses.npy" in names and not _is_recording(names)
         with path.open("rb") as file:
             return _starts_as_poses(file.read(32))
-    except (OSError, zipfile.BadZipFile):
+    except (OSError, *BROKEN):
         return False
 
 
 def _starts_as_poses(start: bytes) -> bool:
-    return start.removeprefix(b"\xef\xbb\xbf").startswith(b"frame,time_s,status,")
+    # Of a pipe only a few bytes may have come; recordings start with other ones.
+    start = start.removeprefix(b"\xef\xbb\xbf")[: len(_HEADER)]
+    return start != b"" and _HEADER.startswith(start)
+
+
+def _absurd(values: NDArray[Any], most: float = LARGEST) -> NDArray[np.bool_]:
+    """Which of the numbers are NaN, or too large to be true."""
+    return ~(np.abs(values.astype(np.float64)) <= most)
 
 
 # --- CSV ----------------------------------------------------------------------------------------------------
 
 
-def read_poses_csv(path: str | Path) -> tuple[NDArray[np.int64], Array, list[str], Array]:
-    """Poses of a CSV file in any of the representations, which is found from its header.
-
-    Args:
-        path: file to read; "-" is standard input.
-
-    Returns:
-        frames (T,), time_s (T,) on the source's clock, T status texts, (T, 24, 3, 3) local rotations.
-
-    Raises:
-        EdgeposeError: no such file, or not a file of poses; names the row, counted from 1 for the header.
-    """
-    poses = read_poses(path)
-    return poses.frames, poses.time_s, poses.status, poses.rotations
+def _read_csv_file(path: Path) -> tuple[Poses, str | None]:
+    blocks: list[Poses] = []
+    problem = None
+    try:
+        blocks.extend(read_blocks(path))  # one by one: what has come before an error stays
+    except EdgeposeError as error:
+        if not blocks:
+            raise
+        problem = str(error)
+    return _joined(blocks), problem
 
 
 def read_blocks(path: str | Path) -> Iterator[Poses]:
-    """Poses of a CSV file in blocks of up to `BLOCK`, at least one; see `read_poses_csv`.
+    """Poses of a CSV file in blocks of up to `BLOCK`, at least one, in any of the representations, which
+    is found from its header; "-" is standard input.
 
     Raises:
         EdgeposeError: no such file, or not a file of poses; names the row, counted from 1 for the header.
@@ -290,13 +297,17 @@ def _block(
             raise _BadRowError(name, number, f"frame {frame} comes after frame {frame_before}")
         if times[-1] <= time_before:
             raise _BadRowError(name, number, f"time {row[1]} s is not after that of the row before")
+        if not row[2].isprintable() or "," in row[2] or '"' in row[2]:
+            raise _BadRowError(name, number, "the status has a comma, a quote or a line break in it")
         status.append(sys.intern(row[2]))
         frame_before, time_before = frame, times[-1]
     values = np.frombuffer(numbers).reshape(len(frames), -1)
     seconds = np.frombuffer(times)
-    bad = ~(np.isfinite(seconds) & np.isfinite(values).all(axis=1))
+    numbered = np.frombuffer(frames, np.int64)
+    bad = _absurd(seconds, LARGEST_TIME) | _absurd(numbered, LARGEST_TIME) | _absurd(values).any(axis=1)
     if bad.any():
-        raise _BadRowError(name, int(bad.argmax()) + first, "a number is infinite or not a number")
+        what = "a number is infinite or not a number, or far too large"
+        raise _BadRowError(name, int(bad.argmax()) + first, what)
     width = len(FORMS[form])
     rotations, off = _rotations(
         form, values[:, : len(JOINTS) * width].reshape(len(frames), len(JOINTS), width)
@@ -305,7 +316,7 @@ def _block(
         at, joint = np.argwhere(off > 1e-3)[0].tolist()
         raise _BadRowError(name, at + first, f"the numbers of {JOINTS[joint]} are not a rotation")
     where = values[:, -3:] if moves else None
-    return Poses(np.frombuffer(frames, np.int64), seconds, status, rotations, where)
+    return Poses(numbered, seconds, status, rotations, where)
 
 
 def _rotations(form: str, values: Array) -> tuple[Array, Array]:
@@ -334,7 +345,7 @@ def _is_recording(names: set[str]) -> bool:
     return any(f"{placement}_quat.npy" in names for placement in PLACEMENTS)
 
 
-def _read_npz(path: Path) -> Poses:
+def _read_npz(path: Path) -> tuple[Poses, None]:
     """Poses of an AMASS file, in its world with Z up, or the true poses of a recording, which are in T.
 
     Frames, times and status are there if edgepose has written the file. Of SMPL-H and SMPL-X the body's 22
@@ -346,6 +357,7 @@ def _read_npz(path: Path) -> Poses:
     count, width = arrays["poses"].shape
     if width < 66 or width % 3:
         raise EdgeposeError(f"{path}: 'poses' must be (frames, 72), it is {arrays['poses'].shape}")
+    check_size(path, count * _POSE_BYTES)
     joints = len(JOINTS) if width == 72 else 22
     vectors = _numbers(path, arrays, "poses", (count, width))[:, : 3 * joints].reshape(count, joints, 3)
     rotations = np.broadcast_to(np.eye(3), (count, len(JOINTS), 3, 3)).copy()
@@ -357,25 +369,16 @@ def _read_npz(path: Path) -> Poses:
         rotations[:, 0] = Z_UP_TO_T @ rotations[:, 0]
         translation = None if translation is None else translation @ Z_UP_TO_T.T
     frames, time_s = _clock(path, arrays, count)
-    return Poses(frames, time_s, _status(path, arrays, count), rotations, translation)
+    return Poses(frames, time_s, _status(path, arrays, count), rotations, translation), None
 
 
 def _load(path: Path) -> tuple[dict[str, NDArray[Any]], bool]:
     """The arrays of a file that matter, and whether it is a recording with true poses in T."""
     wanted = ("poses", "trans", "mocap_framerate", "mocap_frame_rate", "time_s", "frame", "held", "filling")
     try:
-        with zipfile.ZipFile(path) as archive:
-            # Sizes as declared are the most that zipfile unpacks.
-            sizes = {member.filename: member.file_size for member in archive.infolist()}
-        size = sum(sizes.get(f"{key}.npy", 0) for key in wanted)
-        if size > MAX_BYTES:
-            raise EdgeposeError(
-                f"{path}: unpacks to {size >> 20} MB; poses are read up to {MAX_BYTES >> 20} MB"
-            )
-        with np.load(path, allow_pickle=False) as archive:
-            # Members without the ending are no arrays.
-            arrays = {key: archive[key] for key in wanted if f"{key}.npy" in sizes}
-            return arrays, _is_recording(set(sizes))
+        names = member_names(path)
+        with open_npz(path) as archive:
+            return {key: archive[key] for key in wanted if f"{key}.npy" in names}, _is_recording(names)
     except OSError as error:
         raise EdgeposeError(f"cannot read poses from {path}: {error.strerror or error}") from error
     except BROKEN as error:
@@ -389,7 +392,7 @@ def _numbers(path: Path, arrays: Mapping[str, NDArray[Any]], key: str, shape: tu
     if values.dtype.kind not in "fiub" or values.shape != shape:
         raise EdgeposeError(f"{path}: {key!r} is {values.dtype} {values.shape} and not numbers {shape}")
     numbers = values.astype(np.float64)
-    bad = ~np.isfinite(numbers) | (np.abs(numbers) > (1e12 if key in ("time_s", "frame") else LARGEST))
+    bad = _absurd(numbers, LARGEST_TIME if key in ("time_s", "frame") else LARGEST)
     if bad.any():
         where = f" of frame {np.argwhere(bad)[0][0]}" if shape else ""
         raise EdgeposeError(f"{path}: a number in {key!r}{where} is not finite, or far too large")
@@ -439,20 +442,24 @@ _LIMBS = {
 """Joints at the far ends of limbs, and where the limbs point in the T-pose."""
 
 
-def _read_bvh(path: Path) -> Poses:
+def _read_bvh(path: Path) -> tuple[Poses, str | None]:
     """Poses of a BVH file with SMPL's joints, whose world has the axes of T."""
-    tree = read_bvh(path)
+    tree, problem = salvage_bvh(path)
     places = _smpl_joints(path, tree)
     count = len(tree.rotations)
     rotations = np.broadcast_to(np.eye(3), (count, len(JOINTS), 3, 3)).copy()
+    metres = _metres(tree.offsets[places["left_ankle"]])
+    offsets = np.zeros((len(JOINTS), 3))
     for joint, name in enumerate(JOINTS):
         if name in places:
             rotations[:, joint] = tree.rotations[:, places[name]]
-    root = tree.positions[:, 0]
-    # A file that knows no place has the root at one and the same.
-    moves = (root != root[0]).any()
-    translation = root * _metres(tree.offsets[places["left_ankle"]]) if moves else None
-    return Poses(np.arange(count), np.arange(count) / tree.rate, ["ok"] * count, rotations, translation)
+            offsets[joint] = metres * tree.offsets[places[name]]
+    translation = metres * tree.positions[:, 0]
+    # Where `BvhSink` puts those of whom it knows no place.
+    known = np.abs(translation - standing_place(offsets)).max() > _SAME_PLACE_M
+    times = np.arange(count) / tree.rate
+    poses = Poses(np.arange(count), times, ["ok"] * count, rotations, translation if known else None)
+    return poses, problem
 
 
 def _smpl_joints(path: Path, tree: JointTree) -> dict[str, int]:
@@ -486,12 +493,16 @@ def _metres(shank: Array) -> float:
     return min((1.0, 0.01, 0.001), key=lambda metres: abs(np.log(length * metres / 0.4)))
 
 
-def _read_dip(path: Path) -> Poses:
+def _read_dip(path: Path) -> tuple[Poses, None]:
     """True poses of DIP-IMU or of DIP's TotalCapture."""
     rotations = dip_imu.read_true_pose(path)
     count = len(rotations)
-    return Poses(np.arange(count), np.arange(count) / dip_imu.RATE, ["ok"] * count, rotations, None)
+    return Poses(np.arange(count), np.arange(count) / dip_imu.RATE, ["ok"] * count, rotations, None), None
 
 
-_READERS: dict[str, Callable[[Path], Poses]] = {".npz": _read_npz, ".bvh": _read_bvh, ".pkl": _read_dip}
-"""Readers of whole files, by ending; all others are CSV."""
+_READERS: dict[str, Callable[[Path], tuple[Poses, str | None]]] = {
+    ".npz": _read_npz,
+    ".bvh": _read_bvh,
+    ".pkl": _read_dip,
+}
+"""Readers by ending, of poses and what is wrong with a file; all others are CSV."""

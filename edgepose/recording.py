@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import heapq
 import sys
-import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from math import inf, nan
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
-from edgepose.npz import BROKEN
+from edgepose.npz import BROKEN, open_npz
 from edgepose.placements import PLACEMENTS
 
 Array = NDArray[np.float64]
@@ -38,9 +37,6 @@ MAX_SAMPLES = 20_000_000
 
 _WIDTH = COLUMNS.count(",") + 1
 _MAX_LINE = 4096
-_MAX_BYTES = 2 << 30
-_FREE_BYTES = 256 << 20  # unpacked sizes up to which the ratio does not matter: a simulated rest packs well
-_MAX_RATIO = 100  # real recordings pack less than 3:1
 _MAX_VALUE = 1e6  # no sensor measures more, in any of the units
 _MAX_TIME_S = 1e11
 _CHUNK = 4096
@@ -370,13 +366,8 @@ def _read_npz(path: Path, salvage: bool, names: Sequence[str]) -> Recording:
 
 def _load_arrays(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Arrays of an NPZ file that belong to a recording."""
-    with zipfile.ZipFile(path) as archive:
-        # Sizes as declared are the most that zipfile unpacks.
-        size = sum(member.file_size for member in archive.infolist())
-    if size > _MAX_BYTES or size > max(_FREE_BYTES, _MAX_RATIO * path.stat().st_size):
-        raise EdgeposeError(f"{path}: unpacks to {size >> 20} MB, which is no recording")
     result = {}
-    with np.load(path, allow_pickle=False) as archive:
+    with open_npz(path) as archive:
         for key in archive.files:
             placement, _, name = key.rpartition("_")
             is_sensor = name in QUANTITIES or (name == "t" and placement)

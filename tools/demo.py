@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from edgepose import rotations as rot
 from edgepose.figures import skeleton_strip
 from edgepose.metrics import format_table, summary
-from edgepose.poses import read_poses_csv
+from edgepose.poses import read_poses
 from edgepose.skeleton import default_body
 from firmware_protocols.registry import PROTOCOLS
 
@@ -141,7 +141,7 @@ def follow(process: subprocess.Popen[str], source: list[str], out: Path) -> tupl
 
 def report(begin: float, end: float, listener: Listener, truth: Truth, out: Path) -> None:
     """Prints error, latency and rate over the clip and draws it."""
-    frames, time_s, status, poses = read_poses_csv(out / "poses.csv")
+    frames, time_s, status, poses = read_poses(out / "poses.csv")[:4]
     missing = np.sum(np.diff(frames) - 1)
     click.echo(
         f"\nposes.csv: {len(frames)} frames at 60 Hz, {missing} numbers missing between first and last"

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
-from edgepose.npz import BROKEN
+from edgepose.npz import BROKEN, open_npz
 from edgepose.offline.kinematics import JOINT_COUNT
 
 Array = NDArray[np.float64]
@@ -80,7 +80,7 @@ def load_prior(path: str | Path | None = None) -> Prior:
     """
     source = resources.files("edgepose.offline").joinpath("prior.npz") if path is None else Path(path)
     try:
-        with source.open("rb") as file, np.load(file, allow_pickle=False) as data:
+        with resources.as_file(source) as file, open_npz(file) as data:
             mean, covariance, lower, upper = (
                 np.asarray(data[name], float) for name in ("mean", "covariance", "lower", "upper")
             )

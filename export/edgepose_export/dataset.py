@@ -15,7 +15,7 @@ from torch import Tensor
 from edgepose import rotations as rot
 from edgepose.calibration import GRAVITY
 from edgepose.errors import EdgeposeError
-from edgepose.npz import BROKEN
+from edgepose.npz import BROKEN, open_npz
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import PARENTS, forward_kinematics
 from edgepose_export.splits import part_of
@@ -53,7 +53,7 @@ def read_take(path: Path) -> Take:
         EdgeposeError: not such a file.
     """
     try:
-        with np.load(path, allow_pickle=False) as data:
+        with open_npz(path) as data:
             quats = np.stack([data[f"{name}_quat"] for name in PLACEMENTS], axis=1)
             force = np.stack([data[f"{name}_acc"] for name in PLACEMENTS], axis=1)
             poses = data["poses"].reshape(-1, 24, 3)

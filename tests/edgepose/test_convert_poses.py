@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -231,13 +232,132 @@ def test_broken_files_cost_only_themselves(command, tmp_path):
     )
     said = lines(result.stdout)
     assert list(said.values()).count("ok") == 11
-    assert re.match(r"damaged: .*3\.csv, row 11: 1 columns.*; only the 9 poses before it", said["3.csv"])
+    assert re.match(r"damaged: .*3\.csv, row 11: 1 columns.*; 9 poses are taken", said["3.csv"])
     assert re.match("failed: .*not a whole NPZ file", said["x.npz"])
     assert re.match("failed: .*has no poses, only a header", said["empty.csv"])
     assert sorted(path.name for path in out.iterdir()) == sorted(f"{i}.bvh" for i in range(12))
     check(out / "3.bvh", 9)
     result = command("convert", folder, "--to", "bvh", "--out", out, "--skip-existing")
     assert result.stdout.count("skipped, there already") == 12
+
+
+@pytest.mark.parametrize(("at", "mended"), [(6, b"\x63"), (8, struct.pack("<H", 0x800))])
+def test_directories_of_archives_that_zipfile_refuses(tmp_path, at, mended):
+    """A version of the format that is not there yet, and a name that says it is UTF-8 and is not."""
+    content = bytearray(REAL.read_bytes())
+    entry = content.index(b"PK\x01\x02")
+    content[entry + at : entry + at + len(mended)] = mended
+    content[entry + 46] = 0xFF
+    path = tmp_path / "a.npz"
+    path.write_bytes(content)
+    assert not is_poses(path)
+    with pytest.raises(EdgeposeError, match=r"a\.npz: not a whole NPZ file"):
+        read_poses(path)
+
+
+@pytest.mark.parametrize("form", ["axis-angle", "quat", "matrix", "euler"])
+@pytest.mark.parametrize(
+    ("column", "number"), [(0, "-9" + "0" * 13), (1, "1e300"), (3, "1e200"), (-1, "-1e7")]
+)
+def test_numbers_that_are_far_too_large(tmp_path, form, column, number):
+    path = write(tmp_path / "a.csv", 5, True, form)
+    rows = [row.split(",") for row in path.read_text().splitlines()]
+    rows[1 if column == 0 else 5][column] = number
+    path.write_text("\n".join(map(",".join, rows)) + "\n")
+    with pytest.raises(
+        EdgeposeError, match=r"row [26]: a number is infinite or not a number, or far too large"
+    ):
+        read_poses(path)
+
+
+@pytest.mark.parametrize("times", [("0", "1e-320"), ("0", "1e-7"), ("0", "1000")])
+@pytest.mark.parametrize("ending", ["csv", "npz"])
+def test_times_of_no_frame_rate(tmp_path, times, ending):
+    path = write(tmp_path / "a.csv", 2)
+    rows = [row.split(",") for row in path.read_text().splitlines()]
+    rows[1][1], rows[2][1] = times
+    path.write_text("\n".join(map(",".join, rows)) + "\n")
+    if ending == "npz":
+        path = tmp_path / "a.npz"
+        np.savez(path, poses=np.zeros((2, 72)), time_s=np.array(times, float))
+    with pytest.raises(EdgeposeError, match=r"a\.(csv|npz): .* s from pose to pose is not possible"):
+        read_poses(path)
+
+
+@pytest.mark.parametrize("status", ["held, head", "held\nhead", 'held ""head', "held\x85head"])
+def test_a_status_that_would_break_a_row(tmp_path, status):
+    path = write(tmp_path / "a.csv", 5)
+    path.write_text(path.read_text().replace("held head", f'"{status}"'))
+    read, damage = salvage_poses(path)
+    assert len(read.frames) == 3
+    assert "row 5: the status has a comma, a quote or a line break in it; 3 poses are taken" in damage
+
+
+def test_names_of_other_sensors_in_a_status_stay(tmp_path):
+    path = write(tmp_path / "a.csv", 5)
+    path.write_text(path.read_text().replace("held head", "held sternum left_foot"))
+    assert read_poses(path).status[3] == "held sternum left_foot"
+
+
+def test_poses_that_come_in_pieces(tmp_path):
+    path = write(tmp_path / "a.csv")
+    line = f"(head -c 3 {path}; sleep 1; tail -c +4 {path}) | {sys.executable} -m edgepose convert - "
+    line += f"--to npz --out {tmp_path / 'out'}"
+    result = subprocess.run(line, shell=True, text=True, capture_output=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
+    check(tmp_path / "out" / "stdin.npz", 20)
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (0.3, 0.9, -2.0)])
+def test_a_place_that_does_not_change_comes_through_bvh(tmp_path, place):
+    with BvhSink(tmp_path / "a.bvh", body=default_body(1.9)) as sink:
+        for pose in poses(3):
+            sink.write(pose._replace(translation=np.array(place)))
+    found = read_poses(tmp_path / "a.bvh").translation
+    np.testing.assert_allclose(found, [place] * 3, atol=1e-6)
+
+
+def test_small_files_of_many_poses(tmp_path):
+    """They must not fill the memory."""
+    path = tmp_path / "a.npz"
+    np.savez_compressed(path, poses=np.zeros((200_000, 72), np.int8), mocap_framerate=60.0)
+    with pytest.raises(EdgeposeError, match=r"a\.npz: unpacks to 329 MB; files are read up to"):
+        read_poses(path)
+    still = "".join(f"JOINT j{i}\n{{\nOFFSET 0 0 0\nCHANNELS 0\n}}\n" for i in range(500))
+    head = f"HIERARCHY\nROOT r\n{{\nOFFSET 0 0 0\nCHANNELS 1 Xrotation\n{still}}}\nMOTION\n"
+    path = tmp_path / "a.bvh"
+    path.write_text(f"{head}Frames: 50000\nFrame Time: .01\n" + "0\n" * 50_000)
+    with pytest.raises(EdgeposeError, match=r"a\.bvh: unpacks to 2293 MB; files are read up to"):
+        read_poses(path)
+    more = "".join(still.replace("j", letter) for letter in "abcdefghiklmnopqstuvw")
+    path.write_text(path.read_text().replace("}\nMOTION", more + "}\nMOTION"))
+    with pytest.raises(EdgeposeError, match=r"a\.bvh, line \d+: more than 10000 joints"):
+        read_poses(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "count", "says"),
+    [
+        (lambda text: text[:-100], 19, "line 164: a frame needs 75 numbers, this line has"),
+        (lambda text: text.replace("Frames: 20", "Frames: 12"), 20, "12 frames are announced, 20 are there"),
+        (lambda text: text.replace("Frames: 20", "Frames: 30"), 20, "30 frames are announced, 20 are there"),
+        (lambda text: text.replace("Frames: 20", "Frames: 30")[:-3], 19, "30 frames are announced"),
+        (lambda text: re.sub(r"\S+(\s\S+\s)$", r"nan\1", text), 19, "a number is not finite"),
+    ],
+)
+def test_good_rows_of_a_damaged_bvh_file(command, tmp_path, change, count, says):
+    path = tmp_path / "a.bvh"
+    with BvhSink(path) as sink:
+        for pose in poses(20):
+            sink.write(pose)
+    path.write_text(change(path.read_text()))
+    with pytest.raises(EdgeposeError, match=says):
+        read_poses(path)
+    result = command("convert", path, "--to", "npz", "--out", tmp_path / "out")
+    assert result.returncode == 1
+    assert re.match(f"damaged: .*{says}.*; {count} poses are taken", lines(result.stdout)["a.bvh"])
+    found = read_poses(tmp_path / "out" / "a.npz").rotations
+    np.testing.assert_allclose(found, [pose.rotations for pose in poses(count)], atol=1e-5)
 
 
 @pytest.mark.parametrize("form", ["axis-angle", "quat", "matrix"])

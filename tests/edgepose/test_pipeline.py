@@ -14,7 +14,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuFrame
 from edgepose.pipeline import LATENCIES, RunSummary, Walk, run, status
 from edgepose.placements import PLACEMENTS
-from edgepose.poses import read_poses_csv
+from edgepose.poses import read_poses
 from edgepose.rezero import Headings
 from edgepose.sinks import Sink
 from edgepose.sinks.csv_file import CsvSink
@@ -112,7 +112,7 @@ def test_all_sinks_get_the_same(walk, tmp_path):
     shelf, file = Shelf(), tmp_path / "poses.csv"
     with CsvSink(file, "matrix") as sink:
         walk(sinks=[shelf, sink])
-    frames, time_s, texts, rotations = read_poses_csv(file)
+    frames, time_s, texts, rotations = read_poses(file)[:4]
     assert frames.tolist() == indices(shelf)
     assert texts == [pose.status for pose in shelf.poses]
     np.testing.assert_allclose(time_s, [pose.time_s for pose in shelf.poses], atol=1e-6)

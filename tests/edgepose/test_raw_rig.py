@@ -25,7 +25,7 @@ from edgepose.cli.calibrate import calibrate
 from edgepose.errors import EdgeposeError
 from edgepose.metrics import joint_angle_error
 from edgepose.placements import PLACEMENTS
-from edgepose.poses import read_poses_csv
+from edgepose.poses import read_poses
 from edgepose.recording import Recording, SensorData, read_recording, write_npz
 from edgepose.skeleton import local_from_global
 from edgepose_export.exercises import with_exercises
@@ -93,7 +93,7 @@ def test_poses_from_raw_samples_are_true(command, rig, tmp_path):
     result = command("run", "--file", rig.raw, *words)
     assert result.returncode == 0, result.stderr
     assert "warning" not in result.stderr
-    _, time_s, _, found = read_poses_csv(poses)
+    _, time_s, _, found = read_poses(poses)[:4]
     moving = time_s >= CLIP_S
     assert joint_angle_error(found[moving], true_poses(time_s[moving])).mean() < 9.0
 
@@ -263,7 +263,7 @@ def test_a_live_run_begins_with_the_pose_and_re_zeroes_on_request(rig, tmp_path)
         os.close(terminal.inside)
         terminal.join(5)
         os.close(terminal.master)
-    frames, time_s, _, found = read_poses_csv(poses)
+    frames, time_s, _, found = read_poses(poses)[:4]
     assert frames.tolist() == list(range(frames[0], frames[0] + len(frames)))
     assert frames[0] >= 120  # those before the pose are not written
     moving = (time_s >= begin + 1.6) & (time_s <= end)

@@ -27,7 +27,7 @@ from edgepose import archive
 from edgepose import rotations as rot
 from edgepose.calibration import apply, load_calibration
 from edgepose.placements import PLACEMENTS
-from edgepose.poses import read_poses_csv
+from edgepose.poses import read_poses
 from edgepose.recording import read_recording, samples, write_csv
 from edgepose.sinks.udp import decode_binary
 from edgepose.skeleton import JOINTS, PARENTS
@@ -80,7 +80,7 @@ class Listener(threading.Thread):
 def whole(path: Path) -> tuple[np.ndarray, np.ndarray, list[str], np.ndarray]:
     """Frames, times, status and rotations of a CSV of poses, after the checks that every run must pass."""
     assert path.read_bytes().endswith(b"\n")
-    frames, time_s, status, rotations = read_poses_csv(path)
+    frames, time_s, status, rotations = read_poses(path)[:4]
     assert frames.tolist() == list(range(len(frames)))
     np.testing.assert_allclose(time_s, time_s[0] + frames / 60.0, atol=1.1e-6)
     unit = np.eye(3)

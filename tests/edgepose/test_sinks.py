@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseFrame
-from edgepose.poses import read_poses_csv
+from edgepose.poses import read_poses
 from edgepose.rotations import matrix_to_euler_zxy
 from edgepose.sinks import csv_file
 from edgepose.sinks.csv_file import CsvSink, pose_columns
@@ -55,7 +55,7 @@ def test_csv_comes_back(tmp_path, form, std):
     with CsvSink(path, form, std) as sink:
         for pose in poses:
             sink.write(pose)
-    frames, times, status, rotations = read_poses_csv(path)
+    frames, times, status, rotations = read_poses(path)[:4]
     assert frames.tolist() == list(range(10))
     np.testing.assert_allclose(times, [p.time_s for p in poses], atol=1e-6)
     assert status == [p.status for p in poses]
@@ -108,7 +108,7 @@ def test_csv_close_twice_and_after_an_error(tmp_path):
     with pytest.raises(RuntimeError, match="elsewhere"), sink:
         raise RuntimeError("elsewhere")
     sink.close()
-    assert len(read_poses_csv(tmp_path / "a.csv")[0]) == 1
+    assert len(read_poses(tmp_path / "a.csv").frames) == 1
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux only")
@@ -134,7 +134,7 @@ def test_csv_ends_at_a_whole_row_when_the_disk_fills(tmp_path):
     assert "cannot write poses" in out
     assert 15_000 < path.stat().st_size < 20_000
     assert path.read_bytes().endswith(b"\n")
-    frames = read_poses_csv(path)[0]
+    frames = read_poses(path).frames
     assert frames.tolist() == list(range(len(frames)))
 
 
@@ -152,7 +152,7 @@ def test_csv_killed_run_keeps_its_rows(tmp_path):
     assert process.stdout.readline() == "written\n"
     process.send_signal(signal.SIGKILL if hasattr(signal, "SIGKILL") else signal.SIGTERM)
     process.communicate()
-    frames = read_poses_csv(path)[0]
+    frames = read_poses(path).frames
     assert 0 < len(frames) <= 100
     assert csv_file.FLUSH_S == 1.0
 
@@ -238,12 +238,12 @@ def test_damaged_files(tmp_path, damage, message):
             sink.write(make_pose(i))
     path.write_bytes(_damaged(path.read_text().splitlines(), damage))
     with pytest.raises(EdgeposeError, match=message):
-        read_poses_csv(path)
+        read_poses(path)
 
 
 def test_no_such_file(tmp_path):
     with pytest.raises(EdgeposeError, match="No such file"):
-        read_poses_csv(tmp_path / "a.csv")
+        read_poses(tmp_path / "a.csv")
 
 
 def test_matrices_that_are_no_rotations(tmp_path):
@@ -251,7 +251,7 @@ def test_matrices_that_are_no_rotations(tmp_path):
     with CsvSink(path, "matrix") as sink:
         sink.write(make_pose(0)._replace(rotations=-np.tile(np.eye(3, dtype=np.float32), (24, 1, 1))))
     with pytest.raises(EdgeposeError, match="row 2: the numbers of pelvis are not a rotation"):
-        read_poses_csv(path)
+        read_poses(path)
 
 
 def test_file_with_a_byte_order_mark_and_windows_line_ends(tmp_path):
@@ -259,7 +259,7 @@ def test_file_with_a_byte_order_mark_and_windows_line_ends(tmp_path):
     with CsvSink(path) as sink:
         sink.write(make_pose(0))
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
-    assert len(read_poses_csv(path)[0]) == 1
+    assert len(read_poses(path).frames) == 1
 
 
 # --- UDP ------------------------------------------------------------------------------------------

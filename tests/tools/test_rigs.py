@@ -21,7 +21,7 @@ import serial
 
 from edgepose import rotations as rot
 from edgepose.metrics import summary
-from edgepose.poses import read_poses_csv
+from edgepose.poses import read_poses
 from edgepose.recording import Recording, SensorData, read_recording, write_npz
 from edgepose.skeleton import JOINTS, default_body
 from edgepose.sources.can_bus import Buffered
@@ -93,7 +93,7 @@ def test_the_same_poses_over_every_wire(clip, tmp_path):
         results = list(pool.map(lambda name: follow(recording, name, tmp_path / name), RIGS))
     errors = {}
     for name, (begin, end, path) in zip(RIGS, results, strict=True):
-        frames, time_s, _, poses = read_poses_csv(path)
+        frames, time_s, _, poses = read_poses(path)[:4]
         assert frames.tolist() == list(range(len(frames))), name
         moving = (time_s >= begin + 1.0) & (time_s <= end - 0.1)
         assert moving.sum() in range(262, 266), name

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
 from edgepose.joint_tree import LARGEST
-from edgepose.npz import BROKEN
+from edgepose.npz import BROKEN, open_npz
 from edgepose.rotations import Z_UP_TO_T, rotvec_to_matrix
 from edgepose.skeleton import PARENTS
 
@@ -67,9 +67,7 @@ def _load(path: Path) -> dict[str, Array]:
     """The fields of the file that matter, as numbers."""
     wanted = ("poses", "trans", "mocap_framerate", "mocap_frame_rate")
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise EdgeposeError(f"{path}: not an npz archive")
+        with open_npz(path) as archive:
             return {key: np.asarray(archive[key], float) for key in wanted if key in archive.files}
     except OSError as error:
         raise EdgeposeError(f"{path}: cannot be read: {error.strerror or error}") from None
