@@ -7,13 +7,17 @@ frame, and more; 60 Hz.
 
 from __future__ import annotations
 
+from array import array
 from functools import partial
+from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edgepose import rotations as rot
+from edgepose.calibration import GRAVITY
 from edgepose.calibration.checks import tilt_deg
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
@@ -29,6 +33,7 @@ RATE = 60.0
 
 MAX_FRAMES = 1_000_000
 _NUMBERS = 7  # of each line: quaternion and acceleration; AuxFields has more behind them
+_AT_REST = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY)
 _LONGEST_LINE = 4096
 _TILT_DEG = 30.0  # of what a sensor measures on average over a take
 _METADATA = {
@@ -40,55 +45,100 @@ _METADATA = {
 
 
 def read_recording(path: Path) -> Recording:
-    """The six sensors of a file, as they were strapped on.
+    """The sensors of a file, as they were strapped on; rows that are no good are not there.
 
     Raises:
         EdgeposeError: not such a file, or its inertial frame has not Z up.
     """
-    orientation, force = read_sensors(path)
-    for name, mean in zip(NAMES, (orientation @ force[..., None]).mean(axis=0)[..., 0], strict=True):
+    readings = read_sensors(path)
+    orientation, force, measured = readings.orientation, readings.force, readings.measured
+    quats = rot.matrix_to_quat(orientation)
+    times = np.arange(len(quats)) / RATE
+    sensors = {}
+    for i, (name, placement) in enumerate(zip(NAMES, PLACEMENTS, strict=True)):
+        there = measured[:, i]
+        if not there.any():
+            continue
+        mean = (orientation[there, i] @ force[there, i, :, None]).mean(axis=0)[:, 0]
         if not tilt_deg(mean) < _TILT_DEG:
             raise EdgeposeError(
                 f"{path}: {name} measures gravity along {np.round(mean, 1).tolist()} and not along Z; "
                 "the file is not laid out as TotalCapture's"
             )
-    quats = rot.matrix_to_quat(orientation)
-    times = np.arange(len(quats)) / RATE
-    sensors = {name: SensorData(times, quats[:, i], force[:, i]) for i, name in enumerate(PLACEMENTS)}
-    return Recording(sensors, _METADATA)
+        sensors[placement] = SensorData(times[there], quats[there, i], force[there, i])
+    return Recording(sensors, _METADATA, readings.damage)
 
 
-def read_sensors(path: Path) -> tuple[Array, Array]:
-    """R_IS (T, 6, 3, 3) and specific force (T, 6, 3) in the sensors' frames of a .sensors file.
+class Readings(NamedTuple):
+    """What a file holds.
+
+    Attributes:
+        orientation: (T, 6, 3, 3) R_IS.
+        force: (T, 6, 3) specific force in the sensors' frames, m/s^2.
+        measured: (T, 6) where both are good; elsewhere they are those of a sensor at rest.
+        damage: one line on what is not; None if all is.
+    """
+
+    orientation: Array
+    force: Array
+    measured: NDArray[np.bool_]
+    damage: str | None
+
+
+def read_sensors(path: Path) -> Readings:
+    """What is good in a .sensors file.
 
     Raises:
-        EdgeposeError: not such a file; names the line.
+        EdgeposeError: not such a file.
     """
+    rows, problems = array("d"), list[str]()
     try:
         with path.open(encoding="ascii", errors="replace") as file:
             lines = enumerate(iter(partial(file.readline, _LONGEST_LINE), ""), start=1)
             sensors, frames = _counts(path, next(lines, (1, ""))[1])
-            values = np.empty((frames, len(NAMES), _NUMBERS))
-            for frame in range(frames):
+            for frame in range(1, frames + 1):
                 number, line = next(lines, (0, ""))
-                if line.strip() != str(frame + 1):
-                    raise EdgeposeError(
-                        f"{path}, line {number or 'at the end'}: expected frame {frame + 1} of {frames}, "
+                if line.strip() != str(frame):
+                    problems.append(
+                        f"line {number or 'at the end'}: expected frame {frame} of {frames}, "
                         f"found {line.strip()[:40]!r}"
                     )
-                found = {}
-                for _ in range(sensors):
-                    number, line = next(lines, (0, ""))
-                    name, *cells = line.split()[: 1 + _NUMBERS] or [""]
-                    if name in NAMES:
-                        found[name] = _row(path, number, cells)
-                if missing := [name for name in NAMES if name not in found]:
-                    raise EdgeposeError(f"{path}: frame {frame + 1} has no {', '.join(missing)}")
-                values[frame] = [found[name] for name in NAMES]
+                    break
+                block = list(islice(lines, sensors))
+                # Where the file is cut digits may be missing, which nobody can see.
+                if (len(block) < sensors or frame < frames) and block and not block[-1][1].endswith("\n"):
+                    block.pop()
+                rows.extend(_frame(block, frame, problems).ravel())
     except OSError as error:
         raise EdgeposeError(f"{path}: cannot be read: {error.strerror or error}") from error
-    quats = values[..., :4]
-    return rot.quat_to_matrix(quats / np.linalg.norm(quats, axis=-1, keepdims=True)), values[..., 4:]
+    damage = None
+    if problems:
+        damage = f"{path}, {problems[0]}; {len(problems)} such places in all, the rest is good"
+    values = np.frombuffer(rows).reshape(-1, len(NAMES), _NUMBERS)
+    measured = ~np.isnan(values[..., 0])
+    if not measured.any():
+        raise EdgeposeError(f"{path}, {problems[0]}")
+    values = np.where(measured[..., None], values, _AT_REST)
+    quats = values[..., :4] / np.linalg.norm(values[..., :4], axis=-1, keepdims=True)
+    return Readings(rot.quat_to_matrix(quats), values[..., 4:], measured, damage)
+
+
+def _frame(lines: list[tuple[int, str]], frame: int, problems: list[str]) -> Array:
+    """Rows (6, 7) of a frame's lines, NaN where there is none; adds what is wrong to the problems."""
+    rows = np.full((len(NAMES), _NUMBERS), np.nan)
+    missing = set(NAMES)
+    for number, line in lines:
+        name, *cells = line.split()[: 1 + _NUMBERS] or [""]
+        if name not in NAMES:
+            continue
+        missing.discard(name)
+        try:
+            rows[NAMES.index(name)] = _row(cells)
+        except ValueError:
+            problems.append(f"line {number}: expected a unit quaternion and an acceleration of {name}")
+    if missing:
+        problems.append(f"frame {frame} has no {', '.join(name for name in NAMES if name in missing)}")
+    return rows
 
 
 def _counts(path: Path, line: str) -> tuple[int, int]:
@@ -103,12 +153,13 @@ def _counts(path: Path, line: str) -> tuple[int, int]:
     )
 
 
-def _row(path: Path, number: int, cells: list[str]) -> list[float]:
-    """Quaternion and acceleration of a line."""
-    try:
-        row = [float(cell) for cell in cells]
-    except ValueError:
-        row = []
+def _row(cells: list[str]) -> list[float]:
+    """Quaternion and acceleration of a line.
+
+    Raises:
+        ValueError: they are none.
+    """
+    row = [float(cell) for cell in cells]
     if len(row) != _NUMBERS or not np.abs(row).max() < 1e4 or not abs(np.linalg.norm(row[:4]) - 1.0) < 0.1:
-        raise EdgeposeError(f"{path}, line {number}: expected a unit quaternion and an acceleration")
+        raise ValueError
     return row

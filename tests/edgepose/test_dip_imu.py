@@ -11,6 +11,7 @@ import pytest
 
 from edgepose.calibration import GRAVITY
 from edgepose.dip_imu import read_recording
+from edgepose.errors import EdgeposeError
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.poses import read_poses
 from edgepose.recording import read_recording as read_npz
@@ -57,6 +58,36 @@ def test_lost_packets_are_not_there(content, tmp_path):
     kept = [i for i in range(FRAMES) if i not in (3, 4, 5)]
     np.testing.assert_allclose(recording.sensors["left_forearm"].time_s, np.array(kept) / 60)
     assert len(recording.sensors["head"].time_s) == FRAMES
+
+
+def test_a_silent_sensor_and_a_bad_matrix_cost_only_themselves(content, tmp_path):
+    content["imu_ori"][:, PLACES[4]] = np.nan
+    content["imu_ori"][3, PLACES[0]] = 0.0
+    content["imu_ori"][4:6, PLACES[0]] = 1e300
+    content["imu_acc"][7, PLACES[1]] = np.inf
+    recording = read_recording(written(tmp_path / "01.pkl", content))
+    assert "head was not measured" in recording.damage
+    assert "4 samples left out, which are no rotation or no acceleration" in recording.damage
+    assert {name: len(data.time_s) for name, data in recording.sensors.items()} == {
+        name: FRAMES - {"left_forearm": 3, "right_forearm": 1}.get(name, 0)
+        for name in PLACEMENTS
+        if name != "head"
+    }
+
+
+@pytest.mark.parametrize("gt", [None, np.nan, 200.0])
+def test_sensors_need_no_true_poses(content, tmp_path, gt):
+    if gt is None:
+        del content["gt"]
+    else:
+        content["gt"][3, 0] = gt
+    path = written(tmp_path / "01.pkl", content)
+    recording = read_recording(path)
+    assert recording.damage is None
+    assert [len(data.time_s) for data in recording.sensors.values()] == [FRAMES] * 6
+    says = {None: "has no 'gt'", 200.0: "an angle in frame 3 of 'gt' is more than 100 rad"}.get(gt, "NaN")
+    with pytest.raises(EdgeposeError, match=says):
+        read_poses(path)
 
 
 class Attack:

@@ -48,16 +48,49 @@ def test_by_the_command(file, command, tmp_path):
 
 
 def test_other_files(file):
-    text = file.read_text()
     for changed, message in (
-        (text[: len(text) // 2], r"line \d+: expected|line at the end: expected|has no"),
-        (text.replace("Head\t", "Tail\t"), "frame 1 has no Head"),
         ("", "line 1: expected the numbers of sensors and frames"),
+        ("9\t30\n1\n", "frame 1 has no L_LowArm, R_LowArm, L_LowLeg, R_LowLeg, Head, Pelvis"),
+        ("9\t30\n7\n", "line 2: expected frame 1 of 30, found '7'"),
     ):
         file.write_text(changed)
         with pytest.raises(EdgeposeError, match=message) as info:
             read_recording(file)
         assert "\n" not in str(info.value)
+
+
+LINE = len(SENSORS) + 1
+NAN = "\tnan\t0\t0\t0\t0\t0\t9.8\t0\t0\t0\t0\t0\t0"
+
+
+@pytest.mark.parametrize(
+    ("change", "counts", "message"),
+    [
+        (lambda rows: rows[:-3], {1: 29, 2: 29, 3: 29}, "frame 30 has no R_LowArm, L_LowLeg, R_LowLeg"),
+        (lambda rows: rows[: 20 * LINE + 1], {i: 20 for i in range(6)}, "line at the end: expected frame 21"),
+        (lambda rows: [*rows[:5], rows[5].split("\t")[0] + NAN, *rows[6:]], {}, None),
+        (lambda rows: [*rows[:2], "Head" + NAN, *rows[3:]], {4: 29}, "line 3: expected a unit quaternion"),
+        (lambda rows: [row.replace("Head\t", "Tail\t") for row in rows], {4: 0}, "frame 1 has no Head"),
+    ],
+)
+def test_good_rows_of_damaged_files(file, change, counts, message):
+    rows = change(file.read_text().splitlines())
+    file.write_text("\n".join(rows) + "\n")
+    recording = read_recording(file)
+    found = [len(recording.sensors[name].time_s) if name in recording.sensors else 0 for name in PLACEMENTS]
+    assert found == [counts.get(i, FRAMES) for i in range(6)]
+    assert (recording.damage is None) if message is None else (message in recording.damage)
+
+
+def test_a_number_that_is_cut_is_none(file):
+    rows = file.read_text().splitlines()
+    head = 1 + 11 * LINE + 1
+    assert rows[head - 1] == "12"
+    cut = "\t".join(rows[head].split("\t")[:8])[:-3]
+    file.write_text("\n".join([*rows[:head], cut]))
+    recording = read_recording(file)
+    assert "frame 12 has no L_LowArm, R_LowArm, L_LowLeg, R_LowLeg, Head, Pelvis" in recording.damage
+    assert [len(data.time_s) for data in recording.sensors.values()] == [11] * 6
 
 
 def test_another_inertial_frame(file):

@@ -43,7 +43,10 @@ def read_totalcapture(path: Path, folder: Path, truth: Mapping[str, Path]) -> Ta
         EdgeposeError: a file is missing or broken; says which and where.
     """
     name = take_name(path)
-    orientation, force = read_sensors(path)
+    readings = read_sensors(path)
+    if readings.damage:
+        raise EdgeposeError(readings.damage)
+    orientation, force = readings.orientation, readings.force
     refs = _calibration(folder, f"{name}_calib_imu_ref.txt")
     bones = _calibration(folder, f"{name}_calib_imu_bone.txt")
     if name not in truth:
