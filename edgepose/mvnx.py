@@ -11,9 +11,11 @@ the wearer looked when they were calibrated.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from functools import partial
 from itertools import chain
+from math import isfinite
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
@@ -35,6 +37,7 @@ _WIDTHS = {
     "sensorAngularVelocity": 3,
     "sensorMagneticField": 3,
 }
+_EXTRAS = ("sensorAngularVelocity", "sensorMagneticField")  # without which the rest of a frame is good
 _METADATA = {
     "frame": "Z up",
     "units": "s, m/s^2, rad/s; mag in units of the earth's field",
@@ -85,6 +88,8 @@ def _samples(path: Path, frames: _Frames, problems: list[str]) -> Iterator[ImuSa
         )
     if frames.bad:
         problems.append(f"{path}: {frames.bad} bad frames left out")
+    for name, count in frames.bad_lists.items():
+        problems.append(f"{path}: {count} {name} that are not whole left out")
 
 
 class _Frames:
@@ -94,11 +99,13 @@ class _Frames:
         rate: frames a second.
         count: frames so far.
         bad: frames that had to be left out.
+        bad_lists: how many lists had to be, of frames that are good without them, by name.
     """
 
     def __init__(self, path: Path) -> None:
         self.rate = 0.0
         self.count = self.bad = 0
+        self.bad_lists: Counter[str] = Counter()
         self._path = path
         self._labels: list[str] = []
         self._depth = self._fed = self._length = 0
@@ -113,18 +120,24 @@ class _Frames:
         self._parser.EndElementHandler = self._end
 
     def feed(self, chunk: bytes) -> str | None:
-        """Take the next bytes, none at the end of the file; what is wrong with them, if they are no XML.
+        """Take the next bytes, none at the end of the file; what is wrong with them, if they are the last.
 
         Raises:
-            EdgeposeError: it is no MVNX.
+            EdgeposeError: it is no MVNX, and there is no frame yet.
         """
         self._fed += len(chunk)
         try:
             self._parser.Parse(chunk, not chunk)
+            if self._fed - self._parser.CurrentByteIndex > _LONGEST:
+                raise EdgeposeError(
+                    f"{self._path}: not an MVNX file: it has a tag of more than {_LONGEST} bytes"
+                )
+        except EdgeposeError as error:
+            if not self.count:
+                raise
+            return str(error).removeprefix(f"{self._path}: ")
         except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two: odd encodings
             return str(error)
-        if self._fed - self._parser.CurrentByteIndex > _LONGEST:
-            raise EdgeposeError(f"{self._path}: not an MVNX file: it has a tag of more than {_LONGEST} bytes")
         return None
 
     def take(self) -> list[ImuSample]:
@@ -198,8 +211,15 @@ class _Frames:
         Raises:
             ValueError, OverflowError: there is no list, or one that is not whole.
         """
-        lists = {name: "".join(texts).split() for name, texts in self._texts.items()}
-        if not lists or any(len(words) != _WIDTHS[name] * len(self._labels) for name, words in lists.items()):
+        lists: dict[str, list[float]] = {}
+        for name, texts in self._texts.items():
+            try:
+                lists[name] = self._list_of(name, "".join(texts).split())
+            except ValueError:
+                if name not in _EXTRAS:
+                    raise
+                self.bad_lists[name] += 1
+        if not lists:
             raise ValueError
         # Milliseconds are rounded; frames come at an even rate.
         time_s = round(float(time_ms) * self.rate / 1000.0) / self.rate
@@ -208,11 +228,17 @@ class _Frames:
             if label in self._labels:
                 at = self._labels.index(label)
                 numbers = {
-                    name: tuple(map(float, words[at * _WIDTHS[name] : (at + 1) * _WIDTHS[name]]))
-                    for name, words in lists.items()
+                    name: tuple(values[at * _WIDTHS[name] : (at + 1) * _WIDTHS[name]])
+                    for name, values in lists.items()
                 }
                 samples.append(_sample(sensor, time_s, numbers))
         return samples
+
+    def _list_of(self, name: str, words: list[str]) -> list[float]:
+        """The numbers of a list; raises ValueError if it is not whole."""
+        if len(words) != _WIDTHS[name] * len(self._labels):
+            raise ValueError
+        return [float(word) for word in words]
 
 
 def _sample(sensor: int, time_s: float, numbers: dict[str, Any]) -> ImuSample:
@@ -222,5 +248,8 @@ def _sample(sensor: int, time_s: float, numbers: dict[str, Any]) -> ImuSample:
     if quat is not None and free is not None:
         unit = unit_quaternion(*quat)  # a sample without one is left out, as in every recording
         acc = unit and rotate_back(unit, (free[0], free[1], free[2] + GRAVITY))
-    gyr, mag = numbers.get("sensorAngularVelocity"), numbers.get("sensorMagneticField")
+    gyr, mag = (
+        values if values is not None and all(map(isfinite, values)) else None  # NaN: not measured
+        for values in map(numbers.get, _EXTRAS)
+    )
     return ImuSample(sensor, time_s, quat, acc, gyr, mag)

@@ -137,12 +137,37 @@ def test_bad_frames_cost_only_themselves(tmp_path):
     parts[20] = parts[20][:begin] + " ".join(words)
     path.write_text("</frame>".join(parts))
     found = read_mvnx(path)
-    assert f"{path}: 4 bad frames left out; {path}: 1 bad rows left out" in found.damage
+    assert f"{path}: 3 bad frames left out; {path}: 1 sensorMagneticField that are not whole" in found.damage
+    assert f"{path}: 1 bad rows left out" in found.damage
     assert "head has a quaternion that is not of unit length" in found.damage
     assert {name: len(data.time_s) for name, data in found.sensors.items()} == {
-        name: FRAMES - 5 if name == "head" else FRAMES - 4 for name in PLACEMENTS
+        name: FRAMES - 4 if name == "head" else FRAMES - 3 for name in PLACEMENTS
     }
+    assert [np.isnan(data.mag[:, 0]).sum() for data in found.sensors.values()] == [1] * 6
     assert len(wanted.sensors["head"].time_s) > FRAMES
+
+
+@pytest.mark.parametrize("there", ["nan nan nan", "nan", "0.250000"])
+def test_a_magnetometer_that_measures_nothing(tmp_path, there):
+    path = tmp_path / "walk.mvnx"
+    wanted = write(path)
+    path.write_text(path.read_text().replace("0.250000 -0.500000 1.000000", there))
+    found = read_mvnx(path)
+    whole = there.count("nan") == 3
+    says = None if whole else f"{path}: {FRAMES} sensorMagneticField that are not whole left out"
+    assert found.damage == says
+    for name, data in found.sensors.items():
+        assert data.mag is None
+        np.testing.assert_allclose(data.acc, wanted.sensors[name].acc[:FRAMES], atol=5e-5)
+
+
+def test_frames_before_a_second_subject_are_good(tmp_path):
+    path = tmp_path / "walk.mvnx"
+    write(path)
+    path.write_text(path.read_text().replace("</subject>", '</subject><subject frameRate="0"></subject>'))
+    found = read_mvnx(path)
+    assert "breaks off (the frame rate '0' of its subject is not possible), 40 frames before" in found.damage
+    assert [len(data.time_s) for data in found.sensors.values()] == [FRAMES] * 6
 
 
 def test_a_lost_frame_is_a_gap(tmp_path):
