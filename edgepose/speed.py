@@ -9,6 +9,7 @@ from __future__ import annotations
 import gc
 import json
 import os
+import platform
 import socket
 import statistics
 import subprocess
@@ -365,7 +366,7 @@ def machine() -> dict[str, str]:
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     python = ".".join(map(str, sys.version_info[:3]))
     return {
-        "processor": names[0] if names else os.uname().machine,
+        "processor": names[0] if names else platform.processor() or platform.machine(),
         "python": python,
         "torch": torch.__version__,
     }

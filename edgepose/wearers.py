@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from math import ceil
 from typing import NamedTuple
 
@@ -41,14 +42,14 @@ class Wearer:
         """Nothing has come.
 
         Args:
-            source: entered, and not one that waits; it is left when he has ended.
+            source: entered, and not one that waits.
             walk: his.
             tell: hears of an error.
         """
         self.walk = walk
         self.waiting: deque[_Waiting] = deque()
         self.ended = False
-        self._source, self._batches, self._tell = source, iter(source), tell
+        self._source, self._batches, self._tell = source, source.__iter__(), tell
         self._spoilt = False  # an output can take no more
 
     def look(self) -> None:
@@ -67,7 +68,7 @@ class Wearer:
         if self.ended:
             return
         self.ended = True
-        self._source.__exit__(None, None, None)
+        self._batches.close()
         try:
             self._put(self.walk.flush())
         except EdgeposeError as error:
@@ -102,6 +103,8 @@ def run_together(
 ) -> None:
     """Runs all to their ends, or until `stopped`; counts and errors are in the summaries of their walks.
 
+    Outputs are closed as their wearers end: of an hour of poses that takes a while, and holds up nobody.
+
     Args:
         wearers: numbered as the engine's.
         engine: makes poses.
@@ -110,24 +113,30 @@ def run_together(
         on_turn: called after each turn with what all have done together.
     """
     going = dict(enumerate(wearers))
+    closed: list[Future[None]] = []
     due_s = time.monotonic()
-    while going:
-        if stopped():
+    with ThreadPoolExecutor() as closing:
+        while going:
+            if stopped():
+                for wearer in going.values():
+                    wearer.end()
             for wearer in going.values():
-                wearer.end()
-        for wearer in going.values():
-            if not wearer.ended:
-                wearer.look()
-        _step(engine, {i: wearer.waiting.popleft() for i, wearer in going.items() if wearer.waiting}, going)
-        for i in [i for i, wearer in going.items() if wearer.ended and not wearer.waiting]:
-            wearer = going.pop(i)
-            wearer.write(engine.finish(i), wearer.walk.arrived)
-            wearer.walk.end()
-        on_turn(_total([wearer.walk.summary for wearer in wearers]))
-        if look_s and not any(wearer.waiting for wearer in going.values()):
-            # Looks that are missed are left out.
-            due_s += look_s * max(1, ceil((time.monotonic() - due_s) / look_s))
-            time.sleep(max(0.0, due_s - time.monotonic()))
+                if not wearer.ended:
+                    wearer.look()
+            frames = {i: wearer.waiting.popleft() for i, wearer in going.items() if wearer.waiting}
+            _step(engine, frames, going)
+            for i in [i for i, wearer in going.items() if wearer.ended and not wearer.waiting]:
+                wearer = going.pop(i)
+                wearer.write(engine.finish(i), wearer.walk.arrived)
+                wearer.walk.end()
+                closed.append(closing.submit(wearer.walk.close))
+            on_turn(_total([wearer.walk.summary for wearer in wearers]))
+            if look_s and not any(wearer.waiting for wearer in going.values()):
+                # Looks that are missed are left out.
+                due_s += look_s * max(1, ceil((time.monotonic() - due_s) / look_s))
+                time.sleep(max(0.0, due_s - time.monotonic()))
+    for each in closed:
+        each.result()  # raises what was not foreseen
 
 
 def _step(engine: BatchEngine, frames: dict[int, _Waiting], wearers: dict[int, Wearer]) -> None:

@@ -135,7 +135,9 @@ def run(
     failed = {rig.name: error for rig, error in zip(rigs, reports, strict=True) if error is not None}
     if several and failed:
         told = "; ".join(f"{name}: {error}" for name, error in failed.items())
-        raise EdgeposeError(f"{len(failed)} of {len(rigs)} wearers failed: {told}")
+        raise EdgeposeError(f"{len(failed)} of {len(rigs)} wearers failed: {told}") from next(
+            iter(failed.values())
+        )
     for error in failed.values():
         raise error
 
@@ -184,8 +186,7 @@ def _walks(
     else:
         source = opened[0].source
         run_alone(walks[0], source, engine, lambda: stop.asked, lambda: source.behind_s)
-    for walk in walks:
-        walk.close()
+        walks[0].close()
     return walks
 
 

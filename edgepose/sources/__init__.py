@@ -11,7 +11,7 @@ once at the start and carried on by the monotonic clock, so that it never jumps;
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -21,6 +21,9 @@ from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 
 Batch = tuple[float, list[ImuSample]]
+
+Batches = Generator[Batch, None, None]
+"""Closing it ends the reading, without waiting for what is under way."""
 
 POLL_S = 0.02
 """Longest time between two batches of a live source, seconds."""
@@ -46,7 +49,8 @@ class Source(AbstractContextManager["Source"], Protocol):
     """See the module's text.
 
     Attributes:
-        behind_s: how long the batch given last had waited to be taken, seconds; 0 for files.
+        behind_s: how long the batch given last had waited to be taken, at most, seconds; 0 for files unless
+            they come at their own pace.
     """
 
     behind_s: float
@@ -64,7 +68,7 @@ class Source(AbstractContextManager["Source"], Protocol):
         """One line for the user if something was wrong with the input although the rest of it was
         delivered."""
 
-    def __iter__(self) -> Iterator[Batch]:
+    def __iter__(self) -> Batches:
         """Batches, in order.
 
         Raises:

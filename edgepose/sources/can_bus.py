@@ -102,7 +102,7 @@ class CanBus:
             while len(messages) < _MOST:
                 try:
                     message = self._bus.recv(timeout)
-                except ValueError:  # slcan's line was damaged
+                except (ValueError, IndexError):  # slcan's line was damaged
                     continue
                 if message is None:
                     return messages, False

@@ -13,7 +13,7 @@ from edgepose.clock import CaptureClock, DeviceClock, HostClocks
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.recording import Recording, read_recording, salvage_recording, samples
-from edgepose.sources import Batch, Counters, Source, total
+from edgepose.sources import Batches, Counters, Source, total
 from edgepose.sources.detection import Chunk, candidates, protocol_named
 from edgepose.sources.sensor_map import SensorMap, default_places
 from edgepose.sources.stream import Clock, Places, Stream
@@ -33,8 +33,6 @@ _SLICE_S = 0.01
 class RecordingSource:
     """A CSV or NPZ recording."""
 
-    behind_s = 0.0
-
     def __init__(self, path: Path, realtime: bool, lenient: bool = False, waits: bool = True) -> None:
         """Nothing is read yet.
 
@@ -44,6 +42,7 @@ class RecordingSource:
             lenient: take the good rows of any sensors; without, all six and no bad row.
             waits: see `open_source`.
         """
+        self.behind_s = 0.0
         self._path = path
         self._read = salvage_recording if lenient else read_recording
         self._realtime, self._waits = realtime, waits
@@ -79,18 +78,18 @@ class RecordingSource:
     ) -> None:
         """Nothing is open."""
 
-    def __iter__(self) -> Iterator[Batch]:
+    def __iter__(self) -> Batches:
         """All samples in time order, a hundredth of a second at a time."""
         assert self._recording is not None, "the source has not been entered"
-        for batch in _batches(samples(self._recording), self._realtime, self._waits):
-            self._packets += len(batch[1])
-            yield batch
+        rows = samples(self._recording)
+        for now_s, batch, late_s in _batches(rows, self._realtime, self._waits):
+            self.behind_s = late_s
+            self._packets += len(batch)
+            yield now_s, batch
 
 
 class LogSource:
     """What came over a serial port or CAN buses, in a file."""
-
-    behind_s = 0.0
 
     def __init__(
         self,
@@ -109,6 +108,7 @@ class LogSource:
             stream: makes the stream of a line.
             waits: see `open_source`.
         """
+        self.behind_s = 0.0
         self._path = path
         self._realtime, self._waits = realtime, waits
         self._chunks = chunks
@@ -147,13 +147,15 @@ class LogSource:
     ) -> None:
         """Nothing is open."""
 
-    def __iter__(self) -> Iterator[Batch]:
+    def __iter__(self) -> Batches:
         """All samples in the order of the file.
 
         Raises:
             EdgeposeError: the file cannot be read to its end, or there is no packet in it.
         """
-        yield from _batches(self._samples(), self._realtime, self._waits)
+        for now_s, batch, late_s in _batches(self._samples(), self._realtime, self._waits):
+            self.behind_s = late_s
+            yield now_s, batch
         if not self.counters.packets:
             raise EdgeposeError(f"{self._path}: {self._problem()}")
 
@@ -286,12 +288,18 @@ def _read_capture(path: Path) -> Iterator[tuple[str, float, bytes]]:
         yield "", nan if arrival_s is None else arrival_s, data
 
 
-def _batches(rows: Iterator[ImuSample], realtime: bool, waits: bool) -> Iterator[Batch]:
-    """Samples in slices of time; `now_s` is that of the newest sample, or goes on with the clock where
-    realtime is asked for; until a slice is due there are empty ones unless this waits."""
+def _batches(
+    rows: Iterator[ImuSample], realtime: bool, waits: bool
+) -> Iterator[tuple[float, list[ImuSample], float]]:
+    """Samples in slices of time, and how late each is; `now_s` is that of the newest sample, or goes on with
+    the clock where realtime is asked for; until a slice is due there are empty ones unless this waits."""
     now_s = end_s = -inf
     batch: list[ImuSample] = []
     offset_s = 0.0
+
+    def late_s() -> float:
+        return max(0.0, time.monotonic() + offset_s - end_s) if realtime else 0.0
+
     for sample in rows:
         if end_s == -inf:
             now_s, end_s = sample.time_s, sample.time_s + _SLICE_S
@@ -299,14 +307,14 @@ def _batches(rows: Iterator[ImuSample], realtime: bool, waits: bool) -> Iterator
         while sample.time_s >= end_s:
             if realtime:
                 while not waits and end_s - offset_s > time.monotonic():
-                    yield now_s, []
+                    yield now_s, [], 0.0
                 time.sleep(max(0.0, end_s - offset_s - time.monotonic()))
                 now_s = end_s
-            yield now_s, batch
+            yield now_s, batch, late_s()
             batch = []
             # Nothing is said about a pause unless its time really passes.
             end_s = end_s + _SLICE_S if realtime else sample.time_s + _SLICE_S
         batch.append(sample)
         now_s = max(now_s, sample.time_s)
     if batch:
-        yield now_s, batch
+        yield now_s, batch, late_s()

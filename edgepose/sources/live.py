@@ -7,6 +7,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from functools import cache
+from math import inf
 from queue import Empty, SimpleQueue
 from types import TracebackType
 from typing import Any, NamedTuple, Protocol
@@ -15,7 +17,7 @@ from edgepose.clock import DeviceClock, HostClocks
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
-from edgepose.sources import POLL_S, Batch, Counters, total
+from edgepose.sources import POLL_S, Batches, Counters, total
 from edgepose.sources.detection import Chunk
 from edgepose.sources.stream import Clock, Places, Stream
 from firmware_protocols import registry
@@ -33,6 +35,9 @@ NOISE_S = 3.0
 
 REOPEN_S = 0.5
 """Time between two attempts to open a line that has gone, seconds."""
+
+FULL_LOOKS = 32
+"""Looks in a row that may leave something on a line; no system keeps more, and what goes on is a flood."""
 
 _SETTLE_S = 0.1
 """How long to throw away at least: what has waited in the system comes in several pieces."""
@@ -58,8 +63,11 @@ class Handle(Protocol):
         """Give it free."""
 
     @property
-    def waiting(self) -> Callable[[], Chunk] | None:
-        """Gives what is there without waiting, and raises as `read` does; None where only `read` can."""
+    def waiting(self) -> Callable[[], tuple[Chunk, bool]] | None:
+        """As `read`, but without waiting; what it gives is all there was, unless it says that more may wait.
+
+        None where only `read` can.
+        """
 
 
 class Link(NamedTuple):
@@ -108,7 +116,7 @@ class _Line:
         self._queue = queue
         self._now = now
         self._waits = waits
-        self._look: Callable[[], Chunk] | None = None  # while no thread reads
+        self._look: Callable[[], tuple[Chunk, bool]] | None = None  # while no thread reads
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, args=(self._drain,), daemon=True, name=link.name)
 
@@ -119,10 +127,10 @@ class _Line:
     def start(self) -> None:
         self._thread.start()
 
-    def look(self) -> Chunk:
-        """What has come, where no thread reads; nothing where one does."""
+    def look(self) -> tuple[Chunk, bool]:
+        """What has come, and whether more may wait, where no thread reads; nothing where one does."""
         if self._look is None:
-            return b""
+            return b"", False
         try:
             return self._look()
         except Gone:
@@ -131,7 +139,7 @@ class _Line:
                 target=self._run, args=(self._reopen,), daemon=True, name=self.link.name
             )
             self._thread.start()
-            return b""
+            return b"", False
 
     def _run(self, first: Callable[[], None]) -> None:
         try:
@@ -148,7 +156,7 @@ class _Line:
                 except Gone:
                     self._reopen()
         except BaseException as error:  # for the thread that can tell the user
-            self._queue.put((self, self._now(), error))
+            self._queue.put((self, self._now(), _told(self.link, error)))
 
     def _drain(self) -> None:
         # What has waited since the line was opened is of unknown age, and full buffers have lost parts of it.
@@ -175,8 +183,12 @@ class _Line:
             self._drain()
             return
 
-    def close(self) -> None:
+    def stop(self) -> None:
+        """Reads no more, without waiting for what is under way."""
         self._stop.set()
+
+    def close(self) -> None:
+        self.stop()
         if self._thread.is_alive():
             self._thread.join()
         if self.handle is not None:
@@ -185,6 +197,20 @@ class _Line:
 
 Arrival = tuple[_Line, float, Any]
 """A line, when something came over it, and what: a chunk, or what ended its thread."""
+
+
+class _Came(NamedTuple):
+    """What there is for a batch.
+
+    Attributes:
+        arrivals: what came.
+        since_s: it may have waited since then, although it was seen later.
+        emptied: nothing is known to wait behind it.
+    """
+
+    arrivals: list[Arrival]
+    since_s: float
+    emptied: bool
 
 
 class LiveSource:
@@ -212,7 +238,6 @@ class LiveSource:
         self._raw = raw
         self._lines: list[_Line] = []
         self._queue: SimpleQueue = SimpleQueue()
-        self._unix_s = 0.0  # Unix time at 0 of the monotonic clock
         self._open = ExitStack()
 
     @property
@@ -246,12 +271,11 @@ class LiveSource:
             for link in self._links:
                 handle = link.open()
                 stack.callback(handle.close)
-                line = _Line(link, handle, claimed, self._queue, self._now, self._waits)
+                line = _Line(link, handle, claimed, self._queue, _now, self._waits)
                 self._lines.append(line)
             stack.pop_all()
         for line in self._lines:
             self._open.callback(line.close)
-        self._unix_s = time.time() - time.monotonic()
         return self
 
     def __exit__(
@@ -260,52 +284,66 @@ class LiveSource:
         """Close all lines."""
         self._open.close()
 
-    def __iter__(self) -> Iterator[Batch]:
+    def __iter__(self) -> Batches:
         """Batches as they come, without end.
 
         Raises:
-            EdgeposeError: nothing usable comes at the start.
+            EdgeposeError: nothing usable comes at the start, or a line cannot be read.
         """
-        start_s = checked_s = now_s = self._now()
+        start_s = checked_s = now_s = _now()
         for line in self._lines:
             line.start()
-        while True:
-            samples: list[ImuSample] = []
-            came = self._wait() if self._waits else self._look()
-            if not came:
-                now_s = self._now()
-            for line, arrival_s, chunk in came:
-                if isinstance(chunk, BaseException):
-                    raise chunk
-                if self._raw is not None:
-                    pieces = [chunk] if isinstance(chunk, bytes) else chunk
-                    self._raw += [(arrival_s, piece) for piece in pieces]
-                samples += line.stream.feed(chunk, arrival_s)
-                # On a machine that is behind, what has not been taken from the queue is not missing yet.
-                now_s = max(now_s, arrival_s)
-            self.behind_s = self._now() - now_s
-            yield now_s, samples
-            for line in self._lines:
-                self._check_start(line, now_s, start_s)
-            if now_s - checked_s > 1.0:
-                checked_s = now_s
-                for line in self._lines:
-                    _warn_of_twins(line)
-
-    def _wait(self) -> list[Arrival]:
-        """The next that comes, if it comes within POLL_S."""
         try:
-            return [self._queue.get(timeout=POLL_S)]
-        except Empty:
-            return []
+            for came, since_s, emptied in self._waited() if self._waits else self._looks():
+                samples: list[ImuSample] = []
+                for line, arrival_s, chunk in came:
+                    samples += self._feed(line, arrival_s, chunk)
+                # On a machine that is behind, what has not been taken from queue or line is not missing yet.
+                if emptied:
+                    now_s = max(now_s, *(arrival_s for _, arrival_s, _ in came)) if came else _now()
+                self.behind_s = _now() - min(now_s, since_s)
+                yield now_s, samples
+                for line in self._lines:
+                    self._check_start(line, now_s, start_s)
+                if now_s - checked_s > 1.0:
+                    checked_s = now_s
+                    for line in self._lines:
+                        _warn_of_twins(line)
+        finally:
+            for line in self._lines:
+                line.stop()
 
-    def _look(self) -> list[Arrival]:
+    def _feed(self, line: _Line, arrival_s: float, chunk: Any) -> list[ImuSample]:
+        if isinstance(chunk, BaseException):
+            raise chunk
+        if self._raw is not None:
+            pieces = [chunk] if isinstance(chunk, bytes) else chunk
+            self._raw += [(arrival_s, piece) for piece in pieces]
+        return line.stream.feed(chunk, arrival_s)
+
+    def _waited(self) -> Iterator[_Came]:
+        """The next that comes, or nothing where nothing comes within POLL_S."""
+        while True:
+            try:
+                came = [self._queue.get(timeout=POLL_S)]
+            except Empty:
+                came = []
+            yield _Came(came, inf, True)
+
+    def _looks(self) -> Iterator[_Came]:
         """All that has come."""
-        came: list[Arrival] = [self._queue.get() for _ in range(self._queue.qsize())]
-        for line in self._lines:
-            if chunk := line.look():
-                came.append((line, self._now(), chunk))
-        return came
+        since_s, full = _now(), 0
+        while True:
+            look_s, left = _now(), False
+            came: list[Arrival] = [self._queue.get() for _ in range(self._queue.qsize())]
+            for line in self._lines:
+                chunk, more = line.look()
+                left |= more
+                if chunk:
+                    came.append((line, _now(), chunk))
+            full = full + 1 if left else 0
+            yield _Came(came, since_s, not left or full > FULL_LOOKS)
+            since_s = look_s
 
     def _check_start(self, line: _Line, now_s: float, start_s: float) -> None:
         if line.told:
@@ -318,8 +356,28 @@ class LiveSource:
             line.told = True
             _log.warning("%s", error)
 
-    def _now(self) -> float:
-        return self._unix_s + time.monotonic()
+
+def _now() -> float:
+    """Unix time that never jumps."""
+    return _unix_s() + time.monotonic()
+
+
+@cache
+def _unix_s() -> float:
+    """Unix time at 0 of the monotonic clock, the same for all sources: wearers share their ticks."""
+    return time.time() - time.monotonic()
+
+
+def _told(link: Link, error: BaseException) -> EdgeposeError:
+    """What ended a line's thread, for the user; makers' libraries fail in ways that nobody has foreseen."""
+    if isinstance(error, EdgeposeError):
+        return error
+    text = (str(error).splitlines() or [""])[0]
+    told = EdgeposeError(
+        f"{link.name}: reading it failed ({type(error).__name__}: {text}); edgepose --debug shows where"
+    )
+    told.__cause__ = error
+    return told
 
 
 def _check_start(line: _Line, now_s: float, start_s: float) -> None:

@@ -21,6 +21,12 @@ except ImportError:  # Windows has none
 _ANSWER_S = 0.02
 """Time a device may take until it answers, seconds."""
 
+_FULL = 4095
+"""Bytes that a system shows at a time; behind so many more may wait, which it shows a moment later."""
+
+_MOST = 1 << 16
+"""Bytes taken in one look, so that a line that never stops does not hold up the others."""
+
 
 class SerialPort:
     """An open serial port, which nobody else may open meanwhile."""
@@ -39,6 +45,8 @@ class SerialPort:
         """
         try:
             self._serial = serial.Serial(name, baud, timeout=POLL_S, exclusive=True)
+        except OverflowError:
+            raise EdgeposeError(f"{name}: no port has a speed of {baud} bit/s; check --baud") from None
         except (OSError, ValueError, _TerminalError) as error:
             raise EdgeposeError(f"{name}: {_opening_problem(error)}") from None
         self._requests = cycle(requests) if requests else None
@@ -64,15 +72,19 @@ class SerialPort:
             raise Gone from None
 
     @property
-    def waiting(self) -> Callable[[], bytes] | None:
+    def waiting(self) -> Callable[[], tuple[bytes, bool]] | None:
         """See `live.Handle`; the answers of devices that are asked have to be waited for."""
         return self._waiting if self._requests is None else None
 
-    def _waiting(self) -> bytes:
+    def _waiting(self) -> tuple[bytes, bool]:
+        data = b""
         try:
-            return bytes(self._serial.read(self._serial.in_waiting))
+            while len(data) < _MOST and (count := self._serial.in_waiting):
+                data += self._serial.read(count)
         except (OSError, _TerminalError):
-            raise Gone from None
+            if not data:  # else the next look tells
+                raise Gone from None
+        return data, len(data) >= _FULL
 
     def close(self) -> None:
         """See `live.Handle`."""

@@ -230,6 +230,19 @@ def test_a_bus_that_goes_and_comes_back(tmp_path, monkeypatch, caplog):
     assert re.fullmatch(rf"slcan:{path}: back after \d+\.\d s", told[1])
 
 
+def test_damaged_lines_of_an_adapter_cost_only_themselves(tmp_path, monkeypatch):
+    monkeypatch.setenv("CAN_CONFIG", '{"sleep_after_open": 0.01}')
+    adapter = Adapter(tmp_path / "adapter")
+
+    def send(message):
+        os.write(adapter.master, b"t123\rt12\rtxyz\r")  # without a length, an id, a number
+        adapter.send(message)
+
+    with open_source(can=f"slcan:{tmp_path / 'adapter'}") as source, Devices(send, "hipnuc-canopen"):
+        assert {sample.sensor for sample in collect(source, 100)} == set(range(6))
+    adapter.unplug()
+
+
 # --- logs ---------------------------------------------------------------------------------------------------
 
 

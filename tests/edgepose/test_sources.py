@@ -145,6 +145,81 @@ def test_a_source_that_does_not_wait(port, caplog):
     assert source.counters.lost == 0
 
 
+def test_what_waits_behind_a_full_buffer_is_not_said_to_be_delivered(port):
+    """The system shows 4 kB at a time."""
+    master, name = port
+    data = b"".join(map(encode, packets(51)[6:]))
+    assert 8192 < len(data) < 12_000
+    got = []
+    with open_source(port=name, protocol="native", waits=False) as source:
+        batches = iter(source)
+        while not got:
+            time.sleep(0.02)
+            os.write(master, encode(packets(1)[0]))
+            got += next(batches)[1]
+        time.sleep(0.1)
+        got += next(batches)[1]
+        before = len(got)
+        written = 0
+        while written < len(data):
+            written += os.write(master, data[written:])
+        written_s = time.time()
+        time.sleep(0.1)
+        while len(got) < before + 300:
+            now_s, batch = next(batches)
+            got += batch
+            assert now_s < written_s or len(got) == before + 300
+            time.sleep(0.01)
+        assert next(batches)[0] > written_s
+
+
+def test_a_line_that_is_never_empty_does_not_stop_the_time(port, monkeypatch):
+    monkeypatch.setattr("edgepose.sources.live.FULL_LOOKS", 3)
+    master, name = port
+    os.set_blocking(master, False)
+
+    def fill():
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                os.write(master, bytes(4096))
+
+    with open_source(port=name, protocol="native", waits=False) as source:
+        start_s = now_s = next(iter(batches := iter(source)))[0]
+        for _ in range(200):
+            if now_s > start_s + 1.0:
+                break
+            fill()
+            time.sleep(0.02)
+            now_s, _ = next(batches)
+        else:
+            pytest.fail("the time stands still")
+
+
+def test_the_time_until_a_look_counts_as_waiting(port):
+    master, name = port
+    with open_source(port=name, protocol="native", waits=False) as source:
+        batches, got = iter(source), []
+        while not got:
+            time.sleep(0.02)
+            os.write(master, encode(packets(1)[0]))
+            got += next(batches)[1]
+        os.write(master, encode(packets(2)[6]))
+        time.sleep(0.3)
+        assert len(next(batches)[1]) == 1
+        assert source.behind_s >= 0.3
+        next(batches)
+        assert source.behind_s < 0.3
+
+
+def test_sources_share_a_clock_that_nobody_sets(port, monkeypatch):
+    with open_source(port=port[1], waits=False) as source:
+        first_s, _ = next(iter(source))
+    monkeypatch.setattr(time, "time", lambda: 0.0)
+    with open_source(port=port[1], waits=False) as source:
+        second_s, _ = next(iter(source))
+    assert first_s < second_s < first_s + 60.0
+
+
 def test_unknown_ids_are_counted_and_told_once(port, caplog):
     master, name = port
     with open_source(port=name) as source, Device(master, chunks(200, ids=(0, 9))):
@@ -277,6 +352,11 @@ def test_not_a_port(tmp_path):
     for path, baud in ((tmp_path / "file", 115200), ("/dev/null", 115200)):
         with pytest.raises(EdgeposeError, match="cannot open it as a serial port"):
             open_source(port=str(path), baud=baud).__enter__()
+
+
+def test_a_speed_beyond_what_systems_count(port):
+    with pytest.raises(EdgeposeError, match="no port has a speed of 3000000000 bit/s; check --baud"):
+        open_source(port=port[1], baud=3_000_000_000).__enter__()
 
 
 def test_impossible_speed(port):
@@ -582,6 +662,17 @@ def test_realtime_takes_its_time(tmp_path):
     assert len(got) == 180
     assert all(s.time_s <= now_s for now_s, batch in batches for s in batch)
     assert len(batches) >= 28
+
+
+@pytest.mark.parametrize("kind", ["bin", "npz"])
+def test_a_recording_at_its_own_pace_says_how_late_it_is_taken(tmp_path, kind):
+    (tmp_path / "a.bin").write_bytes(b"".join(chunks(20)))
+    with open_source(file={"bin": tmp_path / "a.bin", "npz": REAL}[kind], realtime=True) as source:
+        batches = iter(source)
+        next(batches)
+        time.sleep(0.15)
+        next(batches)
+        assert 0.13 < source.behind_s < 10.0
 
 
 def test_options():
