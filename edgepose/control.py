@@ -6,6 +6,7 @@ import math
 import socket
 import struct
 
+from edgepose.addresses import resolve
 from edgepose.errors import EdgeposeError
 
 MAX_DELAY_S = 60.0
@@ -28,8 +29,8 @@ class Control:
         """
         self.ignored = 0
         try:
-            family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-            self._socket = socket.socket(family, kind, protocol)
+            family, address = resolve(host, port, socket.SOCK_DGRAM)
+            self._socket = socket.socket(family, socket.SOCK_DGRAM)
         except (OSError, UnicodeError) as error:
             raise EdgeposeError(f"cannot find {host!r} to listen on: {error}") from error
         self._socket.setblocking(False)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from edgepose.addresses import resolve
 from edgepose.cli.stop import Stop
 from edgepose.errors import EdgeposeError
 
@@ -95,8 +96,8 @@ def _listen(udp: str) -> socket.socket:
 
     host, port = parse_address(udp)
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-        receiver = socket.socket(family, kind, protocol)
+        family, address = resolve(host, port, socket.SOCK_DGRAM)
+        receiver = socket.socket(family, socket.SOCK_DGRAM)
     except (OSError, UnicodeError) as error:
         raise EdgeposeError(f"cannot listen for poses at {udp}: {error}") from error
     try:

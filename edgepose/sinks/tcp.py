@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 from dataclasses import dataclass
 
+from edgepose.addresses import resolve
 from edgepose.errors import EdgeposeError
 from edgepose.pose import PoseFrame
 from edgepose.rotations import matrix_to_rotvec
@@ -49,7 +50,7 @@ class TcpSink(Sink):
         self.missed = 0
         self._viewers: list[_Viewer] = []
         try:
-            family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+            family, address = resolve(host, port, socket.SOCK_STREAM)
             self._server = socket.create_server(address[:2], family=family, backlog=CLIENTS)
         except (OSError, UnicodeError) as error:
             raise EdgeposeError(f"cannot listen for viewers at {host} port {port}: {error}") from error

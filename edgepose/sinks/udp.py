@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from edgepose.addresses import resolve
 from edgepose.errors import EdgeposeError
 from edgepose.pose import PoseFrame, status_bits, status_text
 from edgepose.rotations import matrix_to_quat, matrix_to_rotvec, quat_to_matrix, rotvec_to_matrix
@@ -147,8 +148,7 @@ class DatagramSink(Sink):
         """Resolve the host, once.
 
         Args:
-            host: name or address. A name with addresses of both kinds stands for its IPv4 one, which most
-                receivers listen on.
+            host: name or address.
             port: UDP port.
 
         Raises:
@@ -156,11 +156,10 @@ class DatagramSink(Sink):
         """
         self.unsent = 0
         try:
-            found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+            family, address = resolve(host, port, socket.SOCK_DGRAM)
         except (OSError, UnicodeError) as error:
             raise EdgeposeError(f"cannot find host {host!r} to send poses to: {error}") from error
-        family, kind, protocol, _, address = min(found, key=lambda entry: entry[0] != socket.AF_INET)
-        self._socket = socket.socket(family, kind, protocol)
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)  # A full network queue costs a datagram, not the time of a frame.
         try:
             self._socket.connect(address)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from edgepose.addresses import resolve
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseFrame
@@ -360,6 +361,15 @@ def test_udp_ipv6():
         with UdpSink(*destination) as sink:
             sink.write(make_pose(1))
         assert decode_binary(sock.recv(2048)).index == 1
+
+
+@pytest.mark.parametrize("kind", [socket.SOCK_DGRAM, socket.SOCK_STREAM])
+def test_names_stand_for_their_address_of_ipv4(kind):
+    # No name is this machine, by both kinds of addresses, as localhost is on many systems.
+    assert socket.AF_INET6 in {family for family, *_ in socket.getaddrinfo(None, 9, type=kind)}
+    assert resolve(None, 9, kind) == (socket.AF_INET, ("127.0.0.1", 9))
+    assert resolve("localhost", 9, kind) == (socket.AF_INET, ("127.0.0.1", 9))
+    assert resolve("::1", 9, kind)[0] == socket.AF_INET6
 
 
 def test_udp_unknown_host():
