@@ -30,7 +30,7 @@ from edgepose.recording import (
     write_npz,
 )
 from edgepose.sources import open_source
-from edgepose.sources.files import CAN_LOGS, CAPTURES, is_recording
+from edgepose.sources.files import CAN_LOGS, CAPTURES, is_can_log, is_recording
 
 WRITERS: dict[str, Callable[[Path, Recording], None]] = {"csv": write_csv, "npz": write_npz}
 """What is written, by ending."""
@@ -136,7 +136,9 @@ def _expand(given: Path, out: Path) -> Iterator[tuple[Path, Path]]:
         except OSError as error:
             raise EdgeposeError(f"{error.filename}: cannot look into it: {error.strerror}") from None
         if not found:
-            raise EdgeposeError(f"{given}: no recording in this folder; names end in {', '.join(ENDINGS)}")
+            raise EdgeposeError(
+                f"{given}: no recording in this folder; names end in {', '.join(ENDINGS)}, or .gz of a log"
+            )
         for path in found:
             # The session that is itself given has its own name.
             yield path, Path(given.resolve().name) if path == given else path.relative_to(given)
@@ -145,6 +147,10 @@ def _expand(given: Path, out: Path) -> Iterator[tuple[Path, Path]]:
             raise EdgeposeError("-: there is no standard input; name a file")
         yield given, Path("stdin")
     elif given.exists():
+        if not given.is_file():
+            raise EdgeposeError(
+                f"{given}: not a file; convert what comes out of it as -: convert - < {given}"
+            )
         yield given, Path(given.name)
     elif any(mark in str(given) for mark in "*?["):
         # The shell has left it alone: it is quoted, or the shell is that of Windows.
@@ -160,16 +166,18 @@ def _expand(given: Path, out: Path) -> Iterator[tuple[Path, Path]]:
 
 def _walk(folder: Path, out: Path) -> Iterator[Path]:
     """Recordings in a folder, save those of an earlier conversion."""
-    if xio.is_session(folder) or mtmanager.is_session(folder):
+    session = xio.is_session(folder)
+    if session or mtmanager.is_session(folder):
         yield folder
-        return
-    if xio.is_sensor(folder):
+    elif xio.is_sensor(folder):
         raise EdgeposeError(f"{folder}: one sensor of an x-io session; give the folder above it")
     for path in folder.iterdir():
         if path.is_dir():
-            if not path.is_symlink() and path.resolve() != out:
+            of_session = session and xio.is_sensor(path)
+            if not of_session and not path.is_symlink() and path.resolve() != out:
                 yield from _walk(path, out)
-        elif path.suffix.lower() in ENDINGS and not path.is_fifo():  # which could be waited for in vain
+        # A pipe could be waited for in vain.
+        elif not path.is_fifo() and (path.suffix.lower() in ENDINGS or is_can_log(path)):
             yield path
 
 

@@ -101,20 +101,32 @@ def _strip(poses: Poses, times: Array, body: Body) -> bytes:
         return path.read_bytes()
 
 
+def extremes(values: Array) -> NDArray[np.int64]:
+    """Rows of values (T,) that a plot needs, rising: the least and the largest of every so many."""
+    if len(values) <= POINTS:
+        return np.arange(len(values))
+    step = -(-len(values) // (POINTS // 2))
+    starts = np.arange(0, len(values), step)
+    # The last few are filled up with the last one.
+    bins = np.pad(values, (0, -len(values) % step), mode="edge").reshape(-1, step)
+    rows = np.concatenate([starts + bins.argmin(axis=1), starts + bins.argmax(axis=1)])
+    return np.unique(np.minimum(rows, len(values) - 1))
+
+
 def _plots(times: Array, angles: dict[str, Array], found: Sequence[Walk]) -> bytes:
     """A panel an angle, left and right in one."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, 1.35 * len(ANGLES)), dpi=110, facecolor="white", layout="constrained")
     panels: Any = figure.subplots(len(ANGLES), 1, sharex=True)
-    step = max(1, len(times) // POINTS)
     for panel, name in zip(panels, ANGLES, strict=True):
         for walk in found:
             panel.axvspan(times[walk.frames[0]], times[walk.frames[-1]], color="#EEEEEE", linewidth=0)
         sides = ("left", "right") if name in LIMBS else ("trunk",)
         for side in sides:
             values = angles[f"{side} {name}" if name in LIMBS else name]
-            panel.plot(times[::step], values[::step], color=PREDICTION[side], linewidth=1.0)
+            shown = extremes(values)
+            panel.plot(times[shown], values[shown], color=PREDICTION[side], linewidth=1.0)
         panel.set_title(f"{name}, deg", loc="left", fontsize=9, color=INK)
         panel.tick_params(labelsize=8)
         panel.grid(color="#E5E5E5", linewidth=0.6)

@@ -62,9 +62,8 @@ def soak(minutes: float) -> None:
                 f"{(time.monotonic() - started) / 60:6.1f}  {does:12}  {max(share, 0.0):8.0%}  "
                 f"{megabytes(viewer):6.1f} MB  {megabytes(run.pid):6.1f} MB"
             )
-        errors = run.communicate()[1]
-        if run.returncode:
-            raise click.ClickException(errors)
+        if run.wait():
+            raise click.ClickException((folder / "errors.txt").read_text())
         poses = read_poses(folder / "poses.csv")
         held = sum("held" in status for status in poses.status)
         wanted = round(length_s * RATE)
@@ -104,24 +103,23 @@ def edgepose(*words: object) -> None:
 
 
 @contextlib.contextmanager
-def run_with_viewer(folder: Path) -> Iterator[subprocess.Popen[str]]:
+def run_with_viewer(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
     """The run, once its viewer serves the page."""
     command = ["run", "--file", folder / "walk.npz", "--realtime", "--model", "rnn", "--view"]
     command += ["--calibration", folder / "calib.json", "--csv", folder / "poses.csv"]
-    run = subprocess.Popen(
-        [sys.executable, "-m", "edgepose", *map(str, command)], text=True, stderr=subprocess.PIPE
-    )
+    # A file and not a pipe, which would hold the run up once it is full.
+    told = folder / "errors.txt"
+    with told.open("w") as errors:
+        run = subprocess.Popen([sys.executable, "-m", "edgepose", *map(str, command)], stderr=errors)
     try:
-        told = ""
-        while "in a browser" not in told:
-            told = run.stderr.readline()
-            if not told:
-                raise click.ClickException("the run has ended without a page")
+        while "in a browser" not in told.read_text():
+            if run.poll() is not None:
+                raise click.ClickException(f"the run has ended without a page: {told.read_text()}")
+            time.sleep(0.1)
         yield run
     finally:
         run.terminate()  # does nothing to one that has ended
         run.wait()
-        run.stderr.close()
 
 
 @contextlib.contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import math
 import os
 import pty
@@ -406,6 +407,34 @@ def test_patterns_folders_and_names(tmp_path, monkeypatch):
     assert plan([tmp_path / "*.npz", Path("c.npz").absolute()], "npz", out) == [
         Job(tmp_path / "c.npz", out / "c.npz")
     ]
+
+
+def test_a_folder_leaves_no_recording_out(command, tmp_path):
+    """Packed logs of a bus, and what lies beside an x-io session."""
+    folder = tmp_path / "in"
+    written = xio_session(folder / "mix", [f"{name} (UDP)" for name in PLACEMENTS])
+    (folder / "mix" / "more").mkdir()
+    for path in (folder / "mix" / "a.npz", folder / "mix" / "more" / "b.npz"):
+        shutil.copy(REAL, path)
+    with can.Logger(tmp_path / "bus.log") as log:
+        for packet in packets():
+            for number, data in native_can.encode(packet):
+                log(can.Message(packet.t_us * 1e-6 + 1e9, number, False, data=data, channel="can0"))
+    (folder / "bus.log.gz").write_bytes(gzip.compress((tmp_path / "bus.log").read_bytes()))
+    (folder / "notes.txt.gz").write_bytes(gzip.compress(b"notes"))
+    result = command("convert", folder, "--to", "csv", "--out", tmp_path / "out")
+    assert result.returncode == 0, result.stdout
+    assert {name: row[0] for name, row in table(result).items()} == {
+        "mix": "600", "a.npz": "1800", "b.npz": "1800", "bus.log.gz": "300"
+    }  # fmt: skip
+    assert len(list(samples(read_recording(tmp_path / "out" / "mix.csv")))) == len(written)
+
+
+def test_a_named_pipe_is_refused(command, tmp_path):
+    os.mkfifo(tmp_path / "a.csv")
+    result = command("convert", tmp_path / "a.csv", "--to", "npz", "--out", tmp_path / "out")
+    assert result.returncode == 1
+    assert result.stderr.startswith(f"edgepose: {tmp_path / 'a.csv'}: not a file; convert what comes out")
 
 
 def test_names_that_are_no_text_and_a_pipe(command, tmp_path):

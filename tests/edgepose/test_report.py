@@ -20,7 +20,7 @@ from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
 from edgepose.pose import PoseFrame, longest_holds
 from edgepose.poses import read_poses
-from edgepose.report import write_report
+from edgepose.report import POINTS, extremes, write_report
 from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.csv_file import CsvSink
 from edgepose.skeleton import JOINTS, default_body, local_from_global
@@ -159,6 +159,19 @@ def write(path: Path, local: np.ndarray, rate: float) -> None:
         for i, rotations in enumerate(local):
             status = "held head" if 10 <= i < 16 else "filling window" if i < 4 else "ok"
             sink.write(PoseFrame(i, 1.7e9 + i / rate, status, rotations, np.zeros(24)))
+
+
+def test_short_peaks_are_drawn():
+    """One pose in hours, up and down, in the middle and at the end."""
+    for count in (1, 2000, 3001, 432_007):
+        values = np.sin(np.arange(count) / 1000)
+        values[count // 3], values[-1] = 90.0, -90.0
+        shown = extremes(values)
+        assert (np.diff(shown) > 0).all()
+        assert 0 <= shown[0] <= shown[-1] < count
+        assert len(shown) <= POINTS
+        assert values[shown].max() == values.max()
+        assert values[shown].min() == values.min()
 
 
 def test_page_of_a_walk(command, tmp_path):
