@@ -81,12 +81,51 @@ class PoseNetwork(nn.Module):
         self.mean = nn.Linear(width, outputs)
         self.deviation = nn.Linear(width, outputs)
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Normalised means and standard deviations (B, T, outputs) of z-scored inputs (B, T, inputs)."""
+    def forward(self, x: Tensor, future: int = 0) -> tuple[Tensor, Tensor]:
+        """Normalised means and standard deviations of z-scored inputs.
+
+        Args:
+            x: (B, T, inputs).
+            future: of a bidirectional network: run it as a stream runs, in which a frame knows so many frames
+                after it; 0 for whole sequences.
+
+        Returns:
+            Twice (B, T, outputs); of a stream (B, T - future, outputs), the frames whose future is known.
+        """
         x = torch.relu(self.dense(x))
-        x, _ = self.lstm1(x)
-        x, _ = self.lstm2(x)
+        if future == 0:
+            x, _ = self.lstm1(x)
+            x, _ = self.lstm2(x)
+        else:
+            x = self._streamed(x, future)
         return self.mean(x), nn.functional.softplus(self.deviation(x)) + SIGMA_FLOOR
+
+    def _streamed(self, x: Tensor, future: int) -> Tensor:
+        """Outputs (B, T - future, 2 hidden) of the recurrent layers as `recurrent.BirnnArchive.stream` gives
+        them: forward states go on, backward passes run over a frame and its future only.
+        """
+        forward1 = _direction(self.lstm1, x, "")
+        backward1 = _direction(self.lstm1, _ahead(x, future), "_reverse")
+        ahead = torch.cat([_ahead(forward1, future), backward1], dim=-1)
+        frames = (len(x), -1)
+        forward2 = _direction(self.lstm2, ahead[:, 0].unflatten(0, frames), "")
+        backward2 = _direction(self.lstm2, ahead, "_reverse")[:, 0].unflatten(0, frames)
+        return torch.cat([forward2, backward2], dim=-1)
+
+
+def _ahead(x: Tensor, future: int) -> Tensor:
+    """Each frame of (B, T, units) with its future: (B (T - future), 1 + future, units)."""
+    return x.unfold(1, future + 1, 1).transpose(-1, -2).flatten(0, 1)
+
+
+def _direction(lstm: nn.LSTM, x: Tensor, suffix: str) -> Tensor:
+    """Outputs (B, T, hidden) of one direction of a layer: "" forwards, "_reverse" from last to first."""
+    names = ("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0")
+    weights = [getattr(lstm, name + suffix) for name in names]
+    zero = x.new_zeros(1, len(x), lstm.hidden_size)
+    order = x.flip(1) if suffix else x
+    result = torch.lstm(order, (zero, zero), weights, True, 1, 0.0, lstm.training, False, True)[0]
+    return result.flip(1) if suffix else result
 
 
 class PoseDecoder(nn.Module):

@@ -47,6 +47,8 @@ class TrainConfig:
         steps: optimiser steps.
         sequences: sequences a step, of all processes together.
         window: frames a sequence.
+        streamed: frames of look-ahead with which a BiRNN is trained as it streams; 0 trains it on whole
+            sequences, three times as fast.
         joined: sequences may run over the ends of takes: a network that is never reset learns to recover from
             a jump.
         free_share: share of the sequences taken from CMU's takes.
@@ -72,6 +74,7 @@ class TrainConfig:
     steps: int = 100_000
     sequences: int = 64
     window: int = 120
+    streamed: int = 0
     joined: bool = False
     free_share: float = 0.0
     seated_share: float = 0.0
@@ -147,6 +150,10 @@ def config_from(values: dict[str, Any]) -> TrainConfig:
         raise ValueError('measured = "passed" needs targets = "global-6d"')
     if config.acceleration_loss and not config.network.acceleration:
         raise ValueError("a network without accelerations cannot give them back: acceleration_loss = false")
+    if config.streamed and config.network.kind != "birnn":
+        raise ValueError('only kind = "birnn" can be trained as streamed')
+    if config.streamed >= config.window:
+        raise ValueError(f"streamed is {config.streamed}; it takes fewer frames than the window has")
     return config
 
 
@@ -163,6 +170,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "steps": (1, 10**9),
     "sequences": (1, 10**6),
     "window": (1, 10**6),
+    "streamed": (0, 1000),
     "validate_every": (1, 10**9),
     "seed": (0, 2**62),
     "learning_rate": (1e-12, 10.0),
@@ -393,7 +401,9 @@ class Trainer:
         if config.acceleration_loss:
             target = torch.cat([target, x[..., -ACCELERATIONS:]], dim=-1)
         with torch.autocast(x.device.type, torch.bfloat16, enabled=config.bf16):
-            mean, deviation = network(nn.functional.dropout(x, dropout, training=dropout > 0))
+            seen = nn.functional.dropout(x, dropout, training=dropout > 0)
+            mean, deviation = network(seen, config.streamed) if config.streamed else network(seen)
+        target = target[:, : mean.shape[1]]  # as a stream, the network leaves out frames without a future
         numbers, pose = target.shape[-1], config.network.pose_outputs
         mean = mean[..., :numbers].float()
         loss = likelihood_loss(mean, deviation[..., :numbers].float(), target, config.beta)

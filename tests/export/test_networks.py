@@ -23,11 +23,11 @@ def close(a, b, atol=2e-5):
     torch.testing.assert_close(a, b, rtol=0, atol=atol)
 
 
-def run_offline(network, statistics, orientation, acceleration):
+def run_offline(network, statistics, orientation, acceleration, *future):
     """What training computes, through torch.nn.LSTM, and the decoder."""
     x = (network_input(orientation, acceleration) - statistics.input_mean) / statistics.input_std
-    mean, deviation = network(x)
-    return PoseDecoder(network.shape, *statistics[2:])(orientation, mean, deviation)
+    mean, deviation = network(x, *future)
+    return PoseDecoder(network.shape, *statistics[2:])(orientation[:, : mean.shape[1]], mean, deviation)
 
 
 def test_archive_computes_what_training_computed(shape, parts, tiny, wearers):
@@ -167,6 +167,17 @@ def test_birnn_stream_against_its_definition(parts, tiny, wearers, frames, futur
         close(a, b)
     if frames == 12:
         assert (got[0] - whole[0]).abs().max() > 1e-3  # another function than the whole sequence's
+
+
+@pytest.mark.parametrize("future", [1, 5])
+def test_a_stream_gives_what_streamed_training_computed(parts, tiny, wearers, future):
+    inputs = wearers(3, 14)
+    with torch.no_grad():
+        expected = run_offline(*parts(BIRNN), *inputs, future)
+        got, _ = stream(tiny(BIRNN), *inputs, future)
+    assert expected[0].shape == (3, 14 - future, 24, 3, 3)
+    for a, b in zip(got, expected, strict=True):
+        close(a[:, : 14 - future], b)
 
 
 def test_wearers_of_a_batch_do_not_meet(shape, tiny, wearers):

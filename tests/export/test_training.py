@@ -498,6 +498,13 @@ def test_every_network_learns(takes, tmp_path, kind, normalisation, acceleration
     assert same(state["averaged"], dict(one.averaged.state_dict()))
 
 
+def test_a_birnn_learns_as_it_streams(takes, tmp_path):
+    config = replace(SMALL, network=SMALL.network._replace(kind="birnn"), streamed=5, steps=50)
+    one = trainer(takes, replace(config, warm_up=0, learning_rate=0.03, validate_every=50))
+    losses, _ = fit(one, tmp_path)
+    assert np.mean(losses[-10:]) < np.mean(losses[:10]) - 0.1
+
+
 def test_loss_without_accelerations_is_the_poses_alone(takes):
     both, alone = (trainer(takes, replace(SMALL, beta=0.0, acceleration_loss=loss)) for loss in (True, False))
     outputs = SMALL.network.pose_outputs
@@ -555,6 +562,8 @@ def test_config_that_differs_from_another(tmp_path):
         ("schedule = 'linear'", "schedule is 'linear'; it takes 'exponential' or 'cosine'"),
         ("schedule = []", "schedule is []; it takes a text"),
         ("speed = 1", "unknown field 'speed'"),
+        ('streamed = 5\n[network]\nkind = "rnn"', "can be trained as streamed"),
+        ("window = 5\nstreamed = 5", "streamed is 5; it takes fewer frames"),
         ("network = 3", r"network is 3; it takes a table [network]"),
         ("[network]\nkind = 'gru'", "kind is 'gru'; it takes 'birnn' or 'rnn'"),
         ("[network]\nhidden = 0", "hidden is 0; it takes 1 to"),
