@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 import click
@@ -11,7 +11,7 @@ import click
 from edgepose.cli.options import Orientations
 from edgepose.cli.rigs import RigFlags
 from edgepose.cli.wishes import Wishes
-from edgepose.errors import EdgeposeError
+from edgepose.errors import EdgeposeError, named
 from edgepose.placements import PLACEMENTS
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ class OpenRig:
         """
         self.say = voice(flags.name)
         self._flags, self._calibration = flags, calibration
-        with _named(flags.name):
+        with named(flags.name):
             self.source = stack.enter_context(flags.source.open(waits=waits))
             self._wishes = Wishes(stack, flags.control, by_key)
             self._orient = Orientations(flags.filter, magnetometer=calibration.north)
@@ -62,7 +62,7 @@ class OpenRig:
         Raises:
             EdgeposeError: one cannot be written to.
         """
-        with _named(self._flags.name):
+        with named(self._flags.name):
             self._sinks = self._flags.outputs.open(stack, rate)
 
     def walk(self, rate: float, several: bool, on_pose: Callable[[RunSummary], None]) -> Walk:
@@ -144,7 +144,7 @@ def calibration_of(rig: RigFlags) -> Calibration:
     from edgepose.calibration import load_calibration
 
     calibration = load_calibration(rig.calibration)
-    with _named(rig.name):
+    with named(rig.name):
         _check_filter(calibration, rig)
     return calibration
 
@@ -179,14 +179,3 @@ def _begins_anew(calibration: Calibration) -> bool:
 def voice(name: str) -> Callable[[str], None]:
     """Says things of a wearer on stderr; one without a name needs none."""
     return lambda text: click.echo(f"{name}: {text}" if name else text, err=True)
-
-
-@contextmanager
-def _named(name: str) -> Iterator[None]:
-    """Errors say whose they are."""
-    try:
-        yield
-    except EdgeposeError as error:
-        if not name:
-            raise
-        raise EdgeposeError(f"{name}: {error}") from error

@@ -12,7 +12,8 @@ import click
 from click.core import ParameterSource
 
 from edgepose.cli.options import SourceFlags, filter_options, source_options
-from edgepose.cli.outputs import OutputFlags, address, check_files, output_options
+from edgepose.cli.outputs import OutputFlags, address, output_options
+from edgepose.cli.sharing import check_lines
 from edgepose.errors import EdgeposeError
 
 FILES = ("file", "sensors", "calibration", "csv", "npz", "bvh")
@@ -24,6 +25,7 @@ class RigFlags(NamedTuple):
 
     Attributes:
         name: what messages call the wearer; empty where there is one, from the command line.
+        path: the rig file.
     """
 
     source: SourceFlags
@@ -33,6 +35,7 @@ class RigFlags(NamedTuple):
     outputs: OutputFlags
     control: tuple[str, int] | None
     name: str = ""
+    path: Path | None = None
 
 
 def _needed(ctx: click.Context, param: click.Parameter, value: Path | None) -> Path | None:
@@ -105,18 +108,16 @@ def read_rigs(paths: Sequence[Path]) -> list[RigFlags]:
 
     Raises:
         EdgeposeError: a file cannot be read, a key or value in it means nothing, or two wearers have one name
-            or port.
+            or line.
     """
     rigs = [_read(path) for path in paths]
-    for what, named in (
-        ("name", [rig.name for rig in rigs]),
-        ("port", [port for rig in rigs for port in set((rig.source.port or "").split(",")) if port]),
-    ):
-        twice = [name for name, count in Counter(named).items() if count > 1]
-        if twice:
-            raise EdgeposeError(
-                f"{', '.join(map(str, paths))}: two of them have the {what} {twice[0]}; give each its own"
-            )
+    twice = [name for name, count in Counter(rig.name for rig in rigs).items() if count > 1]
+    if twice:
+        raise EdgeposeError(
+            f"{', '.join(map(str, paths))}: two of them have the name {twice[0]}; give each its own"
+        )
+    if len(rigs) > 1:
+        check_lines(rigs)
     return rigs
 
 
@@ -130,7 +131,7 @@ def _read(path: Path) -> RigFlags:
     words = [word for key, value in content.items() for word in _words(path, key, value)]
     try:
         rig: RigFlags = _flags.invoke(_flags.make_context(str(path), words))
-        return rig._replace(name=name)
+        return rig._replace(name=name, path=path)
     except click.MissingParameter as error:
         key = "" if error.param is None else error.param.opts[0].removeprefix("--")
         raise EdgeposeError(f"{path}: {key} is missing") from None
@@ -164,18 +165,7 @@ def _words(path: Path, key: str, value: object) -> list[str]:
         raise EdgeposeError(f"{path}: {key} must be {what}, not {value!r}")
     if isinstance(value, bool):
         return [f"--{key}"] if value else []
+    if "\0" in str(value):
+        raise EdgeposeError(f"{path}: {key} must be text without NUL characters, not {value!r}")
     is_file = key in FILES or (key == "protocol" and str(value).endswith(".toml"))
     return [f"--{key}={path.parent / str(value) if is_file and value != '-' else value}"]
-
-
-def check_all_files(rigs: Sequence[RigFlags]) -> None:
-    """Raises click.UsageError where a file to write is one to read, or two outputs are one file."""
-    outputs: dict[str, str | Path | None] = {}
-    inputs: dict[str, Path | None] = {}
-    for rig in rigs:
-        whose = f"{rig.name}: " if rig.name else ""
-        outputs |= {whose + flag: file for flag, file in rig.outputs.files.items()}
-        inputs |= {f"{whose}--file": rig.source.file, f"{whose}--calibration": rig.calibration}
-    check_files(outputs, inputs)
-    if sum(rig.outputs.csv == "-" for rig in rigs) > 1:
-        raise click.UsageError("several wearers write CSV to standard output; give all but one a file")

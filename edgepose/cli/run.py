@@ -13,7 +13,8 @@ import click
 
 from edgepose.cli.keys import Keys
 from edgepose.cli.opened import OpenRig, calibration_of
-from edgepose.cli.rigs import RigFlags, check_all_files, rig_options
+from edgepose.cli.rigs import RigFlags, rig_options
+from edgepose.cli.sharing import check_all_files
 from edgepose.cli.stop import Stop
 from edgepose.cli.wishes import heard_by
 from edgepose.errors import EdgeposeError
@@ -88,17 +89,18 @@ def run(
       edgepose run --file walk.csv --calibration calib.json --csv - | head
       edgepose run --rig anna.toml --rig ben.toml --model rnn
     """
-    check_all_files(rigs)
+    from edgepose import archive
+
+    path = archive.find(model)
+    check_all_files(rigs, path)
     live, several = rigs[0].source.live, len(rigs) > 1
     if other := [rig.name for rig in rigs if rig.source.live != live]:
         raise click.UsageError(
             f"{rigs[0].name} and {other[0]}: beside sensors that send, a recording needs  realtime = true"
         )
 
-    from edgepose import archive
-
     calibrations = [calibration_of(rig) for rig in rigs]
-    info = archive.inspect(archive.find(model))
+    info = archive.inspect(path)
     kind, rate = info.metadata["kind"], float(info.metadata["rate_hz"])
     past = info.metadata["past"] if past is None else past
     future = info.metadata["future"] if future is None else future

@@ -143,6 +143,8 @@ def read_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(text)
     except OSError as error:
         raise EdgeposeError(f"{path}: cannot read it: {error.strerror}") from None
+    except RecursionError:
+        raise EdgeposeError(f"{path}: not valid TOML: brackets within brackets without end") from None
     except ValueError as error:  # also not UTF-8
         # The parser does not name what is there twice.
         keys = re.findall(r"^\s*(?:\[\s*)?(\w+)\s*[=\]]", text, re.MULTILINE)

@@ -7,6 +7,7 @@ import fcntl
 import json
 import os
 import pty
+import re
 import signal
 import socket
 import subprocess
@@ -31,6 +32,7 @@ from edgepose.sources import open_source
 from edgepose.sync import FrameClock
 from edgepose_export.networks import NetworkShape
 
+PAGE = (Path(__file__).parents[2] / "docs" / "sensors.md").read_text(encoding="utf-8")
 SIMULATOR = Path(__file__).parents[2] / "tools" / "simulate.py"
 ALL_HELD = f"held {' '.join(PLACEMENTS)}"
 
@@ -112,6 +114,11 @@ def test_addresses_and_lines_are_read_as_flags(rig):
         ({"name": 3}, "name must be text in quotes on one line, not 3"),
         ({"name": " "}, "name must be text"),
         ({"name": "a\nb"}, "name must be text"),
+        *(({key: "a\0.toml"}, f"{key} must be text without NUL characters") for key in ("csv", "file")),
+        *(
+            ({key: "a\0.toml"}, f"{key} must be text without NUL")
+            for key in ("sensors", "calibration", "udp")
+        ),
     ],
     ids=str,
 )
@@ -131,6 +138,9 @@ def test_a_rig_file_that_is_not_there_or_not_toml(rig, tmp_path):
     file.write_text("file = ")
     with pytest.raises(EdgeposeError, match=r"anna\.toml: not valid TOML"):
         read_rigs([file])
+    file.write_text("file = " + "[" * 100_000)
+    with pytest.raises(EdgeposeError, match=r"anna\.toml: not valid TOML: brackets within brackets"):
+        read_rigs([file])
 
 
 def test_wearers_have_names_and_ports_of_their_own(rig):
@@ -139,6 +149,75 @@ def test_wearers_have_names_and_ports_of_their_own(rig):
     first, second = rig(file=None, port="A,B"), rig("ben", file=None, port="B")
     with pytest.raises(EdgeposeError, match="two of them have the port B; give each its own"):
         read_rigs([first, second])
+
+
+def sensor_map(path: Path, line: str, first: int) -> str:
+    path.write_text(
+        "".join(f"{name} = {{ {line}, id = {first + i} }}\n" for i, name in enumerate(PLACEMENTS))
+    )
+    return path.name
+
+
+def test_wearers_have_lines_of_their_own(rig, tmp_path):
+    """Whatever names them; only a bus has room for two, if each says which ids are his."""
+    hub = sensor_map(tmp_path / "hub.toml", 'port = "B"', 0)
+    low, high, high_again = (
+        sensor_map(tmp_path / f"{i}.toml", 'can = "socketcan:can0"', first)
+        for i, first in enumerate((0, 6, 11))
+    )
+    bus, nobody = "two of them have the bus socketcan:can0; give each its own, or ids", None
+    for anna, ben, says in (
+        ({"port": "A, B"}, {"port": "B"}, "two of them have the port B"),
+        ({"port": "A,B,C"}, {"sensors": hub}, "two of them have the port B"),
+        ({"sensors": hub}, {"sensors": hub}, "two of them have the port B"),
+        ({"port": "A"}, {"sensors": hub}, nobody),
+        ({"can": "socketcan:can0"}, {"can": "socketcan:can0"}, bus),
+        ({"can": "socketcan:can0"}, {"can": "socketcan:can0", "sensors": low}, bus),
+        ({"sensors": high}, {"sensors": high_again}, bus),
+        ({"sensors": low}, {"can": "socketcan:can0", "sensors": high}, nobody),
+        ({"can": "socketcan:can0"}, {"can": "socketcan:can1"}, nobody),
+        ({"file": "-"}, {"file": "-"}, "two of them have the standard input"),
+    ):
+        files = [rig("anna", **{"file": None} | anna), rig("ben", **{"file": None} | ben)]
+        if says is nobody:
+            assert len(read_rigs(files)) == 2
+        else:
+            with pytest.raises(EdgeposeError, match=says):
+                read_rigs(files)
+
+
+def test_no_output_takes_the_place_of_what_is_read(command, rig, tmp_path, write_archive):
+    hub = sensor_map(tmp_path / "hub.toml", 'port = "B"', 0)
+    (tmp_path / "mine.toml").write_text("[columns]\n")
+    (tmp_path / "hub.toml").write_text((tmp_path / hub).read_text() + "[ports.B]\nprotocol = 'mine.toml'\n")
+    model = write_archive(tmp_path / "model.pt", NetworkShape("rnn", 8, "global-6d", "passed"))
+    inputs = {name: (tmp_path / name).read_bytes() for name in ("hub.toml", "mine.toml", "model.pt")}
+    outputs = {"anna.toml": "--rig", "hub.toml": "--sensors", "mine.toml": "--protocol mine.toml"}
+    outputs["model.pt"] = "--model"
+    for output, flag in outputs.items():
+        file = rig(file=None, sensors="hub.toml", csv=output)
+        text = file.read_bytes()
+        result = command("run", "--rig", file, "--model", model, cwd=tmp_path)
+        assert result.returncode == 2, result.stderr
+        assert f"--csv would overwrite {output}" in result.stderr.replace(f"{tmp_path}/", "")
+        assert f", which is {'' if flag == '--model' else 'anna: '}{flag};" in result.stderr
+        assert file.read_bytes() == text
+    assert inputs == {name: (tmp_path / name).read_bytes() for name in inputs}
+
+
+def test_several_wearers_write_to_nothing_that_can_stop_them(command, rig, tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for flag, output in {"csv": "-", "bvh": "pipe"}.items():
+        result = command("run", *words(rig(), rig("ben", **{"csv": None, flag: output})))
+        assert result.returncode == 2, result.stderr
+        assert f"ben: --{flag} " in result.stderr
+        assert f"{output} is no file on a disk: a slow reader of it would hold up" in result.stderr
+    # Where standard output is a file, there is no reader.
+    rigs = map(str, words(rig(), rig("ben", csv="-")))
+    with (tmp_path / "out.csv").open("w") as out:
+        done = subprocess.run([sys.executable, "-m", "edgepose", "run", *rigs, "--model", "rnn"], stdout=out)
+    assert done.returncode == 0
+    assert len(read_poses(tmp_path / "out.csv").frames) == 180
 
 
 @pytest.mark.parametrize(
@@ -167,6 +246,14 @@ def test_only_one_wearer_has_standard_output(command, rig):
     result = command("run", *words(rig(csv="-"), rig("ben", csv="-")))
     assert result.returncode == 2
     assert "several wearers write CSV to standard output; give all but one a file" in result.stderr
+
+
+def test_the_example_of_a_rig_file_is_one(tmp_path):
+    (example,) = (text for text in re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL) if "calibration" in text)
+    (tmp_path / "example.toml").write_text(example)
+    (flags,) = read_rigs([tmp_path / "example.toml"])
+    assert (flags.name, flags.source.port, flags.control) == ("anna", "/dev/ttyUSB0", ("127.0.0.1", 9101))
+    assert flags.outputs.csv == str(tmp_path / "anna.csv")
 
 
 # --- recordings ---------------------------------------------------------------------------------------------
