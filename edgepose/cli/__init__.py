@@ -83,6 +83,11 @@ def main() -> NoReturn:
             raise
         click.echo(f"edgepose: {error}", err=True)
         sys.exit(1)
+    except MemoryError:
+        if debug:
+            raise
+        click.echo("edgepose: not enough memory; give it a shorter file", err=True)
+        sys.exit(1)
     except click.ClickException as error:
         error.show()
         sys.exit(error.exit_code)

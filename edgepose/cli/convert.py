@@ -74,7 +74,7 @@ def convert(
     IN are files, patterns and folders. A folder stands for the recordings in it, at any depth; one that holds
     a folder for each x-io sensor is one recording, whose sensors' folders have placements in their names (or,
     with --sensors, their serial numbers as ids: id = 0x64F61CB3). Of a damaged recording what is good is
-    written, and the exit code is 1.
+    written, of poses in CSV or BVH those before the first bad one, and the exit code is 1.
 
     Files of poses, CSV and BVH as `run` writes them or NPZ with the keys of AMASS, become CSV, NPZ or BVH; of
     a recording that holds true poses, as DIP-IMU's do, --to bvh takes these. - is CSV on standard input.

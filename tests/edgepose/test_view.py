@@ -440,6 +440,27 @@ def test_wrong_use(command, tmp_path, words, code, says):
     assert "Traceback" not in result.stderr
 
 
+SHORT_OF_MEMORY = """
+import re, resource, sys
+from pathlib import Path
+import edgepose.cli.view, edgepose.poses
+held = int(re.search(r"VmSize:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) << 10
+resource.setrlimit(resource.RLIMIT_AS, (held + (60 << 20),) * 2)
+edgepose.cli.main()
+"""
+
+
+def test_a_file_that_does_not_fit_into_memory(tmp_path):
+    joints = "".join(f"JOINT j{i}\n{{\nOFFSET 0 0 0\nCHANNELS 0\n}}\n" for i in range(500))
+    head = f"HIERARCHY\nROOT r\n{{\nOFFSET 0 0 0\nCHANNELS 1 Xrotation\n{joints}}}\nMOTION\n"
+    path = tmp_path / "a.bvh"
+    path.write_text(f"{head}Frames: 5000\nFrame Time: .01\n" + "0\n" * 5000)
+    command = [sys.executable, "-c", SHORT_OF_MEMORY, "view", str(path)]
+    result = subprocess.run(command, text=True, capture_output=True, check=False)
+    assert result.returncode == 1
+    assert result.stderr == "edgepose: not enough memory; give it a shorter file\n"
+
+
 def test_a_port_that_is_taken(command, tmp_path):
     with CsvSink(tmp_path / "poses.csv") as sink:
         sink.write(standing())
