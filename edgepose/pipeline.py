@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import deque
+from array import array
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
@@ -37,8 +37,8 @@ class RunSummary:
         held_by_sensor: frames in which each sensor was held, in the order of PLACEMENTS.
         behind_s: how long the newest batch had waited to be taken.
         seconds: wall time from the first samples to the end.
-        latencies_s: for the newest frames that gave a pose, seconds from the arrival of their newest packet
-            here to the pose's being sent.
+        late_s: seconds from the arrival of the newest packet here to the newest pose's being sent.
+        latencies_s: that of the newest LATENCIES poses, in no order.
         error: what ended the run early, if anything did.
     """
 
@@ -48,8 +48,18 @@ class RunSummary:
     held_by_sensor: list[int] = field(default_factory=lambda: [0] * len(PLACEMENTS))
     behind_s: float = 0.0
     seconds: float = 0.0
-    latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=LATENCIES))
+    late_s: float = 0.0
+    latencies_s: array[float] = field(default_factory=lambda: array("f"))
     error: EdgeposeError | None = None
+
+    def sent(self, late_s: float) -> None:
+        """Counts a pose that was sent so late, seconds."""
+        self.late_s = late_s
+        if len(self.latencies_s) < LATENCIES:
+            self.latencies_s.append(late_s)
+        else:
+            self.latencies_s[self.poses % LATENCIES] = late_s
+        self.poses += 1
 
 
 def status(frame: ImuFrame, filling: bool) -> str:
@@ -121,13 +131,12 @@ class Walk:
             )
             for sink in self._sinks:
                 sink.write(pose)
-            summary.poses += 1
             summary.filling += output.filling
             if frame.held.any():
                 summary.held += 1
                 for i in np.flatnonzero(frame.held):
                     summary.held_by_sensor[i] += 1
-            summary.latencies_s.append(time.perf_counter() - arrived)
+            summary.sent(time.perf_counter() - arrived)
             self._on_pose(summary)
 
     def end(self, error: EdgeposeError | None = None) -> None:

@@ -150,5 +150,5 @@ def _total(summaries: Sequence[RunSummary]) -> RunSummary:
     return RunSummary(
         poses=sum(summary.poses for summary in summaries),
         held=sum(summary.held for summary in summaries),
-        behind_s=max(summary.latencies_s[-1] if summary.latencies_s else 0.0 for summary in summaries),
+        behind_s=max(summary.late_s for summary in summaries),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from itertools import islice
 
 import numpy as np
@@ -199,6 +200,13 @@ def test_a_source_without_samples(walk):
 
 
 def test_latencies_do_not_fill_the_memory():
+    tracemalloc.start()
     summary = RunSummary()
-    summary.latencies_s.extend([0.0] * (LATENCIES + 10))
+    for i in range(LATENCIES + 10):
+        summary.sent(float(i))
+    taken, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
     assert len(summary.latencies_s) == LATENCIES
+    assert (min(summary.latencies_s), max(summary.latencies_s)) == (10.0, LATENCIES + 9.0)
+    assert (summary.poses, summary.late_s) == (LATENCIES + 10, LATENCIES + 9.0)
+    assert taken < 2_000_000
