@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import stat
 import sys
 from collections.abc import Sequence
 from itertools import combinations
@@ -100,7 +101,10 @@ def _map(rig: RigFlags) -> SensorMap | None:
 
 
 def _keeps_up(file: str) -> bool:
-    """Whether it is a file on a disk, or nothing yet."""
+    """Whether it is a file on a disk, or nothing that could be opened yet."""
     if file == "-":
         return is_regular(sys.stdout.buffer)
-    return Path(file).is_file() or not Path(file).exists()
+    try:
+        return stat.S_ISREG(Path(file).stat().st_mode)
+    except OSError:
+        return True

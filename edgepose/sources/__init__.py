@@ -5,7 +5,7 @@
             ...
 
 `now_s` is the time on the source's clock up to which everything has been delivered. Live: Unix time, taken
-once at the start and carried on by the monotonic clock, so that it never jumps; a batch comes at least every
+once in a process and carried on by the monotonic clock, so that it never jumps; a batch comes at least every
 20 ms, empty if need be, also while a line has disappeared. Files: their own times.
 """
 
