@@ -1,0 +1,66 @@
+"""Error against cost: each model in each precision, so that one sees which are worth having.
+
+    python tools/draw_front.py --data recordings --out front.png birnn rnn runs/dip-rnn.pt
+
+Error is the mean over the frames of the chosen parts of the split (recordings of `edgepose synthesize`),
+streamed as `edgepose run` streams; cost is processor time a frame of one core.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import torch
+
+from edgepose import archive, speed
+from edgepose_export.evaluation import modes_of
+from edgepose_export.precisions import compare
+
+KEY = "sip_error_deg"
+
+
+@click.command()
+@click.argument("models", nargs=-1, required=True)
+@click.option("--data", type=click.Path(path_type=Path), required=True, help="What synthesize wrote.")
+@click.option("--part", "parts", multiple=True, default=["cmu-walk-run", "cmu-02"], show_default=True)
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Picture to write.")
+def main(models: tuple[str, ...], data: Path, parts: tuple[str, ...], out: Path) -> None:
+    """Measure, print and draw."""
+    torch.set_num_threads(1)
+    points: dict[str, dict[str, tuple[float, float]]] = {}
+    for name in models:
+        info = archive.inspect(archive.find(name))
+        mode = next(mode for mode in modes_of(info.metadata) if mode.name == "stream")
+        measured = compare(lambda info=info: archive.load(info, trust=True), data, parts, mode)
+        costs = {
+            row.precision: row.us for row in speed.model_speeds(info, trust=True) if row.mode == "stream"
+        }
+        for precision, us in costs.items():
+            rows = [measured[part][precision]["errors"][KEY] for part in parts]
+            error = sum(mean * frames for mean, _, frames in rows) / sum(frames for *_, frames in rows)
+            points.setdefault(info.path.stem, {})[precision] = (us, error)
+            click.echo(f"| {info.path.stem} | {precision} | {us:.0f} | {error:.2f} |")
+    draw(points, ", ".join(parts), out)
+
+
+def draw(points: dict[str, dict[str, tuple[float, float]]], title: str, out: Path) -> None:
+    """The picture: a line a model, a point a precision (us, degrees)."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
+    for name, ways in points.items():
+        axes.plot(*zip(*ways.values(), strict=True), "o-", label=name)
+        for precision, point in ways.items():
+            axes.annotate(precision, point, xytext=(4, 5), textcoords="offset points", fontsize=8)
+    axes.set(xlabel="microseconds a frame", ylabel=f"SIP error, deg ({title})", xscale="log")
+    axes.grid(alpha=0.3, which="both")
+    axes.legend()
+    figure.savefig(out, dpi=110)
+
+
+if __name__ == "__main__":
+    main()
