@@ -55,9 +55,12 @@ def draw(points: dict[str, dict[str, tuple[float, float]]], title: str, out: Pat
     for name, ways in points.items():
         axes.plot(*zip(*ways.values(), strict=True), "o-", label=name)
         for precision, point in ways.items():
-            axes.annotate(precision, point, xytext=(4, 5), textcoords="offset points", fontsize=8)
-    axes.set(xlabel="microseconds a frame", ylabel=f"SIP error, deg ({title})", xscale="log")
-    axes.grid(alpha=0.3, which="both")
+            axes.annotate(
+                precision, point, xytext=(0, 6), textcoords="offset points", fontsize=8, rotation=45
+            )
+    axes.set(xlabel="microseconds a frame", ylabel=f"SIP error, deg ({title})")
+    axes.margins(x=0.1, y=0.15)
+    axes.grid(alpha=0.3)
     axes.legend()
     figure.savefig(out, dpi=110)
 
