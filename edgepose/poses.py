@@ -10,6 +10,7 @@ import csv
 import sys
 from array import array
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from io import BufferedReader
 from itertools import islice
 from pathlib import Path
@@ -210,7 +211,8 @@ def _read_csv(file: TextIO, name: str) -> Iterator[Poses]:
         form, std, moves = _recognise(next(rows, []), name)
         columns = len(pose_columns(form, std, moves))
         while block := list(islice(rows, BLOCK)):
-            poses, error = _good(block, first, last, columns, form, moves, name)
+            read = partial(_block, first=first, last=last, columns=columns, form=form, moves=moves, name=name)
+            poses, error = _good(block, first, read)
             if poses is not None:
                 first, last = first + len(poses.frames), (int(poses.frames[-1]), float(poses.time_s[-1]))
                 yield poses
@@ -225,19 +227,13 @@ def _read_csv(file: TextIO, name: str) -> Iterator[Poses]:
 
 
 def _good(
-    rows: list[list[str]],
-    first: int,
-    last: tuple[int, float] | None,
-    columns: int,
-    form: str,
-    moves: bool,
-    name: str,
+    rows: list[list[str]], first: int, read: Callable[[list[list[str]]], Poses]
 ) -> tuple[Poses | None, EdgeposeError | None]:
-    """The poses before the first bad row, and what is wrong with that."""
+    """The poses before the first bad row, and what is wrong with that; the first row has number `first`."""
     problem = None
     while rows:
         try:
-            return _block(rows, first, last, columns, form, moves, name), problem
+            return read(rows), problem
         except _BadRowError as error:
             problem, rows = error, rows[: error.row - first]
     return None, problem

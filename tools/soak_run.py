@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import click
+import demo
 import numpy as np
 from soak_viewer import RATE, cpu_s, make_recording, megabytes
 
@@ -36,9 +37,12 @@ def soak(minutes: float, model: str, core: int) -> None:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         length_s = make_recording(folder, 60.0 * minutes)
-        port = stack.enter_context(simulator(folder / "walk.npz", core))
-        run = stack.enter_context(running(folder, port, model, core))
+        os.sched_setaffinity(0, os.sched_getaffinity(0) - {core} or {core})  # the simulator has it, too
+        sensors, source = stack.enter_context(demo.simulator(folder / "walk.npz", "native"))
+        run = stack.enter_context(running(folder, source, model, core))
         time.sleep(3.0)  # the model is loaded
+        sensors.stdin.write("go\n")
+        sensors.stdin.flush()
         started, used_s = time.monotonic(), cpu_s(run.pid)
         click.echo(f"{'minute':>6}  {'of the core':>11}  {'memory':>9}")
         for part in LOOKS:
@@ -63,27 +67,9 @@ def soak(minutes: float, model: str, core: int) -> None:
 
 
 @contextlib.contextmanager
-def simulator(recording: Path, core: int) -> Iterator[str]:
-    """The name of a pty on which the sensors of a recording are heard, in real time."""
-    others = os.sched_getaffinity(0) - {core} or {core}
-    child = subprocess.Popen(
-        [sys.executable, Path(__file__).parent / "simulate.py", recording],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: os.sched_setaffinity(0, others),
-    )
-    try:
-        yield child.stdout.readline().removeprefix("port ").strip()
-    finally:
-        child.kill()
-        child.communicate()
-
-
-@contextlib.contextmanager
-def running(folder: Path, port: str, model: str, core: int) -> Iterator[subprocess.Popen[str]]:
-    """The run on a port."""
-    command = ["run", "--port", port, "--protocol", "native", "--model", model]
+def running(folder: Path, source: list[str], model: str, core: int) -> Iterator[subprocess.Popen[str]]:
+    """The run on a line."""
+    command = ["run", *source, "--protocol", "native", "--model", model]
     command += ["--calibration", folder / "calib.json", "--csv", folder / "poses.csv"]
     run = subprocess.Popen(
         [sys.executable, "-m", "edgepose", *map(str, command)],
