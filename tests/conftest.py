@@ -26,7 +26,7 @@ SHAPES = [
         ("global-6d", "predicted"),
         ("global-6d", "passed"),
     )
-]
+] + [NetworkShape(kind, 8, "global-6d", "passed", smoothing=0.6) for kind in ("birnn", "rnn")]
 DATA = {"summary": "Made-up motion", "licenses": ["Made-up motion, public domain"], "takes": 3, "hours": 0.5}
 
 
@@ -66,7 +66,7 @@ def tiny():
     return tiny_module
 
 
-@pytest.fixture(scope="session", params=SHAPES, ids=lambda s: f"{s.kind}-{s.targets}-{s.measured}")
+@pytest.fixture(scope="session", params=SHAPES, ids=lambda s: "-".join(map(str, s)))
 def shape(request):
     return request.param
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import PLACEMENTS, ROOT
 from edgepose.skeleton import JOINTS
 
 
@@ -36,6 +36,8 @@ class Augmentation(NamedTuple):
         acceleration_scale: deviation of each sensor's scale error.
         aligned: share of sequences without misalignment and heading errors, so that a network trusts sensors
             that agree with each other.
+        pelvis_pitch_deg: deviation of a turn of the pelvis about its own X axis, of bone and sensor alike: as
+            if another actor's skeleton, in whom the trunk leans otherwise against the pelvis, did the same.
     """
 
     mirror: float = 0.5
@@ -44,6 +46,7 @@ class Augmentation(NamedTuple):
     acceleration_noise: float = 0.0
     acceleration_scale: float = 0.0
     aligned: float = 0.0
+    pelvis_pitch_deg: float = 0.0
 
 
 def mirror(orientation: Tensor, acceleration: Tensor, relative: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -70,8 +73,8 @@ def small_rotations(vectors: Tensor) -> Tensor:
 def augment(
     batch: tuple[Tensor, Tensor, Tensor], how: Augmentation, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Disturbed copies of sequences (B, T, 6, 3, 3), (B, T, 6, 3) and, mirrored only, their true poses (B, T,
-    24, 3, 3).
+    """Disturbed copies of sequences (B, T, 6, 3, 3), (B, T, 6, 3) and, mirrored and with other pelvises only,
+    their true poses (B, T, 24, 3, 3).
     """
     orientation, acceleration, relative = batch
     size = len(orientation)
@@ -84,6 +87,13 @@ def augment(
         mirrored = mirror(orientation[chosen], acceleration[chosen], relative[chosen])
         orientation, acceleration, relative = orientation.clone(), acceleration.clone(), relative.clone()
         orientation[chosen], acceleration[chosen], relative[chosen] = mirrored
+    if how.pelvis_pitch_deg:
+        pitch = torch.zeros(size, 1, 3)
+        pitch[..., 0] = torch.deg2rad(how.pelvis_pitch_deg * normal(size, 1))
+        turn = small_rotations(pitch)
+        orientation, relative = orientation.clone(), relative.clone()
+        orientation[:, :, ROOT] = orientation[:, :, ROOT] @ turn
+        relative[:, :, 1:] = turn.mT.unsqueeze(2) @ relative[:, :, 1:]
     turned = (
         (torch.rand(size, generator=generator) >= how.aligned).float() if how.aligned else torch.ones(size)
     )

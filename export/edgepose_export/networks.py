@@ -33,6 +33,9 @@ class NetworkShape(NamedTuple):
             sensor take its orientation; the network predicts the other 10). "passed" needs "global-6d".
         normalisation: of the inputs, one of `normalisation.SCHEMES`.
         acceleration: whether accelerations are inputs (without: DIP appendix D).
+        smoothing: of a recurrent network, the share of the last frame's pose numbers in this frame's: a
+            one-pole low-pass behind the network, in training too, so that the network learns to make up for
+            its delay.
     """
 
     kind: str = "birnn"
@@ -41,6 +44,7 @@ class NetworkShape(NamedTuple):
     measured: str = "predicted"
     normalisation: str = "root"
     acceleration: bool = True
+    smoothing: float = 0.0
 
     @property
     def inputs(self) -> int:
@@ -98,7 +102,11 @@ class PoseNetwork(nn.Module):
             x, _ = self.lstm2(x)
         else:
             x = self._streamed(x, future)
-        return self.mean(x), nn.functional.softplus(self.deviation(x)) + SIGMA_FLOOR
+        mean, deviation = self.mean(x), nn.functional.softplus(self.deviation(x)) + SIGMA_FLOOR
+        if self.shape.smoothing:
+            pose, acceleration = mean.tensor_split([self.shape.pose_outputs], dim=-1)
+            mean = torch.cat([_smoothed(pose.float(), self.shape.smoothing), acceleration], dim=-1)
+        return mean, deviation
 
     def _streamed(self, x: Tensor, future: int) -> Tensor:
         """Outputs (B, T - future, 2 hidden) of the recurrent layers as `recurrent.BirnnArchive.stream` gives
@@ -111,6 +119,17 @@ class PoseNetwork(nn.Module):
         forward2 = _direction(self.lstm2, ahead[:, 0].unflatten(0, frames), "")
         backward2 = _direction(self.lstm2, ahead, "_reverse")[:, 0].unflatten(0, frames)
         return torch.cat([forward2, backward2], dim=-1)
+
+
+def _smoothed(x: Tensor, smoothing: float) -> Tensor:
+    """One-pole low-pass over the frames of (B, T, numbers): weighted means of each frame and all before it,
+    as `recurrent.Ends.smoothed` carries them on but for their scale.
+    """
+    frame = torch.arange(x.shape[1], device=x.device, dtype=x.dtype)
+    weights = (smoothing ** (frame[:, None] - frame).clamp_min(0.0)).tril()
+    # In full precision: what is left of a pose's trembling is smaller than bfloat16 can say.
+    with torch.autocast(x.device.type, enabled=False):
+        return (weights / weights.sum(dim=1, keepdim=True)) @ x
 
 
 def _ahead(x: Tensor, future: int) -> Tensor:

@@ -109,6 +109,7 @@ class Ends(nn.Module):
         self.scheme, self.with_acceleration = shape.normalisation, shape.acceleration
         self.decoder = decoder
         self.floor = SIGMA_FLOOR
+        self.smoothing = shape.smoothing
         dense = network.dense.weight.detach() / input_std
         self.dense = Product(dense, network.dense.bias.detach() - dense @ input_mean)
         # The acceleration part of the outputs serves training alone.
@@ -124,11 +125,33 @@ class Ends(nn.Module):
         return torch.relu(self.dense(x))
 
     @torch.jit.export
-    def pose(self, orientation: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Local rotations (..., 24, 3, 3) and deviations (..., 24) from the last recurrent outputs."""
+    def before(self, batch: int) -> Tensor:
+        """What `pose` knows of the frames before the first one, (B, pose outputs)."""
+        return torch.zeros(batch, self.decoder.target_mean.shape[0])
+
+    @torch.jit.export
+    def pose(self, orientation: Tensor, hidden: Tensor, before: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Local rotations (B, T, 24, 3, 3) and deviations (B, T, 24) of frames, from the last recurrent
+        outputs (B, T, hidden) and what is known of the frames before; then what the next frames shall know.
+        """
         pose, deviation = self.heads(hidden).chunk(2, dim=-1)
+        pose, before = self.smoothed(pose, before)
         deviation = nn.functional.softplus(deviation) + self.floor
-        return self.decoder.rotations(orientation, pose), self.decoder.deviations(deviation)
+        return self.decoder.rotations(orientation, pose), self.decoder.deviations(deviation), before
+
+    def smoothed(self, pose: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
+        """One-pole low-pass over the frames of (B, T, pose outputs), and its last output.
+
+        It begins at zero without a bias: the first outputs are too small, but rotations are made from the
+        numbers' directions alone.
+        """
+        if self.smoothing == 0.0:
+            return pose, before
+        outputs: list[Tensor] = []
+        for row in pose.unbind(1):
+            before = torch.lerp(row, before, self.smoothing)
+            outputs.append(before)
+        return torch.stack(outputs, dim=1), before
 
 
 class RnnArchive(nn.Module):
@@ -144,7 +167,9 @@ class RnnArchive(nn.Module):
     def forward(self, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
         """Poses of a whole sequence."""
         x = self.cell1.run(self.cell1.inputs[0](self.ends(orientation, acceleration)), False)
-        return self.ends.pose(orientation, self.cell2.run(self.cell2.inputs[0](x), False))
+        x = self.cell2.run(self.cell2.inputs[0](x), False)
+        rotations, std, _ = self.ends.pose(orientation, x, self.ends.before(x.shape[0]))
+        return rotations, std
 
     @torch.jit.export
     def pack(self, precision: str) -> None:
@@ -164,7 +189,7 @@ class RnnArchive(nn.Module):
         if future != 0:
             raise ValueError("a unidirectional network has no future frames")
         zero = torch.zeros(batch, self.cell1.size)
-        return [zero, zero, zero, zero]
+        return [zero, zero, zero, zero, self.ends.before(batch)]
 
     @torch.jit.export
     def stream(
@@ -181,8 +206,8 @@ class RnnArchive(nn.Module):
         x = self.ends(orientation, acceleration)
         x, h1, c1 = self.cell1.carry(self.cell1.inputs[0](x), state[0], state[1])
         x, h2, c2 = self.cell2.carry(self.cell2.inputs[0](x), state[2], state[3])
-        rotations, std = self.ends.pose(orientation, x)
-        return rotations, std, [h1, c1, h2, c2]
+        rotations, std, before = self.ends.pose(orientation, x, state[4])
+        return rotations, std, [h1, c1, h2, c2, before]
 
     @torch.jit.export
     def drain(self, state: list[Tensor]) -> tuple[Tensor, Tensor]:
@@ -228,9 +253,18 @@ class BirnnArchive(nn.Module):
     def forward(self, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
         """Poses of a whole sequence."""
         ahead, back = self.layer1(orientation, acceleration)
-        before = self.forward2.run(self.forward2_products(ahead, back), False)
-        after = self.backward2.run(self.backward2_products(ahead, back), True)
-        return self.ends.pose(orientation, torch.cat([before, after], dim=-1))
+        return self.poses(orientation, ahead, back, 0)
+
+    def poses(self, orientation: Tensor, ahead: Tensor, back: Tensor, first: int) -> tuple[Tensor, Tensor]:
+        """Poses of a sequence's frames (B, T - first, ...) from `first` to the last that `orientation` (B, T,
+        6, 3, 3) has, of what layer 1 says of them and of any later ones.
+        """
+        end = orientation.shape[1]
+        past = self.forward2.run(self.forward2_products(ahead[:, :end], back[:, :end]), False)
+        later = self.backward2.run(self.backward2_products(ahead[:, first:], back[:, first:]), True)
+        hidden = torch.cat([past[:, first:], later[:, : end - first]], dim=-1)
+        rotations, std, _ = self.ends.pose(orientation[:, first:], hidden, self.ends.before(hidden.shape[0]))
+        return rotations, std
 
     @torch.jit.export
     def pack(self, precision: str) -> None:
@@ -244,26 +278,26 @@ class BirnnArchive(nn.Module):
     def window(self, orientation: Tensor, acceleration: Tensor, index: int) -> tuple[Tensor, Tensor]:
         """Pose of frame `index` of a window (DIP 3.4), the same as `forward` over the window gives there.
 
-        The second layer runs only over the frames that reach `index`.
+        The second layer runs only over the frames that reach `index`: with smoothing, all of them do.
         """
         ahead, back = self.layer1(orientation, acceleration)
-        end = index + 1
-        before = self.forward2.run(self.forward2_products(ahead[:, :end], back[:, :end]), False)[:, -1]
-        after = self.backward2.run(self.backward2_products(ahead[:, index:], back[:, index:]), True)[:, 0]
-        return self.ends.pose(orientation[:, index], torch.cat([before, after], dim=-1))
+        first = 0 if self.ends.smoothing > 0.0 else index
+        rotations, std = self.poses(orientation[:, : index + 1], ahead, back, first)
+        return rotations[:, -1], std[:, -1]
 
     @torch.jit.export
     def start(self, batch: int, future: int) -> list[Tensor]:
         """State before the first frame of a stream in which each pose sees `future` later frames.
 
         The state is [h1, c1, h2, c2, then of the frames that wait for their future: products of layer 1
-        backwards, known products of layer 2 forwards, the same backwards, orientations; last a tensor whose
-        length is `future`].
+        backwards, known products of layer 2 forwards, the same backwards, orientations; what smoothing knows
+        of the frames before; last a tensor whose length is `future`].
         """
         size = self.forward1.size
         zero, waiting = torch.zeros(batch, size), torch.zeros(batch, 0, 4 * size)
         orientations = torch.zeros(batch, 0, 6, 3, 3)
-        return [zero, zero, zero, zero, waiting, waiting, waiting, orientations, torch.zeros(future)]
+        before = self.ends.before(batch)
+        return [zero, zero, zero, zero, waiting, waiting, waiting, orientations, before, torch.zeros(future)]
 
     def oldest(self, state: list[Tensor], count: int, future: int) -> tuple[Tensor, Tensor, list[Tensor]]:
         """Poses of the oldest waiting frames, each seen with `future` that wait behind it, and the state
@@ -275,12 +309,12 @@ class BirnnArchive(nn.Module):
         batch = state[0].shape[0]
         back = self.backward1.run(_fields(state[4], count, future), True)
         known = self.forward2.inputs[1](back[:, 0]).unflatten(0, (batch, count)) + state[5][:, :count]
-        before, h2, c2 = self.forward2.carry(known, state[2], state[3])
-        after = self.backward2.run(_fields(state[6], count, future) + self.backward2.inputs[1](back), True)
-        hidden = torch.cat([before, after[:, 0].unflatten(0, (batch, count))], dim=-1)
-        rotations, std = self.ends.pose(state[7][:, :count], hidden)
+        past, h2, c2 = self.forward2.carry(known, state[2], state[3])
+        later = self.backward2.run(_fields(state[6], count, future) + self.backward2.inputs[1](back), True)
+        hidden = torch.cat([past, later[:, 0].unflatten(0, (batch, count))], dim=-1)
+        rotations, std, before = self.ends.pose(state[7][:, :count], hidden, state[8])
         waiting = [state[4][:, count:], state[5][:, count:], state[6][:, count:], state[7][:, count:]]
-        return rotations, std, [state[0], state[1], h2, c2] + waiting + state[8:]  # noqa: RUF005
+        return rotations, std, [state[0], state[1], h2, c2] + waiting + [before, state[9]]  # noqa: RUF005
 
     @torch.jit.export
     def stream(
@@ -309,8 +343,9 @@ class BirnnArchive(nn.Module):
             torch.cat([state[6], self.backward2.inputs[0](ahead)], dim=1),
             torch.cat([state[7], orientation], dim=1),
             state[8],
+            state[9],
         ]
-        future = state[8].shape[0]
+        future = state[9].shape[0]
         due = state[4].shape[1] - future
         if due <= 0:
             batch = x.shape[0]

@@ -152,6 +152,8 @@ def config_from(values: dict[str, Any]) -> TrainConfig:
         raise ValueError("a network without accelerations cannot give them back: acceleration_loss = false")
     if config.streamed and config.network.kind != "birnn":
         raise ValueError('only kind = "birnn" can be trained as streamed')
+    if config.network.smoothing and config.network.kind not in ("birnn", "rnn"):
+        raise ValueError('smoothing is for kind = "birnn" and "rnn"')
     if config.streamed >= config.window:
         raise ValueError(f"streamed is {config.streamed}; it takes fewer frames than the window has")
     return config
@@ -181,6 +183,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "seated_share": (0.0, 1.0),
     "aligned": (0.0, 1.0),
     "mirror": (0.0, 1.0),
+    "smoothing": (0.0, 0.99),
 }
 """Least and greatest value of numbers; those of other fields are 0 and 1000."""
 
@@ -502,7 +505,7 @@ class Trainer:
         Raises:
             EdgeposeError: the checkpoint is of another network.
         """
-        self._check_shape(state)
+        self._check_shape(state, smoothing=self.config.network.smoothing)
         self.statistics = self._placed(Statistics(**state["statistics"]))
         self.network.load_state_dict(state["averaged"])
         self.averaged.load_state_dict(state["averaged"])
@@ -514,8 +517,9 @@ class Trainer:
             "hours": before["hours"] + self.data["hours"],
         }
 
-    def _check_shape(self, state: dict[str, Any]) -> None:
-        shape = config_from(json.loads(state["config"])).network
+    def _check_shape(self, state: dict[str, Any], **other: Any) -> None:
+        """The checkpoint's network is the config's, apart from `other` fields."""
+        shape = config_from(json.loads(state["config"])).network._replace(**other)
         if shape != self.config.network:
             raise EdgeposeError(f"the checkpoint holds {shape}, the config asks for {self.config.network}")
 

@@ -115,6 +115,24 @@ def test_misalignment_is_one_turn_a_sensor_behind_its_orientation():
     assert relative is data[2]
 
 
+def test_another_pelvis_turns_with_its_sensor_under_the_same_body():
+    data = batch()
+    data[2][:, :, 0] = torch.eye(3)
+    orientation, acceleration, relative = augment(
+        data, Augmentation(mirror=0, pelvis_pitch_deg=5.0), generator()
+    )
+    turn = data[0][:, :, -1].mT @ orientation[:, :, -1]
+    torch.testing.assert_close(turn, turn[:, :1].expand_as(turn), rtol=0, atol=1e-5)
+    torch.testing.assert_close(turn[..., 0], torch.tensor([1.0, 0, 0]).expand(400, 3, 3), rtol=0, atol=1e-5)
+    size = angles(data[0][:, 0, -1], orientation[:, 0, -1])
+    assert size.square().mean().sqrt().item() == pytest.approx(5.0, rel=0.1)
+    assert torch.equal(orientation[:, :, :-1], data[0][:, :, :-1])
+    assert acceleration is data[1]
+    bodies = (o[:, :, -1:] @ r for o, r in ((orientation, relative), data[::2]))
+    torch.testing.assert_close(*(body[:, :, 1:] for body in bodies), rtol=0, atol=1e-5)
+    assert torch.equal(relative[:, :, 0], data[2][:, :, 0])
+
+
 def test_heading_turns_all_but_the_pelvis_about_the_vertical():
     data = batch()
     orientation, acceleration, _ = augment(data, Augmentation(mirror=0, heading_deg=3.0), generator())
@@ -151,7 +169,7 @@ def test_nothing_asked_nothing_done_and_the_input_is_never_written():
     data = batch(20)
     kept = [x.clone() for x in data]
     assert all(a is b for a, b in zip(augment(data, Augmentation(mirror=0), generator()), data, strict=True))
-    everything = Augmentation(0.5, 4.0, 3.0, 0.1, 0.02)
+    everything = Augmentation(0.5, 4.0, 3.0, 0.1, 0.02, pelvis_pitch_deg=5.0)
     first, again = (augment(data, everything, generator(3)) for _ in range(2))
     for a, b, original, copy in zip(first, again, data, kept, strict=True):
         assert torch.equal(a, b)

@@ -16,6 +16,7 @@ from edgepose_export.networks import NetworkShape, PoseDecoder
 
 BIRNN = NetworkShape("birnn", 8, "global-6d", "passed")
 RNN = BIRNN._replace(kind="rnn")
+SMOOTH = 0.6
 RESTING = [7, 8, 10, 11, 20, 21, 22, 23]
 
 
@@ -108,7 +109,7 @@ def stream(module, orientation, acceleration, future):
 
 def test_rnn_stream_is_offline(tiny, wearers):
     orientation, acceleration = wearers(2, 12)
-    for shape in (RNN, NetworkShape("rnn", 8, "local-matrix", "predicted")):
+    for shape in (RNN, RNN._replace(smoothing=SMOOTH), NetworkShape("rnn", 8, "local-matrix", "predicted")):
         module = tiny(shape)
         with torch.no_grad():
             got, counts = stream(module, orientation, acceleration, 0)
@@ -169,15 +170,35 @@ def test_birnn_stream_against_its_definition(parts, tiny, wearers, frames, futur
         assert (got[0] - whole[0]).abs().max() > 1e-3  # another function than the whole sequence's
 
 
+@pytest.mark.parametrize("smoothing", [0.0, SMOOTH])
 @pytest.mark.parametrize("future", [1, 5])
-def test_a_stream_gives_what_streamed_training_computed(parts, tiny, wearers, future):
-    inputs = wearers(3, 14)
+def test_a_stream_gives_what_streamed_training_computed(parts, tiny, wearers, future, smoothing):
+    inputs, shape = wearers(3, 14), BIRNN._replace(smoothing=smoothing)
     with torch.no_grad():
-        expected = run_offline(*parts(BIRNN), *inputs, future)
-        got, _ = stream(tiny(BIRNN), *inputs, future)
+        expected = run_offline(*parts(shape), *inputs, future)
+        got, _ = stream(tiny(shape), *inputs, future)
     assert expected[0].shape == (3, 14 - future, 24, 3, 3)
     for a, b in zip(got, expected, strict=True):
         close(a[:, : 14 - future], b)
+
+
+@pytest.mark.parametrize("kind", ["rnn", "birnn"])
+def test_smoothing_is_a_low_pass_of_the_pose_numbers(parts, kind):
+    """Against its definition, frame by frame; the reconstructed accelerations are left as they are."""
+    shape = BIRNN._replace(kind=kind, smoothing=SMOOTH)
+    network, _ = parts(shape)
+    x = torch.randn(2, 20, 60, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        mean, deviation = network(x)
+        network.shape = shape._replace(smoothing=0.0)
+        sharp, same = network(x)
+    size = shape.pose_outputs
+    total, weight = torch.zeros(2, size), 0.0
+    for t in range(20):
+        total, weight = SMOOTH * total + (1 - SMOOTH) * sharp[:, t, :size], SMOOTH * weight + 1 - SMOOTH
+        close(mean[:, t, :size], total / weight)
+    close(mean[..., size:], sharp[..., size:], atol=0)
+    close(deviation, same, atol=0)
 
 
 def test_wearers_of_a_batch_do_not_meet(shape, tiny, wearers):

@@ -373,6 +373,11 @@ def test_fine_tuning_starts_from_the_average(takes, tmp_path):
     assert tuned.data["licenses"] == ["free", "mine"]
     assert (tuned.data["takes"], tuned.data["hours"]) == (4, 0.501)
     assert np.isfinite(tuned.train_step())
+    smoother = trainer(takes, replace(SMALL, network=SMALL.network._replace(smoothing=0.5)))
+    smoother.start_from(state)  # what is behind the weights may change, but not within a run
+    assert same(dict(smoother.network.state_dict()), state["averaged"])
+    with pytest.raises(EdgeposeError, match=r"the checkpoint holds.*smoothing=0\.0"):
+        smoother.load(first.state())
     other = trainer(takes, replace(SMALL, network=SMALL.network._replace(kind="birnn")))
     for start in (other.start_from, other.load):
         with pytest.raises(EdgeposeError, match="the checkpoint holds"):
@@ -568,6 +573,8 @@ def test_config_that_differs_from_another(tmp_path):
         ("[network]\nkind = 'gru'", "kind is 'gru'; it takes 'birnn' or 'rnn'"),
         ("[network]\nhidden = 0", "hidden is 0; it takes 1 to"),
         ("[network]\nlayers = 3", r"unknown field 'layers' in [network]"),
+        ("[network]\nsmoothing = 1.0", "smoothing is 1.0; it takes 0 to 0.99"),
+        ("[network]\nkind = 'wavenet'\nsmoothing = 0.5", "smoothing is for kind"),
         ("[network]\nmeasured = 'passed'", 'measured = "passed" needs targets = "global-6d"'),
         ("[network]\nacceleration = false", "cannot give them back: acceleration_loss = false"),
         ("[network]\nnormalisation = 'none'", "normalisation is 'none'; it takes 'root' or"),
