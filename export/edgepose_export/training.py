@@ -281,6 +281,9 @@ def tremble_loss(mean: Tensor, target: Tensor) -> Tensor:
 # --- batches ------------------------------------------------------------------------------------------------
 
 
+Batch = tuple[Tensor, Tensor, Tensor]
+"""Orientations, accelerations and true rotations of sequences."""
+
 Starts = tuple[Tensor, Tensor]
 """First frames of windows: of other takes, of CMU's."""
 
@@ -317,7 +320,7 @@ def draw(starts: Starts, count: int, free_share: float, generator: torch.Generat
     )
 
 
-def windows(tape: Tape, starts: Tensor, length: int) -> tuple[Tensor, Tensor, Tensor]:
+def windows(tape: Tape, starts: Tensor, length: int) -> Batch:
     """Orientations, accelerations and true rotations of windows, each (len(starts), length, ...)."""
     index = starts[:, None] + torch.arange(length)
     return tape.orientation[index], tape.acceleration[index], tape.relative[index]
@@ -393,7 +396,7 @@ class Trainer:
     def _loss(
         self,
         network: nn.Module,
-        batch: tuple[Tensor, Tensor, Tensor],
+        batch: Batch,
         dropout: float = 0.0,
         smoothness: float = 0.0,
     ) -> Tensor:
@@ -426,10 +429,14 @@ class Trainer:
             group["lr"] = rate * min(1.0, (self.step + 1) / (config.warm_up + 1))
         count = config.sequences // self.processes.size
         seated = round(count * config.seated_share) if len(torch.cat(self.seated_starts)) else 0
-        starts = draw(self.starts, count - seated, config.free_share, self.generator)
+        how = config.augmentation
+        parts = [self._batch(draw(self.starts, count - seated, config.free_share, self.generator), how)]
         if seated:
-            starts = torch.cat([starts, draw(self.seated_starts, seated, 0.0, self.generator)])
-        batch = augment(windows(self.train_tape, starts, config.window), config.augmentation, self.generator)
+            # The pelvis' pitch is what tells sitting from standing.
+            how = how._replace(pelvis_pitch_deg=0.0)
+            parts.append(self._batch(draw(self.seated_starts, seated, 0.0, self.generator), how))
+        orientation, acceleration, relative = map(torch.cat, zip(*parts, strict=True))
+        batch = orientation, acceleration, relative
         loss = self._loss(self.parallel, batch, config.input_dropout, config.smoothness)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
@@ -442,6 +449,10 @@ class Trainer:
             for mean, new in zip(self.averaged.parameters(), self.network.parameters(), strict=True):
                 mean.lerp_(new, 1.0 - decay)
         return self.processes.total(loss.detach()).item() / self.processes.size
+
+    def _batch(self, starts: Tensor, how: Augmentation) -> Batch:
+        """Disturbed windows from some first frames on."""
+        return augment(windows(self.train_tape, starts, self.config.window), how, self.generator)
 
     def _validation_starts(self) -> Tensor:
         window = self.config.window

@@ -211,6 +211,19 @@ def test_share_of_made_sitting(takes):
     assert one.train_step() != plain.train_step()
 
 
+def test_takes_with_made_sitting_keep_their_pelvis(takes):
+    """Its pitch is what tells sitting from standing."""
+    made = [takes[0]._replace(name=f"{takes[0].name}.seated"), *takes[1:]]
+
+    def loss(share, pitch):
+        how = SMALL.augmentation._replace(pelvis_pitch_deg=pitch)
+        config = replace(SMALL, sequences=8, seated_share=share, free_share=0.0, augmentation=how)
+        return Trainer(config, tape(made), tape(takes), ABOUT).train_step()
+
+    assert loss(1.0, 0.0) == loss(1.0, 40.0)
+    assert loss(0.0, 0.0) != loss(0.0, 40.0)
+
+
 def test_takes_that_are_too_short(takes):
     with pytest.raises(EdgeposeError, match="no training take is as long as the window of 500"):
         trainer(takes, replace(SMALL, window=500))
