@@ -33,9 +33,9 @@ class NetworkShape(NamedTuple):
             sensor take its orientation; the network predicts the other 10). "passed" needs "global-6d".
         normalisation: of the inputs, one of `normalisation.SCHEMES`.
         acceleration: whether accelerations are inputs (without: DIP appendix D).
-        smoothing: of a recurrent network, the share of the last frame's pose numbers in this frame's: a
-            one-pole low-pass behind the network, in training too, so that the network learns to make up for
-            its delay.
+        smoothing: of a recurrent network, both poles of a low-pass over its pose numbers, 0 to 1: each of two
+            stages keeps this share of what it gave in the last frame. It is there in training too, so that
+            the network learns to make up for its delay.
     """
 
     kind: str = "birnn"
@@ -122,11 +122,12 @@ class PoseNetwork(nn.Module):
 
 
 def _smoothed(x: Tensor, smoothing: float) -> Tensor:
-    """One-pole low-pass over the frames of (B, T, numbers): weighted means of each frame and all before it,
-    as `recurrent.Ends.smoothed` carries them on but for their scale.
+    """Low-pass over the frames of (B, T, numbers): weighted means of each frame and all before it, as
+    `recurrent.Ends.smoothed` carries them on but for their scale.
     """
     frame = torch.arange(x.shape[1], device=x.device, dtype=x.dtype)
-    weights = (smoothing ** (frame[:, None] - frame).clamp_min(0.0)).tril()
+    age = (frame[:, None] - frame).clamp_min(0.0)
+    weights = ((age + 1.0) * smoothing**age).tril()  # what two equal poles answer to an impulse
     # In full precision: what is left of a pose's trembling is smaller than bfloat16 can say.
     with torch.autocast(x.device.type, enabled=False):
         return (weights / weights.sum(dim=1, keepdim=True)) @ x

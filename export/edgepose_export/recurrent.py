@@ -126,8 +126,8 @@ class Ends(nn.Module):
 
     @torch.jit.export
     def before(self, batch: int) -> Tensor:
-        """What `pose` knows of the frames before the first one, (B, pose outputs)."""
-        return torch.zeros(batch, self.decoder.target_mean.shape[0])
+        """What `pose` knows of the frames before the first one, (B, 2, pose outputs)."""
+        return torch.zeros(batch, 2, self.decoder.target_mean.shape[0])
 
     @torch.jit.export
     def pose(self, orientation: Tensor, hidden: Tensor, before: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -140,18 +140,20 @@ class Ends(nn.Module):
         return self.decoder.rotations(orientation, pose), self.decoder.deviations(deviation), before
 
     def smoothed(self, pose: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
-        """One-pole low-pass over the frames of (B, T, pose outputs), and its last output.
+        """Two-pole low-pass over the frames of (B, T, pose outputs), and the last outputs of both stages.
 
         It begins at zero without a bias: the first outputs are too small, but rotations are made from the
         numbers' directions alone.
         """
         if self.smoothing == 0.0:
             return pose, before
+        first, second = before.unbind(1)
         outputs: list[Tensor] = []
         for row in pose.unbind(1):
-            before = torch.lerp(row, before, self.smoothing)
-            outputs.append(before)
-        return torch.stack(outputs, dim=1), before
+            first = torch.lerp(row, first, self.smoothing)
+            second = torch.lerp(first, second, self.smoothing)
+            outputs.append(second)
+        return torch.stack(outputs, dim=1), torch.stack([first, second], dim=1)
 
 
 class RnnArchive(nn.Module):
