@@ -143,6 +143,7 @@ def describe(
         "measured_bones": shape.measured,
         "normalisation": shape.normalisation,
         "acceleration": shape.acceleration,
+        "smoothing": shape.smoothing,
         "precision": "f32",
         "training": {
             "steps": checkpoint["step"],

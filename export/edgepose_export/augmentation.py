@@ -37,8 +37,8 @@ class Augmentation(NamedTuple):
         aligned: share of sequences without misalignment and heading errors, so that a network trusts sensors
             that agree with each other.
         pelvis_pitch_deg: deviation of a turn of the pelvis about its own X axis, of bone and sensor alike: as
-            if another actor's skeleton, in whom the trunk leans otherwise against the pelvis, did the same;
-            not in sequences with made sitting, whose sign it is.
+            if another actor's skeleton, in whom the trunk leans otherwise against the pelvis, did the same.
+            `Trainer` leaves sequences with made sitting alone, which the pelvis' pitch tells from standing.
     """
 
     mirror: float = 0.5

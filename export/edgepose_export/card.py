@@ -38,7 +38,8 @@ def card(metadata: dict[str, Any]) -> str:
         f"- Input: calibrated orientations{' and accelerations' if metadata['acceleration'] else ''} of "
         f"{', '.join(metadata['placements'])} at {metadata['rate_hz']:g} Hz, "
         f"{_INPUTS[metadata['normalisation']]}.",
-        f"- Targets: {metadata['targets']}; bones that carry a sensor are {metadata['measured_bones']}.",
+        f"- Targets: {metadata['targets']}; bones that carry a sensor are {metadata['measured_bones']}"
+        f"{_smoothing(metadata)}.",
         f"- Trained on: {training['summary']}; {training['takes']} takes, {training['hours']:.2f} h, "
         f"{training['steps']} steps.",
         "- Licences of that motion:",
@@ -102,6 +103,12 @@ def _table(rows: dict[str, dict[str, list[float]]]) -> list[str]:
         cells = [f"{measures[key][0]:.2f} ± {measures[key][1]:.2f}" for key in _COLUMNS]
         lines.append("| " + " | ".join([name, *cells, str(int(measures["sip_error_deg"][2]))]) + " |")
     return lines
+
+
+def _smoothing(metadata: dict[str, Any]) -> str:
+    if not metadata["smoothing"]:
+        return ""
+    return f"; a low-pass of two poles at {metadata['smoothing']:g} behind the network, learnt with it"
 
 
 def _seated(metadata: dict[str, Any]) -> bool:

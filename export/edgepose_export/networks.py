@@ -22,7 +22,7 @@ Without it, joints that never move take all gradient.
 
 
 class NetworkShape(NamedTuple):
-    """What decides the weights' shapes and the meaning of the outputs.
+    """What decides the weights' shapes, the meaning of the outputs and what is done with them.
 
     Attributes:
         kind: "birnn" or "rnn" (DIP 3.4), "feed-forward" or "wavenet" (DIP appendix A).
@@ -33,9 +33,9 @@ class NetworkShape(NamedTuple):
             sensor take its orientation; the network predicts the other 10). "passed" needs "global-6d".
         normalisation: of the inputs, one of `normalisation.SCHEMES`.
         acceleration: whether accelerations are inputs (without: DIP appendix D).
-        smoothing: of a recurrent network, both poles of a low-pass over its pose numbers, 0 to 1: each of two
-            stages keeps this share of what it gave in the last frame. It is there in training too, so that
-            the network learns to make up for its delay.
+        smoothing: of a recurrent network, both poles of a low-pass over its pose numbers, 0 (none) to 0.99:
+            each of two stages keeps this share of what it gave in the last frame. It is there in training
+            too, so that the network learns to make up for its delay.
     """
 
     kind: str = "birnn"
@@ -128,7 +128,8 @@ def _smoothed(x: Tensor, smoothing: float) -> Tensor:
     frame = torch.arange(x.shape[1], device=x.device, dtype=x.dtype)
     age = (frame[:, None] - frame).clamp_min(0.0)
     weights = ((age + 1.0) * smoothing**age).tril()  # what two equal poles answer to an impulse
-    # In full precision: what is left of a pose's trembling is smaller than bfloat16 can say.
+    weights = weights * (weights > 1e-20)  # numbers that are smaller still make products slow
+    # The means in full precision: bfloat16 steps are as large as the trembling that is left.
     with torch.autocast(x.device.type, enabled=False):
         return (weights / weights.sum(dim=1, keepdim=True)) @ x
 

@@ -125,29 +125,31 @@ class Ends(nn.Module):
         return torch.relu(self.dense(x))
 
     @torch.jit.export
-    def before(self, batch: int) -> Tensor:
-        """What `pose` knows of the frames before the first one, (B, 2, pose outputs)."""
+    def start(self, batch: int) -> Tensor:
+        """State of the low-pass before the first frame: its stages' last outputs, (B, 2, pose outputs)."""
         return torch.zeros(batch, 2, self.decoder.target_mean.shape[0])
 
     @torch.jit.export
-    def pose(self, orientation: Tensor, hidden: Tensor, before: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Local rotations (B, T, 24, 3, 3) and deviations (B, T, 24) of frames, from the last recurrent
-        outputs (B, T, hidden) and what is known of the frames before; then what the next frames shall know.
+    def pose(self, orientation: Tensor, hidden: Tensor, lowpass: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Local rotations (B, N, 24, 3, 3) and deviations (B, N, 24) of the frames of `orientation` (B, N, 6,
+        3, 3), the last of those of the recurrent outputs (B, T, hidden); and the low-pass' new state.
         """
         pose, deviation = self.heads(hidden).chunk(2, dim=-1)
-        pose, before = self.smoothed(pose, before)
-        deviation = nn.functional.softplus(deviation) + self.floor
-        return self.decoder.rotations(orientation, pose), self.decoder.deviations(deviation), before
+        pose, lowpass = self.smoothed(pose, lowpass)
+        first = hidden.shape[1] - orientation.shape[1]
+        deviation = nn.functional.softplus(deviation[:, first:]) + self.floor
+        rotations = self.decoder.rotations(orientation, pose[:, first:])
+        return rotations, self.decoder.deviations(deviation), lowpass
 
-    def smoothed(self, pose: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
-        """Two-pole low-pass over the frames of (B, T, pose outputs), and the last outputs of both stages.
+    def smoothed(self, pose: Tensor, lowpass: Tensor) -> tuple[Tensor, Tensor]:
+        """Two-pole low-pass over the frames of (B, T, pose outputs), and its new state.
 
-        It begins at zero without a bias: the first outputs are too small, but rotations are made from the
-        numbers' directions alone.
+        It begins at zero and is not corrected for it: the first outputs are too small, but rotations are
+        made from the numbers' directions alone.
         """
         if self.smoothing == 0.0:
-            return pose, before
-        first, second = before.unbind(1)
+            return pose, lowpass
+        first, second = lowpass.unbind(1)
         outputs: list[Tensor] = []
         for row in pose.unbind(1):
             first = torch.lerp(row, first, self.smoothing)
@@ -168,9 +170,13 @@ class RnnArchive(nn.Module):
 
     def forward(self, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
         """Poses of a whole sequence."""
+        return self.last(orientation, acceleration, orientation.shape[1])
+
+    def last(self, orientation: Tensor, acceleration: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        """Poses of the last frames of a sequence."""
         x = self.cell1.run(self.cell1.inputs[0](self.ends(orientation, acceleration)), False)
         x = self.cell2.run(self.cell2.inputs[0](x), False)
-        rotations, std, _ = self.ends.pose(orientation, x, self.ends.before(x.shape[0]))
+        rotations, std, _ = self.ends.pose(orientation[:, -count:], x, self.ends.start(x.shape[0]))
         return rotations, std
 
     @torch.jit.export
@@ -182,8 +188,8 @@ class RnnArchive(nn.Module):
     @torch.jit.export
     def window(self, orientation: Tensor, acceleration: Tensor, index: int) -> tuple[Tensor, Tensor]:
         """Pose of frame `index` of a window; later frames are not used."""
-        rotations, std = self.forward(orientation[:, : index + 1], acceleration[:, : index + 1])
-        return rotations[:, -1], std[:, -1]
+        rotations, std = self.last(orientation[:, : index + 1], acceleration[:, : index + 1], 1)
+        return rotations[:, 0], std[:, 0]
 
     @torch.jit.export
     def start(self, batch: int, future: int) -> list[Tensor]:
@@ -191,7 +197,7 @@ class RnnArchive(nn.Module):
         if future != 0:
             raise ValueError("a unidirectional network has no future frames")
         zero = torch.zeros(batch, self.cell1.size)
-        return [zero, zero, zero, zero, self.ends.before(batch)]
+        return [zero, zero, zero, zero, self.ends.start(batch)]
 
     @torch.jit.export
     def stream(
@@ -208,8 +214,8 @@ class RnnArchive(nn.Module):
         x = self.ends(orientation, acceleration)
         x, h1, c1 = self.cell1.carry(self.cell1.inputs[0](x), state[0], state[1])
         x, h2, c2 = self.cell2.carry(self.cell2.inputs[0](x), state[2], state[3])
-        rotations, std, before = self.ends.pose(orientation, x, state[4])
-        return rotations, std, [h1, c1, h2, c2, before]
+        rotations, std, lowpass = self.ends.pose(orientation, x, state[4])
+        return rotations, std, [h1, c1, h2, c2, lowpass]
 
     @torch.jit.export
     def drain(self, state: list[Tensor]) -> tuple[Tensor, Tensor]:
@@ -255,18 +261,17 @@ class BirnnArchive(nn.Module):
     def forward(self, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
         """Poses of a whole sequence."""
         ahead, back = self.layer1(orientation, acceleration)
-        return self.poses(orientation, ahead, back, 0)
+        hidden = self.layer2(ahead, back, 0, orientation.shape[1])
+        rotations, std, _ = self.ends.pose(orientation, hidden, self.ends.start(hidden.shape[0]))
+        return rotations, std
 
-    def poses(self, orientation: Tensor, ahead: Tensor, back: Tensor, first: int) -> tuple[Tensor, Tensor]:
-        """Poses of a sequence's frames (B, T - first, ...) from `first` to the last that `orientation` (B, T,
-        6, 3, 3) has, of what layer 1 says of them and of any later ones.
+    def layer2(self, ahead: Tensor, back: Tensor, first: int, end: int) -> Tensor:
+        """Outputs (B, end - first, 2 hidden) of the second layer over a sequence, of the frames from `first`
+        to before `end`.
         """
-        end = orientation.shape[1]
         past = self.forward2.run(self.forward2_products(ahead[:, :end], back[:, :end]), False)
         later = self.backward2.run(self.backward2_products(ahead[:, first:], back[:, first:]), True)
-        hidden = torch.cat([past[:, first:], later[:, : end - first]], dim=-1)
-        rotations, std, _ = self.ends.pose(orientation[:, first:], hidden, self.ends.before(hidden.shape[0]))
-        return rotations, std
+        return torch.cat([past[:, first:], later[:, : end - first]], dim=-1)
 
     @torch.jit.export
     def pack(self, precision: str) -> None:
@@ -283,23 +288,24 @@ class BirnnArchive(nn.Module):
         The second layer runs only over the frames that reach `index`: with smoothing, all of them do.
         """
         ahead, back = self.layer1(orientation, acceleration)
-        first = 0 if self.ends.smoothing > 0.0 else index
-        rotations, std = self.poses(orientation[:, : index + 1], ahead, back, first)
-        return rotations[:, -1], std[:, -1]
+        hidden = self.layer2(ahead, back, 0 if self.ends.smoothing > 0.0 else index, index + 1)
+        last = orientation[:, index : index + 1]
+        rotations, std, _ = self.ends.pose(last, hidden, self.ends.start(hidden.shape[0]))
+        return rotations[:, 0], std[:, 0]
 
     @torch.jit.export
     def start(self, batch: int, future: int) -> list[Tensor]:
         """State before the first frame of a stream in which each pose sees `future` later frames.
 
         The state is [h1, c1, h2, c2, then of the frames that wait for their future: products of layer 1
-        backwards, known products of layer 2 forwards, the same backwards, orientations; what smoothing knows
-        of the frames before; last a tensor whose length is `future`].
+        backwards, known products of layer 2 forwards, the same backwards, orientations; the low-pass' state;
+        last a tensor whose length is `future`].
         """
         size = self.forward1.size
         zero, waiting = torch.zeros(batch, size), torch.zeros(batch, 0, 4 * size)
         orientations = torch.zeros(batch, 0, 6, 3, 3)
-        before = self.ends.before(batch)
-        return [zero, zero, zero, zero, waiting, waiting, waiting, orientations, before, torch.zeros(future)]
+        lowpass = self.ends.start(batch)
+        return [zero, zero, zero, zero, waiting, waiting, waiting, orientations, lowpass, torch.zeros(future)]
 
     def oldest(self, state: list[Tensor], count: int, future: int) -> tuple[Tensor, Tensor, list[Tensor]]:
         """Poses of the oldest waiting frames, each seen with `future` that wait behind it, and the state
@@ -314,9 +320,9 @@ class BirnnArchive(nn.Module):
         past, h2, c2 = self.forward2.carry(known, state[2], state[3])
         later = self.backward2.run(_fields(state[6], count, future) + self.backward2.inputs[1](back), True)
         hidden = torch.cat([past, later[:, 0].unflatten(0, (batch, count))], dim=-1)
-        rotations, std, before = self.ends.pose(state[7][:, :count], hidden, state[8])
+        rotations, std, lowpass = self.ends.pose(state[7][:, :count], hidden, state[8])
         waiting = [state[4][:, count:], state[5][:, count:], state[6][:, count:], state[7][:, count:]]
-        return rotations, std, [state[0], state[1], h2, c2] + waiting + [before, state[9]]  # noqa: RUF005
+        return rotations, std, [state[0], state[1], h2, c2] + waiting + [lowpass, state[9]]  # noqa: RUF005
 
     @torch.jit.export
     def stream(

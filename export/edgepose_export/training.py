@@ -305,6 +305,16 @@ def window_starts(
     return torch.cat([empty, *groups[0]]), torch.cat([empty, *groups[1]])
 
 
+def windows_with_sitting(tape: Tape, window: int) -> Tensor:
+    """Whether the windows from each frame (T,) of a tape on hold frames of takes with made sitting."""
+    frames = torch.zeros(int(tape.starts[-1]) + 1, dtype=torch.int32)
+    for i in (i for i, seated in enumerate(tape.seated) if seated):
+        frames[int(tape.starts[i]) + 1 : int(tape.starts[i + 1]) + 1] = 1
+    before = frames.cumsum(0)
+    first = torch.arange(len(before) - 1)
+    return before[(first + window).clamp(max=len(before) - 1)] > before[first]
+
+
 def draw(starts: Starts, count: int, free_share: float, generator: torch.Generator) -> Tensor:
     """First frames (count,) of random windows with the wanted share of CMU's."""
     other, cmu = starts
@@ -366,6 +376,7 @@ class Trainer:
         seated = train.seated if config.seated_share else [False] * len(train.names)
         self.starts = window_starts(train, config.window, config.joined, lambda take: not seated[take])
         self.seated_starts = window_starts(train, config.window, config.joined, seated.__getitem__)
+        self.sits = windows_with_sitting(train, config.window)
         counts = processes.everywhere(len(torch.cat(self.starts)))
         if not all(counts):
             at = f"process {counts.index(0)} has " if processes.size > 1 else ""
@@ -429,14 +440,10 @@ class Trainer:
             group["lr"] = rate * min(1.0, (self.step + 1) / (config.warm_up + 1))
         count = config.sequences // self.processes.size
         seated = round(count * config.seated_share) if len(torch.cat(self.seated_starts)) else 0
-        how = config.augmentation
-        parts = [self._batch(draw(self.starts, count - seated, config.free_share, self.generator), how)]
+        starts = draw(self.starts, count - seated, config.free_share, self.generator)
         if seated:
-            # The pelvis' pitch is what tells sitting from standing.
-            how = how._replace(pelvis_pitch_deg=0.0)
-            parts.append(self._batch(draw(self.seated_starts, seated, 0.0, self.generator), how))
-        orientation, acceleration, relative = map(torch.cat, zip(*parts, strict=True))
-        batch = orientation, acceleration, relative
+            starts = torch.cat([starts, draw(self.seated_starts, seated, 0.0, self.generator)])
+        batch = self._batch(starts)
         loss = self._loss(self.parallel, batch, config.input_dropout, config.smoothness)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
@@ -450,9 +457,18 @@ class Trainer:
                 mean.lerp_(new, 1.0 - decay)
         return self.processes.total(loss.detach()).item() / self.processes.size
 
-    def _batch(self, starts: Tensor, how: Augmentation) -> Batch:
-        """Disturbed windows from some first frames on."""
-        return augment(windows(self.train_tape, starts, self.config.window), how, self.generator)
+    def _batch(self, starts: Tensor) -> Batch:
+        """Disturbed windows from some first frames on, those with made sitting last."""
+        how = self.config.augmentation
+        # The pelvis' pitch is what tells sitting from standing.
+        kinds = ((~self.sits[starts], how), (self.sits[starts], how._replace(pelvis_pitch_deg=0.0)))
+        parts = [
+            augment(windows(self.train_tape, starts[kind], self.config.window), its, self.generator)
+            for kind, its in kinds
+            if kind.any()
+        ]
+        orientation, acceleration, relative = map(torch.cat, zip(*parts, strict=True))
+        return orientation, acceleration, relative
 
     def _validation_starts(self) -> Tensor:
         window = self.config.window
@@ -514,7 +530,7 @@ class Trainer:
         What it was trained on, and under which licences, is noted together with this run's takes.
 
         Raises:
-            EdgeposeError: the checkpoint is of another network.
+            EdgeposeError: the checkpoint is of another network; only its `smoothing` may differ.
         """
         self._check_shape(state, smoothing=self.config.network.smoothing)
         self.statistics = self._placed(Statistics(**state["statistics"]))
@@ -530,8 +546,8 @@ class Trainer:
 
     def _check_shape(self, state: dict[str, Any], **other: Any) -> None:
         """The checkpoint's network is the config's, apart from `other` fields."""
-        shape = config_from(json.loads(state["config"])).network._replace(**other)
-        if shape != self.config.network:
+        shape = config_from(json.loads(state["config"])).network
+        if shape._replace(**other) != self.config.network:
             raise EdgeposeError(f"the checkpoint holds {shape}, the config asks for {self.config.network}")
 
 

@@ -7,6 +7,7 @@ from edgepose_export.networks import NetworkShape
 
 BIRNN = NetworkShape("birnn", 8, "global-6d", "passed")
 RNN = BIRNN._replace(kind="rnn")
+SMOOTH = [shape._replace(smoothing=0.6) for shape in (BIRNN, RNN)]
 
 
 def run(engine, orientation, acceleration):
@@ -100,7 +101,7 @@ def test_warming_up_leaves_no_trace(tiny, wearers, engine):
     np.testing.assert_array_equal(kept.rotations, copy)
 
 
-@pytest.mark.parametrize("shape", [BIRNN, RNN, BIRNN._replace(normalisation="sequence")], ids=str)
+@pytest.mark.parametrize("shape", [BIRNN, RNN, *SMOOTH, BIRNN._replace(normalisation="sequence")], ids=str)
 @pytest.mark.parametrize("frames", [0, 3, 4, 11, 13])
 def test_frames_together_give_what_they_give_one_by_one(tiny, wearers, shape, frames):
     orientation, acceleration = (x[0, :frames] for x in wearers(1, 13))
@@ -145,6 +146,7 @@ def together(engine, spans, orientation, acceleration):
     [
         BIRNN,
         RNN,
+        *SMOOTH,
         BIRNN._replace(normalisation="sequence"),
         NetworkShape("feed-forward", 8, "global-6d", "passed"),
     ],

@@ -152,16 +152,32 @@ def latency_controlled(network, statistics, orientation, acceleration, future):
         outputs.append(torch.cat([forward2, backward2], dim=-1))
     hidden = torch.cat(outputs, dim=1)
     deviation = nn.functional.softplus(network.deviation(hidden)) + 0.02
-    return PoseDecoder(network.shape, *statistics[2:])(orientation, network.mean(hidden), deviation)
+    mean = low_pass(network.mean(hidden), network.shape.smoothing)
+    return PoseDecoder(network.shape, *statistics[2:])(orientation, mean, deviation)
 
 
+def low_pass(numbers, smoothing):
+    """Definition: two stages, each a weighted mean of its input and its own last output; corrected for their
+    beginning at zero.
+    """
+    numbers = torch.cat([numbers, torch.ones_like(numbers[..., :1])], dim=-1)  # the one tells the weight
+    first = second = torch.zeros_like(numbers[:, 0])
+    outputs = []
+    for t in range(numbers.shape[1]):
+        first = smoothing * first + (1 - smoothing) * numbers[:, t]
+        second = smoothing * second + (1 - smoothing) * first
+        outputs.append(second[:, :-1] / second[:, -1:])
+    return torch.stack(outputs, dim=1)
+
+
+@pytest.mark.parametrize("smoothing", [0.0, SMOOTH])
 @pytest.mark.parametrize(("frames", "future"), [(12, 3), (12, 0), (5, 5), (3, 8), (1, 2)])
-def test_birnn_stream_against_its_definition(parts, tiny, wearers, frames, future):
-    inputs = wearers(2, frames)
+def test_birnn_stream_against_its_definition(parts, tiny, wearers, frames, future, smoothing):
+    inputs, shape = wearers(2, frames), BIRNN._replace(smoothing=smoothing)
     with torch.no_grad():
-        got, counts = stream(tiny(BIRNN), *inputs, future)
-        expected = latency_controlled(*parts(BIRNN), *inputs, future)
-        whole = tiny(BIRNN)(*inputs)
+        got, counts = stream(tiny(shape), *inputs, future)
+        expected = latency_controlled(*parts(shape), *inputs, future)
+        whole = tiny(shape)(*inputs)
     # Priming: nothing comes out until `future` frames wait; drain gives the rest.
     assert counts == [0] * min(future, frames) + [1] * max(0, frames - future)
     for a, b in zip(got, expected, strict=True):
@@ -193,12 +209,7 @@ def test_smoothing_is_a_two_pole_low_pass_of_the_pose_numbers(parts, kind):
         network.shape = shape._replace(smoothing=0.0)
         sharp, same = network(x)
     size = shape.pose_outputs
-    numbers = torch.cat([sharp[..., :size], torch.ones(2, 20, 1)], dim=-1)  # the one tells the weight
-    first = second = torch.zeros(2, size + 1)
-    for t in range(20):
-        first = SMOOTH * first + (1 - SMOOTH) * numbers[:, t]
-        second = SMOOTH * second + (1 - SMOOTH) * first
-        close(mean[:, t, :size], second[:, :-1] / second[:, -1:])
+    close(mean[..., :size], low_pass(sharp[..., :size], SMOOTH))
     close(mean[..., size:], sharp[..., size:], atol=0)
     close(deviation, same, atol=0)
 

@@ -14,7 +14,7 @@ from edgepose.features import network_input
 from edgepose.skeleton import PARENTS, PREDICTED, default_body
 from edgepose_export import training
 from edgepose_export.archive import Statistics
-from edgepose_export.augmentation import Augmentation
+from edgepose_export.augmentation import Augmentation, augment
 from edgepose_export.cli.synthesize import LICENSES
 from edgepose_export.dataset import read_take, tape, training_paths
 from edgepose_export.mocap import read_motion, resample
@@ -211,17 +211,30 @@ def test_share_of_made_sitting(takes):
     assert one.train_step() != plain.train_step()
 
 
-def test_takes_with_made_sitting_keep_their_pelvis(takes):
+@pytest.mark.parametrize("joined", [False, True])
+def test_windows_with_made_sitting_keep_their_pelvis(takes, monkeypatch, joined):
     """Its pitch is what tells sitting from standing."""
-    made = [takes[0]._replace(name=f"{takes[0].name}.seated"), *takes[1:]]
+    made = [takes[0], takes[1]._replace(name=f"{takes[1].name}.seated"), *takes[2:]]
+    how = Augmentation(mirror=0.0, pelvis_pitch_deg=40.0)
+    config = replace(SMALL, sequences=64, seated_share=0.5, free_share=0.0, joined=joined, augmentation=how)
+    one = Trainer(config, tape(made), tape(takes), ABOUT)
+    first, length = len(made[0].pose), len(made[1].pose)
+    sitting = [start for start in range(len(one.sits)) if first - config.window < start < first + length]
+    assert one.sits.nonzero().flatten().tolist() == sitting
+    batches = []
 
-    def loss(share, pitch):
-        how = SMALL.augmentation._replace(pelvis_pitch_deg=pitch)
-        config = replace(SMALL, sequences=8, seated_share=share, free_share=0.0, augmentation=how)
-        return Trainer(config, tape(made), tape(takes), ABOUT).train_step()
+    def recorded(batch, how, generator):
+        result = augment(batch, how, generator)
+        batches.append((len(batch[0]), (batch[2], result[2])))
+        return result
 
-    assert loss(1.0, 0.0) == loss(1.0, 40.0)
-    assert loss(0.0, 0.0) != loss(0.0, 40.0)
+    monkeypatch.setattr(training, "augment", recorded)
+    one.train_step()
+    (plain, turned), (seated, kept) = batches
+    assert plain + seated == 64
+    assert seated >= 32 if joined else seated == 32
+    assert torch.equal(*kept)
+    assert ((turned[0] - turned[1]).abs().amax((1, 2, 3, 4)) > 1e-3).all()
 
 
 def test_takes_that_are_too_short(takes):
