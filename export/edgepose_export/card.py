@@ -23,6 +23,9 @@ _INPUTS = {
 }
 
 
+_STANDING = "edgepose synthesize MOCAP/*_normal_*.bvh --hold 3 --out recordings/standing"
+
+
 def card(metadata: dict[str, Any]) -> str:
     """Markdown of an archive's card, made from its metadata alone."""
     kind = _KINDS[metadata["kind"]].format(
@@ -72,7 +75,7 @@ def card(metadata: dict[str, Any]) -> str:
         "",
         "```",
         "edgepose synthesize MOCAP --out recordings --jobs 2",
-        "edgepose synthesize MOCAP/*_normal_*.bvh --hold 3 --out recordings/standing",
+        *([_STANDING] if "Bandai-Namco" in training["summary"] else []),
         *(["edgepose synthesize SOME --seated 1 --out recordings/seated"] if _seated(metadata) else []),
         f"edgepose train --config {metadata['name']} --data recordings --out runs/{metadata['name']}",
         f"edgepose export runs/{metadata['name']}/checkpoint.pt --out {metadata['name']}.pt "

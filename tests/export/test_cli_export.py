@@ -96,6 +96,20 @@ def test_train(made):
     assert "CC BY-NC" in state["data"]["licenses"][0]
 
 
+def test_figures_of_another_model_stand_beside(made, tmp_path):
+    folder, _, _ = made
+    to = ("export", folder / "run" / "best.pt", "--out", tmp_path / "tiny.pt", "--beside", "rnn")
+    edgepose(*to, "--measure", folder / "recordings")
+    measures = archive.inspect(tmp_path / "tiny.pt").metadata["measures"]
+    assert set(measures) == {"cmu-walk-run", "cmu-02", "bandai-styles"}
+    for rows in measures.values():
+        other, own = rows["`rnn`, online, step by step"], rows["online, stream (5 future)"]
+        assert 0 < other["sip_error_deg"][0] < own["sip_error_deg"][0]
+    assert "| `rnn`, online, step by step |" in (tmp_path / "tiny.md").read_text()
+    refused = CliRunner().invoke(cli, [str(a) for a in to])
+    assert (refused.exit_code, "--beside is for --measure" in refused.output) == (2, True)
+
+
 def test_metadata(made):
     folder, said, _ = made
     path = folder / "new" / "tiny.pt"

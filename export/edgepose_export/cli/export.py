@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     import numpy as np
     import torch
     from numpy.typing import NDArray
+
+    Archive = tuple[torch.jit.ScriptModule, dict[str, Any]]
+    """A loaded archive and its metadata."""
 
 
 @click.command(short_help="Make an archive of a trained network.")
@@ -55,7 +58,13 @@ if TYPE_CHECKING:
     help="Folder that `edgepose synthesize` wrote: fit the standard deviations to the errors on its "
     "validation takes, measure the archive on its held-out takes and put the figures into the card.",
 )
-def export(checkpoint: Path, out: Path, past: int, future: int, precision: str, data: Path | None) -> None:
+@click.option(
+    "--beside",
+    help="Shipped or trusted model whose figures stand beside in the card, with --measure.",
+)
+def export(
+    checkpoint: Path, out: Path, past: int, future: int, precision: str, data: Path | None, beside: str | None
+) -> None:
     """Turn a checkpoint of `edgepose train` into a TorchScript archive for `edgepose run --model FILE
     --trust`.
 
@@ -65,12 +74,19 @@ def export(checkpoint: Path, out: Path, past: int, future: int, precision: str, 
     """
     if out.suffix != ".pt":
         raise click.UsageError("--out is the name of a .pt file")
+    if beside and not data:
+        raise click.UsageError("--beside is for --measure")
     import torch
 
+    from edgepose.archive import find, inspect, load
     from edgepose.precision import pack_weights
     from edgepose_export import archive, training
     from edgepose_export.card import card
 
+    others = {}
+    if beside:
+        info = inspect(find(beside))
+        others = {f"`{beside}`": (load(info), info.metadata)}
     state = training.read_checkpoint(checkpoint)
     config = training.config_from(json.loads(state["config"]))
     network = archive.new_network(config.network)
@@ -91,7 +107,7 @@ def export(checkpoint: Path, out: Path, past: int, future: int, precision: str, 
     pack_weights(module, precision)
     archive.save(module, out, metadata)
     if data:
-        metadata |= _measures(out, data)
+        metadata |= _measures(out, data, others)
         metadata["precisions"] = _precisions(script, metadata, data)
         archive.save(module, out, metadata)
     out.with_suffix(".md").write_text(card(metadata), encoding="utf-8")
@@ -127,8 +143,8 @@ def _std_scale(module: torch.jit.ScriptModule, metadata: dict[str, Any], data: P
     return factors
 
 
-def _measures(path: Path, data: Path) -> dict[str, Any]:
-    """Measures and reliability of the archive as a run loads it, with one thread."""
+def _measures(path: Path, data: Path, others: Mapping[str, Archive]) -> dict[str, Any]:
+    """Measures and reliability of the archive as a run loads it, with one thread, and measures of others."""
     from edgepose.archive import inspect, load
     from edgepose_export import evaluation
     from edgepose_export.baselines import learn
@@ -140,6 +156,10 @@ def _measures(path: Path, data: Path) -> dict[str, Any]:
     module, modes = load(info, trust=True), evaluation.modes_of(info.metadata)
     learnt = learn(evaluation.takes_of(data, "train", labelled("learning baselines")))
     methods = evaluation.archive_methods(module, modes) | evaluation.baseline_methods(learnt)
+    for name, (other, about) in others.items():
+        streamed = [mode for mode in evaluation.modes_of(about) if mode.name == "stream"]
+        for row, method in evaluation.archive_methods(other, streamed).items():
+            methods[f"{name}, {row}"] = method
     columns = evaluation.columns_of_parts(methods, data, HELD_OUT, labelled("measuring"))
     (mode,) = (mode for mode in modes if mode.name == "stream")
     deviations = {}
