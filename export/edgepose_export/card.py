@@ -23,9 +23,6 @@ _INPUTS = {
 }
 
 
-_STANDING = "edgepose synthesize MOCAP/*_normal_*.bvh --hold 3 --out recordings/standing"
-
-
 def card(metadata: dict[str, Any]) -> str:
     """Markdown of an archive's card, made from its metadata alone."""
     kind = _KINDS[metadata["kind"]].format(
@@ -34,6 +31,8 @@ def card(metadata: dict[str, Any]) -> str:
         latency=1e3 * metadata["future"] / metadata["rate_hz"],
     )
     training = metadata["training"]
+    mixed = "Bandai-Namco" in training["summary"]
+    bandai = ", and both Bandai-Namco Research motion datasets" if mixed else ""
     lines = [
         f"# {metadata['name']}",
         "",
@@ -75,7 +74,7 @@ def card(metadata: dict[str, Any]) -> str:
         "",
         "```",
         "edgepose synthesize MOCAP --out recordings --jobs 2",
-        *([_STANDING] if "Bandai-Namco" in training["summary"] else []),
+        f"edgepose synthesize MOCAP/{'*_normal_*' if mixed else '*'}.bvh --hold 3 --out recordings/standing",
         *(["edgepose synthesize SOME --seated 1 --out recordings/seated"] if _seated(metadata) else []),
         f"edgepose train --config {metadata['name']} --data recordings --out runs/{metadata['name']}",
         f"edgepose export runs/{metadata['name']}/checkpoint.pt --out {metadata['name']}.pt "
@@ -83,8 +82,8 @@ def card(metadata: dict[str, Any]) -> str:
         "```",
         "",
         "MOCAP is a folder with the motion named above. For the shipped models: the BVH files of CMU "
-        "subjects 01, 02, 03, 05 - 09 and some further takes (cgspeed's conversion), and both Bandai-Namco "
-        "Research motion datasets. The whole config is in the archive's metadata.",
+        f"subjects 01, 02, 03, 05 - 09 and some further takes (cgspeed's conversion){bandai}. The whole "
+        "config is in the archive's metadata.",
         "",
     ]
     return "\n".join(lines)
