@@ -56,8 +56,8 @@ def trust_file() -> Path:
 
 
 def shipped() -> list[Path]:
-    """Archives that come with the package."""
-    return sorted(MODELS.glob("*.pt"))
+    """Archives that come with the package, those trained on everything first."""
+    return sorted(MODELS.glob("*.pt"), key=lambda path: ("-" in path.stem, path.stem))
 
 
 def find(name: str) -> Path:
