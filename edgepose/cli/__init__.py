@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import os
 import signal
 import sys
 from importlib.metadata import entry_points
@@ -73,6 +74,8 @@ def main() -> NoReturn:
     interrupted.
     """
     signal.signal(signal.SIGTERM, _terminate)  # ends a run as Ctrl-C does: files complete, counts printed
+    # torch warns of its own plans when it reads int8 weights; nobody at a terminal can do anything about them.
+    os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
     debug = "--debug" in sys.argv[1:]
     # On a terminal a warning takes the place of the line that shows how far a command is.
     logging.basicConfig(format="\r\033[K%(message)s" if sys.stderr.isatty() else "%(message)s")

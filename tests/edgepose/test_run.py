@@ -175,6 +175,17 @@ def test_the_unidirectional_model_to_csv_and_binary_udp(command, wearer, tmp_pat
     np.testing.assert_allclose([pose.rotations for pose in sent], rotations, atol=5e-6)
 
 
+@pytest.mark.parametrize("model", ["birnn-cmu", "rnn-cmu"])
+def test_the_free_weights_in_int8(command, wearer, tmp_path, model):
+    result = command(
+        *("run", "--file", wearer.short, "--calibration", wearer.calibration),
+        *("--model", model, "--npz", tmp_path / "poses.npz"),
+    )
+    assert result.returncode == 0, result.stderr
+    assert "Warning" not in result.stderr
+    assert len(read_poses(tmp_path / "poses.npz").rotations) == 180
+
+
 def test_a_bidirectional_model_with_its_state_carried_on(command, wearer, tmp_path):
     file = tmp_path / "poses.csv"
     result = command(
