@@ -74,7 +74,7 @@ def main() -> NoReturn:
     interrupted.
     """
     signal.signal(signal.SIGTERM, _terminate)  # ends a run as Ctrl-C does: files complete, counts printed
-    # torch warns of its own plans when it reads int8 weights; nobody at a terminal can do anything about them.
+    # torch warns of its own plans when it reads int8 weights; nobody at a terminal can change these.
     os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
     debug = "--debug" in sys.argv[1:]
     # On a terminal a warning takes the place of the line that shows how far a command is.
