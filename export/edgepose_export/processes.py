@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -54,7 +55,12 @@ ALONE = Processes()
 
 @contextmanager
 def joined() -> Iterator[Processes]:
-    """Meets the other processes that torchrun started, on a GPU each (nccl) or the processor (gloo)."""
+    """Meets the other processes that torchrun started, on a GPU each (nccl) or the processor (gloo).
+
+    Networks that `Processes.wrapped` wrapped have to be gone when the block ends, so make them in a function
+    that the block calls: the connections close with their last user, and DistributedDataParallel waits for
+    their threads in a way that can wait for ever.
+    """
     gpus = torch.cuda.device_count()
     if not distributed.is_torchelastic_launched():
         yield Processes(device=torch.device("cuda", 0) if gpus else ALONE.device)
@@ -62,6 +68,9 @@ def joined() -> Iterator[Processes]:
     local = int(os.environ["LOCAL_RANK"])
     if gpus:
         torch.cuda.set_device(local)
+    # Functions of this module have the group of the moment as a default argument. DistributedDataParallel
+    # imports it, and the group would outlive `destroy_process_group`: its threads can abort an ending Python.
+    importlib.import_module("torch.distributed.nn.functional")
     distributed.init_process_group("nccl" if gpus else "gloo")
     try:
         device = torch.device("cuda", local) if gpus else ALONE.device

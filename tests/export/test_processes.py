@@ -42,7 +42,8 @@ from edgepose_export.networks import NetworkShape
 from edgepose_export.processes import joined
 
 torch.set_num_threads(1)
-with joined() as processes:
+
+def compare(processes):
     assert processes.size == 2
     torch.manual_seed(0)
     network, x = new_network(NetworkShape("rnn", 8)), torch.randn(4, 5, 60)
@@ -59,6 +60,22 @@ with joined() as processes:
     assert total.tolist() == [3.0, 1.0], total
     assert processes.everywhere(f"process {processes.rank}") == ["process 0", "process 1"]
     (Path(sys.argv[1]) / f"done-{processes.rank}").write_text("yes")
+
+with joined() as processes:
+    compare(processes)
+"""
+TRAIN = """
+import sys
+from edgepose.cli import cli
+
+cli.main(sys.argv[1:], standalone_mode=False)
+"""
+# A thread of gloo's that is busy while Python ends aborts the process.
+NO_THREADS = """
+from pathlib import Path
+
+threads = [path.read_text().strip() for path in Path("/proc/self/task").glob("*/comm")]
+assert threads and not [name for name in threads if "gloo" in name], threads
 """
 
 
@@ -72,7 +89,7 @@ def together(*words):
 
 
 def test_gradients_are_those_of_the_whole_batch(tmp_path):
-    (tmp_path / "program.py").write_text(PROGRAM)
+    (tmp_path / "program.py").write_text(PROGRAM + NO_THREADS)
     done = together(tmp_path / "program.py", tmp_path)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "done-0").exists()
@@ -90,14 +107,14 @@ def run(tmp_path_factory):
     for i, name in enumerate(("01_01", "01_02", "05_01", "03_01")):
         rows = {key: value[: 119 - 10 * i] if value.ndim else value for key, value in arrays.items()}
         np.savez(folder / "recordings" / f"{name}.npz", **rows)
-    done = together(*words(folder), "--out", folder / "run", "--cache", folder / "cache")
+    done = together("-m", "edgepose", *words(folder), "--out", folder / "run", "--cache", folder / "cache")
     assert done.returncode == 0, done.stderr
     return folder, done.stderr
 
 
 def words(folder):
     return (
-        *("-m", "edgepose", "train", "--config", folder / "tiny.toml", "--threads", 1),
+        *("train", "--config", folder / "tiny.toml", "--threads", 1),
         *("--data", folder / "recordings"),
     )
 
@@ -126,12 +143,20 @@ def test_one_run_of_two_processes(run):
     assert not torch.equal(*state["generator"])
 
 
+def test_trained_process_leaves_no_threads(run, tmp_path):
+    folder, _ = run
+    (tmp_path / "program.py").write_text(TRAIN + NO_THREADS)
+    done = together(tmp_path / "program.py", *words(folder), "--out", tmp_path / "run", "--steps", 1)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "run" / "checkpoint.pt").exists()
+
+
 def test_resumed_run_of_two_processes_is_the_uninterrupted_one(run, tmp_path):
     folder, _ = run
     half = tmp_path / "half"
-    done = together(*words(folder), "--out", half, "--steps", 2)
+    done = together("-m", "edgepose", *words(folder), "--out", half, "--steps", 2)
     assert done.returncode == 0, done.stderr
-    done = together(*words(folder), "--out", half, "--resume")
+    done = together("-m", "edgepose", *words(folder), "--out", half, "--resume")
     assert done.returncode == 0, done.stderr
     assert "going on at step 2" in done.stderr
     whole, resumed = (read_checkpoint(path / "checkpoint.pt") for path in (folder / "run", half))
@@ -144,7 +169,7 @@ def test_resumed_run_of_two_processes_is_the_uninterrupted_one(run, tmp_path):
 def test_another_number_of_processes_goes_on_too(run, tmp_path):
     folder, _ = run
     shutil.copytree(folder / "run", tmp_path / "run")
-    arguments = [*words(folder)[2:], "--out", tmp_path / "run", "--resume", "--steps", 6]
+    arguments = [*words(folder), "--out", tmp_path / "run", "--resume", "--steps", 6]
     done = CliRunner().invoke(cli, list(map(str, arguments)), catch_exceptions=False)
     assert done.exit_code == 0, done.output
     state = read_checkpoint(tmp_path / "run" / "checkpoint.pt")

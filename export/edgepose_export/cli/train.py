@@ -86,7 +86,6 @@ def train(
     import torch
 
     from edgepose_export import training
-    from edgepose_export.dataset import training_paths
     from edgepose_export.processes import joined
 
     settings = training.read_config(_config_path(config))
@@ -99,21 +98,30 @@ def train(
         )
     torch.set_num_threads(threads)
     with joined() as processes:
-        parts = [
-            _tape(processes.share(paths), processes, cache and cache / part)
-            for part, paths in zip(("train", "validation"), training_paths(data), strict=True)
-        ]
-        about = training.describe_tape(parts[0], processes)
-        trainer = training.Trainer(settings, *parts, about, processes)
-        say = click.echo if processes.rank == 0 else lambda *_, **__: None
-        say(f"training on {about['takes']} takes, {about['hours']:.2f} h: {about['summary']}", err=True)
-        out.mkdir(parents=True, exist_ok=True)
-        if resume:
-            trainer.load(training.read_checkpoint(checkpoint))
-            say(f"going on at step {trainer.step}", err=True)
-        if init:
-            trainer.start_from(training.read_checkpoint(init))
-        _fit(trainer, out, say)
+        _train(settings, data, out, processes, resume, init, cache)
+
+
+def _train(  # type: ignore[no-untyped-def]
+    settings, data: Path, out: Path, processes, resume: bool, init: Path | None, cache: Path | None
+) -> None:
+    from edgepose_export import training
+    from edgepose_export.dataset import training_paths
+
+    parts = [
+        _tape(processes.share(paths), processes, cache and cache / part)
+        for part, paths in zip(("train", "validation"), training_paths(data), strict=True)
+    ]
+    about = training.describe_tape(parts[0], processes)
+    trainer = training.Trainer(settings, *parts, about, processes)
+    say = click.echo if processes.rank == 0 else lambda *_, **__: None
+    say(f"training on {about['takes']} takes, {about['hours']:.2f} h: {about['summary']}", err=True)
+    out.mkdir(parents=True, exist_ok=True)
+    if resume:
+        trainer.load(training.read_checkpoint(out / training.CHECKPOINT))
+        say(f"going on at step {trainer.step}", err=True)
+    if init:
+        trainer.start_from(training.read_checkpoint(init))
+    _fit(trainer, out, say)
 
 
 def _tape(paths: list[Path], processes, cache: Path | None):  # type: ignore[no-untyped-def]
