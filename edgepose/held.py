@@ -1,8 +1,9 @@
 """Bones whose sensors are silent: they go on with the rest of the body.
 
 A bone that kept its orientation in the room would turn against a wearer who turns. So it keeps the attitude
-in which it last stood to the pelvis, and a silent pelvis turns with the lower legs, whose turns add up to its
-own. What that is worth: `tools/bench_robustness.py`.
+in which it last stood to the pelvis; a lower leg, which does not lean when the wearer bends, only follows the
+pelvis' heading. A silent pelvis turns with the lower legs, whose turns add up to its own. What that is worth:
+`tools/bench_robustness.py`.
 """
 
 from __future__ import annotations
@@ -40,8 +41,10 @@ def carried(
         turns = matrix_to_rotvec(orientation[legs] @ transpose(before[legs]))[:, 1]
         orientation[ROOT] = about_axis("y", turns.mean() if legs.any() else 0.0) @ before[ROOT]
         acceleration[ROOT] = 0.0
-    others = held.copy()
-    others[ROOT] = False
-    orientation[others] = orientation[ROOT] @ before[ROOT].T @ before[others]
+    turn = orientation[ROOT] @ before[ROOT].T
+    others = held & (np.arange(len(held)) != ROOT)
+    legs = others & _LOWER_LEGS
+    orientation[others] = turn @ before[others]
+    orientation[legs] = about_axis("y", matrix_to_rotvec(turn)[1]) @ before[legs]
     acceleration[others] = acceleration[ROOT]
     return orientation, acceleration

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from edgepose.placements import PLACEMENTS, ROOT
 from edgepose.skeleton import JOINTS
@@ -39,6 +39,7 @@ class Augmentation(NamedTuple):
         pelvis_pitch_deg: deviation of a turn of the pelvis about its own X axis, of bone and sensor alike: as
             if another actor's skeleton, in whom the trunk leans otherwise against the pelvis, did the same.
             `Trainer` leaves sequences with made sitting alone, which the pelvis' pitch tells from standing.
+        silent: share of sequences in which one sensor is silent for a while.
     """
 
     mirror: float = 0.5
@@ -48,6 +49,7 @@ class Augmentation(NamedTuple):
     acceleration_scale: float = 0.0
     aligned: float = 0.0
     pelvis_pitch_deg: float = 0.0
+    silent: float = 0.0
 
 
 def mirror(orientation: Tensor, acceleration: Tensor, relative: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -69,6 +71,50 @@ def small_rotations(vectors: Tensor) -> Tensor:
     x, y, z = vectors.unbind(-1)
     skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
     return torch.linalg.matrix_exp(skew)
+
+
+def silenced(
+    orientation: Tensor, acceleration: Tensor, sensor: int, first: Tensor, end: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Sequences (B, T, 6, 3, 3), (B, T, 6, 3) with a silent sensor, whose bone `edgepose.held` moves on.
+
+    Args:
+        orientation: in T.
+        acceleration: in T.
+        sensor: which one, for all sequences.
+        first: (B,) first silent frame, 1 or later.
+        end: (B,) first frame that is measured again.
+    """
+    frame = torch.arange(orientation.shape[1])
+    gone = ((frame >= first[:, None]) & (frame < end[:, None]))[..., None]
+    before = first[:, None] - 1
+    sequence = torch.arange(len(orientation))[:, None]
+    lower_legs = [i for i, name in enumerate(PLACEMENTS) if name.endswith("lower_leg")]
+    if sensor == ROOT or sensor in lower_legs:
+        leading = lower_legs if sensor == ROOT else [ROOT]
+        angle = _turned(orientation[:, :, leading]).mean(-1).cumsum(1)
+        about = torch.zeros(*angle.shape, 3)
+        about[..., 1] = angle - angle[sequence, before]
+        turn = small_rotations(about)
+    else:
+        root = orientation[:, :, ROOT]
+        turn = root @ root[sequence, before].mT
+    orientation, acceleration = orientation.clone(), acceleration.clone()
+    going = turn @ orientation[sequence, before, sensor]
+    orientation[:, :, sensor] = torch.where(gone[..., None], going, orientation[:, :, sensor])
+    rest = 0.0 if sensor == ROOT else acceleration[:, :, ROOT]
+    acceleration[:, :, sensor] = torch.where(gone, rest, acceleration[:, :, sensor])
+    return orientation, acceleration
+
+
+def _turned(orientation: Tensor) -> Tensor:
+    """Rotation since the frame before, its vector's part about Y, radians; (B, T, N) of (B, T, N, 3, 3)."""
+    step = orientation[:, 1:] @ orientation[:, :-1].mT
+    axis = torch.stack([step[..., i, j] - step[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], dim=-1) / 2
+    sine = axis.norm(dim=-1)
+    angle = torch.atan2(sine, (step.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2)
+    about = axis[..., 1] * torch.where(sine > 1e-6, angle / sine.clamp(min=1e-6), 1.0)
+    return nn.functional.pad(about, (0, 0, 1, 0))
 
 
 def augment(
@@ -112,4 +158,18 @@ def augment(
         acceleration = acceleration * (1.0 + how.acceleration_scale * normal(size, 1, 6, 1))
     if how.acceleration_noise:
         acceleration = acceleration + how.acceleration_noise * normal(*acceleration.shape)
+    if how.silent:
+        orientation, acceleration = orientation.clone(), acceleration.clone()
+        frames = orientation.shape[1]
+        # Some are silent before the sequence begins or longer than it lasts.
+        first, end = (
+            (frames * (2.0 * torch.rand(size, 2, generator=generator) - 0.5)).long().sort().values.unbind(1)
+        )
+        which = torch.randint(len(PLACEMENTS), (size,), generator=generator)
+        which[torch.rand(size, generator=generator) >= how.silent] = -1
+        for sensor in range(len(PLACEMENTS)):
+            its = which == sensor
+            orientation[its], acceleration[its] = silenced(
+                orientation[its], acceleration[its], sensor, first[its].clamp(1, frames), end[its]
+            )
     return orientation, acceleration, relative

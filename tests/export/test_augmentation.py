@@ -6,7 +6,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from edgepose.features import network_input
-from edgepose.placements import PLACEMENTS
+from edgepose.held import carried
+from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import JOINTS, default_body
 from edgepose_export.augmentation import (
     JOINT_MIRROR,
@@ -14,6 +15,7 @@ from edgepose_export.augmentation import (
     Augmentation,
     augment,
     mirror,
+    silenced,
     small_rotations,
 )
 from edgepose_export.dataset import read_take, root_relative_pose
@@ -169,9 +171,43 @@ def test_nothing_asked_nothing_done_and_the_input_is_never_written():
     data = batch(20)
     kept = [x.clone() for x in data]
     assert all(a is b for a, b in zip(augment(data, Augmentation(mirror=0), generator()), data, strict=True))
-    everything = Augmentation(0.5, 4.0, 3.0, 0.1, 0.02, pelvis_pitch_deg=5.0)
+    everything = Augmentation(0.5, 4.0, 3.0, 0.1, 0.02, pelvis_pitch_deg=5.0, silent=0.5)
     first, again = (augment(data, everything, generator(3)) for _ in range(2))
     for a, b, original, copy in zip(first, again, data, kept, strict=True):
         assert torch.equal(a, b)
         assert torch.equal(original, copy)
     assert torch.isfinite(network_input(*first[:2])).all()
+
+
+def test_silent_sensors_are_those_of_a_run():
+    motion = resample(read_motion(WALK))
+    random = np.random.default_rng(2)
+    lean = Rotation.from_rotvec(random.normal(scale=0.5, size=(2, 3))).as_matrix()[:, None, None]
+    orientation = torch.tensor(lean @ motion.rotations[:100, BONES]).float()
+    acceleration = torch.tensor(random.normal(size=(2, 100, 6, 3))).float()
+    first, end = torch.tensor([1, 30]), torch.tensor([60, 400])
+    for sensor in range(len(PLACEMENTS)):
+        got = silenced(orientation, acceleration, sensor, first, end)
+        for i in range(2):
+            before, expected = None, []
+            for t in range(100):
+                held = (np.arange(6) == sensor) & bool(first[i] <= t < end[i])
+                frame = carried(orientation[i, t].double().numpy(), acceleration[i, t].numpy(), held, before)
+                before = frame[0]
+                expected.append(frame)
+            for a, b in zip(got, zip(*expected, strict=True), strict=True):
+                np.testing.assert_allclose(a[i].numpy(), np.stack(b), atol=2e-4)
+        assert torch.equal(got[0][1, :30], orientation[1, :30])
+        assert torch.equal(got[0][0, 60:], orientation[0, 60:])
+
+
+def test_share_of_sequences_with_a_silent_sensor():
+    data = batch(frames=40)
+    orientation, acceleration, relative = augment(data, Augmentation(mirror=0, silent=0.5), generator())
+    changed = (acceleration != data[1]).any(-1)
+    one = changed.any(1)
+    assert 0.35 < one.any(1).float().mean() < 0.5  # of some the silence ends before the sequence begins
+    assert (one.sum(1) <= 1).all()
+    assert (one.float().mean(0) > 0.04).all()
+    assert torch.equal((orientation != data[0]).any(-1).any(-1) | changed, changed)
+    assert relative is data[2]
