@@ -16,14 +16,14 @@ from edgepose_export import training
 from edgepose_export.archive import Statistics
 from edgepose_export.augmentation import Augmentation, augment
 from edgepose_export.cli.synthesize import LICENSES
+from edgepose_export.config import TrainConfig, config_from
 from edgepose_export.dataset import read_take, tape, training_paths
 from edgepose_export.mocap import read_motion, resample
 from edgepose_export.networks import NetworkShape, PoseDecoder
 from edgepose_export.synthesis import recording_arrays, virtual_imus
-from edgepose_export.training import TrainConfig, Trainer, config_from, read_checkpoint, save_checkpoint
+from edgepose_export.training import Trainer, read_checkpoint, save_checkpoint
 
 DATA = Path(__file__).parents[1] / "data" / "mocap"
-CONFIGS = Path(training.__file__).parent / "configs"
 SMALL = TrainConfig(
     network=NetworkShape("rnn", 8, "global-6d", "passed"),
     augmentation=Augmentation(0.5, 4.0, 3.0, 0.1, 0.02),
@@ -464,50 +464,6 @@ def test_files_that_are_no_checkpoints(takes, tmp_path):
     assert Statistics(**good["statistics"]).input_mean.shape == (60,)
 
 
-# --- configs ------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.toml")), ids=lambda p: p.stem)
-def test_shipped_configs(path):
-    config = training.read_config(path)
-    assert config_from(training.config_values(config)) == config
-    assert config_from(json.loads(json.dumps(training.config_values(config)))) == config
-
-
-def test_paper_configs_are_the_papers():
-    for kind in ("birnn", "rnn"):
-        config = training.read_config(CONFIGS / f"dip-{kind}.toml")
-        assert config.network == NetworkShape(kind, 512, "local-matrix", "predicted")
-        assert (config.beta, config.input_dropout, config.learning_rate) == (0.0, 0.2, 1e-3)
-        assert (config.schedule, config.averaging, config.augmentation.mirror) == ("exponential", 0.0, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("name", "acceleration_loss", "dropout", "shape"),
-    [
-        ("dip-rnn-dropout", False, 0.2, NetworkShape("rnn")),
-        ("dip-rnn-acc", True, 0.0, NetworkShape("rnn")),
-        ("dip-birnn-dropout", False, 0.2, NetworkShape()),
-        ("dip-birnn-acc", True, 0.0, NetworkShape()),
-        ("dip-birnn-no-acc", False, 0.2, NetworkShape(acceleration=False)),
-        ("dip-birnn-heading", True, 0.2, NetworkShape(normalisation="heading")),
-        ("dip-birnn-sequence", True, 0.2, NetworkShape(normalisation="sequence")),
-        ("dip-feed-forward", True, 0.2, NetworkShape("feed-forward")),
-        ("dip-wavenet", True, 0.2, NetworkShape("wavenet", 128)),
-    ],
-)
-def test_rows_of_the_papers_tables_differ_in_what_they_say(name, acceleration_loss, dropout, shape):
-    whole, config = (training.read_config(CONFIGS / f"{n}.toml") for n in ("dip-birnn", name))
-    assert (config.acceleration_loss, config.input_dropout, config.network) == (
-        acceleration_loss,
-        dropout,
-        shape,
-    )
-    same = {"acceleration_loss": True, "input_dropout": 0.2, "network": whole.network}
-    assert replace(config, **same) == whole
-    assert (whole.warm_up, whole.patience, whole.steps) == (0, 10, 100_000)
-
-
 @pytest.mark.parametrize(
     ("kind", "normalisation", "acceleration", "inputs"),
     [
@@ -561,67 +517,3 @@ def test_warm_up_and_decay(takes):
     slow = trainer(takes, replace(SMALL, warm_up=9, learning_rate=1e-3))
     slow.train_step()
     assert slow.optimiser.param_groups[0]["lr"] == pytest.approx(1e-4)
-
-
-def test_config_that_differs_from_another(tmp_path):
-    (tmp_path / "whole.toml").write_text("steps = 7\nseed = 3\n[network]\nhidden = 8\nkind = 'rnn'\n")
-    (tmp_path / "other.toml").write_text("base = 'whole'\nsteps = 9\n[network]\nhidden = 16\n")
-    config = training.read_config(tmp_path / "other.toml")
-    assert (config.steps, config.seed, config.network) == (9, 3, NetworkShape("rnn", 16))
-    (tmp_path / "other.toml").write_text("base = 3\n")
-    with pytest.raises(EdgeposeError, match=r"other\.toml: base is 3; it takes the name of a config"):
-        training.read_config(tmp_path / "other.toml")
-    (tmp_path / "other.toml").write_text("base = 'nosuch'\n")
-    with pytest.raises(EdgeposeError, match=r"nosuch\.toml: No such file"):
-        training.read_config(tmp_path / "other.toml")
-    (tmp_path / "other.toml").write_text("base = 'other'\n")
-    with pytest.raises(EdgeposeError, match=r"other\.toml: unknown field 'base'"):
-        training.read_config(tmp_path / "other.toml")
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("steps = 'many'", "steps is 'many'; it takes a whole number"),
-        ("steps = 1.5", "steps is 1.5; it takes a whole number"),
-        ("steps = true", "steps is True; it takes a whole number"),
-        ("steps = 0", "steps is 0; it takes 1 to"),
-        ("joined = 1", "joined is 1; it takes true or false"),
-        ("learning_rate = -1", "learning_rate is -1; it takes"),
-        ("learning_rate = nan", "learning_rate is nan; it takes"),
-        ("input_dropout = 1.0", "input_dropout is 1.0; it takes 0 to 0.99"),
-        ("schedule = 'linear'", "schedule is 'linear'; it takes 'exponential' or 'cosine'"),
-        ("schedule = []", "schedule is []; it takes a text"),
-        ("speed = 1", "unknown field 'speed'"),
-        ('streamed = 5\n[network]\nkind = "rnn"', "can be trained as streamed"),
-        ("window = 5\nstreamed = 5", "streamed is 5; it takes fewer frames"),
-        ("network = 3", r"network is 3; it takes a table [network]"),
-        ("[network]\nkind = 'gru'", "kind is 'gru'; it takes 'birnn' or 'rnn'"),
-        ("[network]\nhidden = 0", "hidden is 0; it takes 1 to"),
-        ("[network]\nlayers = 3", r"unknown field 'layers' in [network]"),
-        ("[network]\nsmoothing = 1.0", "smoothing is 1.0; it takes 0 to 0.99"),
-        ("[network]\nkind = 'wavenet'\nsmoothing = 0.5", "smoothing is for kind"),
-        ("[network]\nmeasured = 'passed'", 'measured = "passed" needs targets = "global-6d"'),
-        ("[network]\nacceleration = false", "cannot give them back: acceleration_loss = false"),
-        ("[network]\nnormalisation = 'none'", "normalisation is 'none'; it takes 'root' or"),
-        ("[augmentation]\nmirror = 2", "mirror is 2; it takes 0 to 1"),
-        ("[augmentation]\nheading_deg = inf", "heading_deg is inf; it takes"),
-        ("[augmentation\n", "line 1"),
-    ],
-)
-def test_bad_configs_name_the_field(tmp_path, text, message):
-    path = tmp_path / "own.toml"
-    path.write_text(text)
-    with pytest.raises(EdgeposeError) as caught:
-        training.read_config(path)
-    assert str(path) in str(caught.value)
-    assert message in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-def test_config_that_cannot_be_read(tmp_path):
-    with pytest.raises(EdgeposeError, match="nosuch: No such file"):
-        training.read_config(Path("nosuch"))
-    (tmp_path / "x.toml").write_bytes(b"\xff\xfe")
-    with pytest.raises(EdgeposeError, match=r"x\.toml"):
-        training.read_config(tmp_path / "x.toml")

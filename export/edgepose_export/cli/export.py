@@ -82,13 +82,14 @@ def export(
     from edgepose.precision import pack_weights
     from edgepose_export import archive, training
     from edgepose_export.card import card
+    from edgepose_export.config import config_from
 
     others = {}
     if beside:
         info = inspect(find(beside))
         others = {f"`{beside}`": (load(info), info.metadata)}
     state = training.read_checkpoint(checkpoint)
-    config = training.config_from(json.loads(state["config"]))
+    config = config_from(json.loads(state["config"]))
     network = archive.new_network(config.network)
     network.load_state_dict(state["averaged"])
     statistics = archive.Statistics(**state["statistics"])

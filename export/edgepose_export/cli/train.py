@@ -86,9 +86,10 @@ def train(
     import torch
 
     from edgepose_export import training
+    from edgepose_export.config import read_config
     from edgepose_export.processes import joined
 
-    settings = training.read_config(_config_path(config))
+    settings = read_config(_config_path(config))
     if steps:
         settings = replace(settings, steps=steps)
     checkpoint = out / training.CHECKPOINT
