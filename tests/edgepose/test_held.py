@@ -37,6 +37,20 @@ def test_a_silent_bone_turns_with_the_pelvis(walk):
     np.testing.assert_array_equal(measured, given)  # the frames themselves are not changed
 
 
+def test_a_silent_lower_leg_stays_upright_when_the_wearer_bends(walk):
+    _, acceleration = walk
+    bend = rot.about_axis("x", np.interp(np.arange(30), [10, 20], [0.0, 1.5]))
+    turn = rot.about_axis("y", np.interp(np.arange(30), [20, 29], [0.0, 2.0]))
+    measured = np.repeat((turn @ bend)[:, None], 6, axis=1)
+    leg, arm = PLACEMENTS.index("right_lower_leg"), PLACEMENTS.index("right_forearm")
+    held = np.zeros((30, 6), bool)
+    held[5:, [leg, arm]] = True
+    measured[5:, [leg, arm]] = np.eye(3)
+    orientation, _ = through(measured, acceleration, held)
+    np.testing.assert_allclose(orientation[:, leg], turn, atol=1e-12)
+    np.testing.assert_allclose(orientation[:, arm], turn @ bend, atol=1e-12)
+
+
 def test_what_measures_again_counts_at_once(walk):
     true, acceleration = walk
     held = np.zeros((30, 6), bool)
