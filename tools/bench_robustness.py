@@ -148,10 +148,15 @@ def table(title: str, pairs: dict[str, list[tuple[Array, Array]]]) -> None:
     click.echo(f"\n{title}\n")
     click.echo("| fault | 15 joints, deg | without it | costs | SIP, deg | without it | costs | frames |")
     click.echo("|---|---|---|---|---|---|---|---|")
+    lost_costs = []
     for name, rows in pairs.items():
         before, after = (np.concatenate(side).mean(axis=0) for side in zip(*rows, strict=True))
         cells = [f"{after[i]:.1f} | {before[i]:.1f} | {after[i] - before[i]:+.1f}" for i in range(2)]
         click.echo(f"| {name} | {cells[0]} | {cells[1]} | {sum(len(row) for row, _ in rows)} |")
+        if name.endswith(" lost"):
+            lost_costs.append(after - before)
+    mean = np.mean(lost_costs, axis=0)
+    click.echo(f"| mean of the lost sensors | | | {mean[0]:+.1f} | | | {mean[1]:+.1f} | |")
 
 
 if __name__ == "__main__":

@@ -139,6 +139,8 @@ def config_from(values: dict[str, Any]) -> TrainConfig:
         raise ValueError('only kind = "birnn" can be trained as streamed')
     if config.network.smoothing and config.network.kind not in ("birnn", "rnn"):
         raise ValueError('smoothing is for kind = "birnn" and "rnn"')
+    if config.network.smoothing and config.network.targets != "global-6d":
+        raise ValueError('smoothing needs targets = "global-6d"')
     if config.streamed >= config.window:
         raise ValueError(f"streamed is {config.streamed}; it takes fewer frames than the window has")
     return config

@@ -33,9 +33,11 @@ class NetworkShape(NamedTuple):
             sensor take its orientation; the network predicts the other 10). "passed" needs "global-6d".
         normalisation: of the inputs, one of `normalisation.SCHEMES`.
         acceleration: whether accelerations are inputs (without: DIP appendix D).
-        smoothing: of a recurrent network, both poles of a low-pass over its pose numbers, 0 (none) to 0.99:
-            each of two stages keeps this share of what it gave in the last frame. It is there in training
-            too, so that the network learns to make up for its delay.
+        smoothing: of a recurrent network, both poles of a low-pass over its rotations, 0 (none) to 0.99: each
+            of two stages keeps this share of what it gave in the last frame. It is there in training too, so
+            that the network learns to make up for its delay. It works on rotations as seen from T: seen from
+            the root, a bone at rest moves whenever the pelvis does, and smoothing would leave it the
+            pelvis' trembling. Needs "global-6d".
     """
 
     kind: str = "birnn"
@@ -102,11 +104,7 @@ class PoseNetwork(nn.Module):
             x, _ = self.lstm2(x)
         else:
             x = self._streamed(x, future)
-        mean, deviation = self.mean(x), nn.functional.softplus(self.deviation(x)) + SIGMA_FLOOR
-        if self.shape.smoothing:
-            pose, acceleration = mean.tensor_split([self.shape.pose_outputs], dim=-1)
-            mean = torch.cat([_smoothed(pose.float(), self.shape.smoothing), acceleration], dim=-1)
-        return mean, deviation
+        return self.mean(x), nn.functional.softplus(self.deviation(x)) + SIGMA_FLOOR
 
     def _streamed(self, x: Tensor, future: int) -> Tensor:
         """Outputs (B, T - future, 2 hidden) of the recurrent layers as `recurrent.BirnnArchive.stream` gives
@@ -121,17 +119,29 @@ class PoseNetwork(nn.Module):
         return torch.cat([forward2, backward2], dim=-1)
 
 
-def _smoothed(x: Tensor, smoothing: float) -> Tensor:
-    """Low-pass over the frames of (B, T, numbers): weighted means of each frame and all before it, as
-    `recurrent.Ends.smoothed` carries them on but for their scale.
+def smoothed(pose: Tensor, root: Tensor, smoothing: float) -> Tensor:
+    """Low-pass over the frames of "global-6d" numbers (B, T, 6 N) as seen from T: weighted means of each
+    frame and all before it, which `recurrent.Ends.smoothed` carries on but for their scale.
+
+    Args:
+        pose: numbers in the targets' own units.
+        root: (B, T, 3, 3) orientation of the pelvis sensor's bone.
+        smoothing: see `NetworkShape`.
     """
-    frame = torch.arange(x.shape[1], device=x.device, dtype=x.dtype)
+    frame = torch.arange(pose.shape[1], device=pose.device, dtype=pose.dtype)
     age = (frame[:, None] - frame).clamp_min(0.0)
     weights = ((age + 1.0) * smoothing**age).tril()  # what two equal poles answer to an impulse
     weights = weights * (weights > 1e-20)  # numbers that are smaller still make products slow
+    weights = weights / weights.sum(dim=1, keepdim=True)
     # The means in full precision: bfloat16 steps are as large as the trembling that is left.
-    with torch.autocast(x.device.type, enabled=False):
-        return (weights / weights.sum(dim=1, keepdim=True)) @ x
+    with torch.autocast(pose.device.type, enabled=False):
+        columns = turned(pose, root)
+        return turned(weights @ columns, root.transpose(-1, -2))
+
+
+def turned(pose: Tensor, rotation: Tensor) -> Tensor:
+    """Numbers (..., 3 N), N vectors, turned by rotations (..., 3, 3)."""
+    return torch.matmul(pose.unflatten(-1, (-1, 3)), rotation.transpose(-1, -2)).flatten(-2)
 
 
 def _ahead(x: Tensor, future: int) -> Tensor:

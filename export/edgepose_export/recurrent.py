@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from edgepose_export.networks import SIGMA_FLOOR, PoseDecoder, PoseNetwork
+from edgepose_export.networks import SIGMA_FLOOR, PoseDecoder, PoseNetwork, turned
 from edgepose_export.normalisation import network_inputs
 from edgepose_export.products import Product
 
@@ -130,32 +130,35 @@ class Ends(nn.Module):
         return torch.zeros(batch, 2, self.decoder.target_mean.shape[0])
 
     @torch.jit.export
-    def pose(self, orientation: Tensor, hidden: Tensor, lowpass: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Local rotations (B, N, 24, 3, 3) and deviations (B, N, 24) of the frames of `orientation` (B, N, 6,
-        3, 3), the last of those of the recurrent outputs (B, T, hidden); and the low-pass' new state.
+    def pose(
+        self, orientation: Tensor, hidden: Tensor, lowpass: Tensor, count: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Local rotations (B, count, 24, 3, 3) and deviations (B, count, 24) of the last of the frames (B, T,
+        6, 3, 3) whose recurrent outputs are (B, T, hidden); and the low-pass' new state.
         """
         pose, deviation = self.heads(hidden).chunk(2, dim=-1)
-        pose, lowpass = self.smoothed(pose, lowpass)
-        first = hidden.shape[1] - orientation.shape[1]
+        if self.smoothing > 0.0:
+            pose, lowpass = self.smoothed(pose, orientation[:, :, -1], lowpass)
+        first = hidden.shape[1] - count
         deviation = nn.functional.softplus(deviation[:, first:]) + self.floor
-        rotations = self.decoder.rotations(orientation, pose[:, first:])
+        rotations = self.decoder.rotations(orientation[:, first:], pose[:, first:])
         return rotations, self.decoder.deviations(deviation), lowpass
 
-    def smoothed(self, pose: Tensor, lowpass: Tensor) -> tuple[Tensor, Tensor]:
-        """Two-pole low-pass over the frames of (B, T, pose outputs), and its new state.
+    def smoothed(self, pose: Tensor, root: Tensor, lowpass: Tensor) -> tuple[Tensor, Tensor]:
+        """Two-pole low-pass over the frames of (B, T, pose outputs) seen from the root (B, T, 3, 3), and its
+        new state; as seen from T.
 
         It begins at zero and is not corrected for it: the first outputs are too small, but rotations are
         made from the numbers' directions alone.
         """
-        if self.smoothing == 0.0:
-            return pose, lowpass
         first, second = lowpass.unbind(1)
         outputs: list[Tensor] = []
-        for row in pose.unbind(1):
+        for row in turned(pose, root).unbind(1):
             first = torch.lerp(row, first, self.smoothing)
             second = torch.lerp(first, second, self.smoothing)
             outputs.append(second)
-        return torch.stack(outputs, dim=1), torch.stack([first, second], dim=1)
+        pose = turned(torch.stack(outputs, dim=1), root.transpose(-1, -2))
+        return pose, torch.stack([first, second], dim=1)
 
 
 class RnnArchive(nn.Module):
@@ -176,7 +179,7 @@ class RnnArchive(nn.Module):
         """Poses of the last frames of a sequence."""
         x = self.cell1.run(self.cell1.inputs[0](self.ends(orientation, acceleration)), False)
         x = self.cell2.run(self.cell2.inputs[0](x), False)
-        rotations, std, _ = self.ends.pose(orientation[:, -count:], x, self.ends.start(x.shape[0]))
+        rotations, std, _ = self.ends.pose(orientation, x, self.ends.start(x.shape[0]), count)
         return rotations, std
 
     @torch.jit.export
@@ -214,7 +217,7 @@ class RnnArchive(nn.Module):
         x = self.ends(orientation, acceleration)
         x, h1, c1 = self.cell1.carry(self.cell1.inputs[0](x), state[0], state[1])
         x, h2, c2 = self.cell2.carry(self.cell2.inputs[0](x), state[2], state[3])
-        rotations, std, lowpass = self.ends.pose(orientation, x, state[4])
+        rotations, std, lowpass = self.ends.pose(orientation, x, state[4], x.shape[1])
         return rotations, std, [h1, c1, h2, c2, lowpass]
 
     @torch.jit.export
@@ -261,8 +264,9 @@ class BirnnArchive(nn.Module):
     def forward(self, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
         """Poses of a whole sequence."""
         ahead, back = self.layer1(orientation, acceleration)
-        hidden = self.layer2(ahead, back, 0, orientation.shape[1])
-        rotations, std, _ = self.ends.pose(orientation, hidden, self.ends.start(hidden.shape[0]))
+        frames = orientation.shape[1]
+        hidden = self.layer2(ahead, back, 0, frames)
+        rotations, std, _ = self.ends.pose(orientation, hidden, self.ends.start(hidden.shape[0]), frames)
         return rotations, std
 
     def layer2(self, ahead: Tensor, back: Tensor, first: int, end: int) -> Tensor:
@@ -288,9 +292,10 @@ class BirnnArchive(nn.Module):
         The second layer runs only over the frames that reach `index`: with smoothing, all of them do.
         """
         ahead, back = self.layer1(orientation, acceleration)
-        hidden = self.layer2(ahead, back, 0 if self.ends.smoothing > 0.0 else index, index + 1)
-        last = orientation[:, index : index + 1]
-        rotations, std, _ = self.ends.pose(last, hidden, self.ends.start(hidden.shape[0]))
+        first = 0 if self.ends.smoothing > 0.0 else index
+        hidden = self.layer2(ahead, back, first, index + 1)
+        seen = orientation[:, first : index + 1]
+        rotations, std, _ = self.ends.pose(seen, hidden, self.ends.start(hidden.shape[0]), 1)
         return rotations[:, 0], std[:, 0]
 
     @torch.jit.export
@@ -320,7 +325,7 @@ class BirnnArchive(nn.Module):
         past, h2, c2 = self.forward2.carry(known, state[2], state[3])
         later = self.backward2.run(_fields(state[6], count, future) + self.backward2.inputs[1](back), True)
         hidden = torch.cat([past, later[:, 0].unflatten(0, (batch, count))], dim=-1)
-        rotations, std, lowpass = self.ends.pose(state[7][:, :count], hidden, state[8])
+        rotations, std, lowpass = self.ends.pose(state[7][:, :count], hidden, state[8], count)
         waiting = [state[4][:, count:], state[5][:, count:], state[6][:, count:], state[7][:, count:]]
         return rotations, std, [state[0], state[1], h2, c2] + waiting + [lowpass, state[9]]  # noqa: RUF005
 

@@ -16,12 +16,13 @@ from torch import Tensor, nn
 
 from edgepose.errors import EdgeposeError
 from edgepose.features import ACCELERATIONS, rotation_to_6d
+from edgepose.placements import ROOT
 from edgepose.skeleton import PARENTS
 from edgepose_export.archive import Statistics, new_network
 from edgepose_export.augmentation import augment
 from edgepose_export.config import TrainConfig, config_from, config_values
 from edgepose_export.dataset import Tape, describe
-from edgepose_export.networks import NetworkShape
+from edgepose_export.networks import NetworkShape, smoothed
 from edgepose_export.normalisation import network_inputs, seen_from_first
 from edgepose_export.processes import ALONE, Processes
 
@@ -237,6 +238,10 @@ class Trainer:
         target = target[:, : mean.shape[1]]  # as a stream, the network leaves out frames without a future
         numbers, pose = target.shape[-1], config.network.pose_outputs
         mean = mean[..., :numbers].float()
+        if config.network.smoothing:
+            root = orientation[:, : mean.shape[1], ROOT]
+            smooth = smoothed(mean[..., :pose] * s.target_std + s.target_mean, root, config.network.smoothing)
+            mean = torch.cat([(smooth - s.target_mean) / s.target_std, mean[..., pose:]], dim=-1)
         loss = likelihood_loss(mean, deviation[..., :numbers].float(), target, config.beta)
         if smoothness:
             loss = loss + smoothness * tremble_loss(mean[..., :pose], target[..., :pose])

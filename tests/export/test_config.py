@@ -91,6 +91,7 @@ def test_config_that_differs_from_another(tmp_path):
         ("[network]\nlayers = 3", r"unknown field 'layers' in [network]"),
         ("[network]\nsmoothing = 1.0", "smoothing is 1.0; it takes 0 to 0.99"),
         ("[network]\nkind = 'wavenet'\nsmoothing = 0.5", "smoothing is for kind"),
+        ("[network]\nsmoothing = 0.5", 'smoothing needs targets = "global-6d"'),
         ("[network]\nmeasured = 'passed'", 'measured = "passed" needs targets = "global-6d"'),
         ("[network]\nacceleration = false", "cannot give them back: acceleration_loss = false"),
         ("[network]\nnormalisation = 'none'", "normalisation is 'none'; it takes 'root' or"),

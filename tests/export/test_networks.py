@@ -6,13 +6,14 @@ import zipfile
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from torch import nn
 
-from edgepose.features import network_input
+from edgepose.features import network_input, rotation_to_6d
 from edgepose.placements import BONES
 from edgepose.skeleton import PREDICTED, UNOBSERVED, forward_kinematics
 from edgepose_export.archive import build
-from edgepose_export.networks import NetworkShape, PoseDecoder
+from edgepose_export.networks import NetworkShape, PoseDecoder, smoothed
 
 BIRNN = NetworkShape("birnn", 8, "global-6d", "passed")
 RNN = BIRNN._replace(kind="rnn")
@@ -26,9 +27,14 @@ def close(a, b, atol=2e-5):
 
 def run_offline(network, statistics, orientation, acceleration, *future):
     """What training computes, through torch.nn.LSTM, and the decoder."""
+    shape, decoder = network.shape, PoseDecoder(network.shape, *statistics[2:])
     x = (network_input(orientation, acceleration) - statistics.input_mean) / statistics.input_std
-    mean, deviation = network(x, *future)
-    return PoseDecoder(network.shape, *statistics[2:])(orientation[:, : mean.shape[1]], mean, deviation)
+    mean, deviation = (numbers[..., : shape.pose_outputs] for numbers in network(x, *future))
+    orientation = orientation[:, : mean.shape[1]]
+    pose = mean * statistics.target_std + statistics.target_mean
+    if shape.smoothing:
+        pose = smoothed(pose, orientation[:, :, -1], shape.smoothing)
+    return decoder.rotations(orientation, pose), decoder.deviations(deviation)
 
 
 def test_archive_computes_what_training_computed(shape, parts, tiny, wearers):
@@ -151,22 +157,28 @@ def latency_controlled(network, statistics, orientation, acceleration, future):
         backward2 = b2(layer1.flip(1))[0].flip(1)[:, :1]
         outputs.append(torch.cat([forward2, backward2], dim=-1))
     hidden = torch.cat(outputs, dim=1)
+    size = network.shape.pose_outputs
     deviation = nn.functional.softplus(network.deviation(hidden)) + 0.02
-    mean = low_pass(network.mean(hidden), network.shape.smoothing)
-    return PoseDecoder(network.shape, *statistics[2:])(orientation, mean, deviation)
+    pose = network.mean(hidden)[..., :size] * statistics.target_std + statistics.target_mean
+    if network.shape.smoothing:
+        pose = low_pass(pose, orientation[:, :, -1], network.shape.smoothing)
+    decoder = PoseDecoder(network.shape, *statistics[2:])
+    return decoder.rotations(orientation, pose), decoder.deviations(deviation[..., :size])
 
 
-def low_pass(numbers, smoothing):
-    """Definition: two stages, each a weighted mean of its input and its own last output; corrected for their
-    beginning at zero.
+def low_pass(pose, root, smoothing):
+    """Definition: columns of rotations, seen from T, through two stages, each a weighted mean of its input
+    and its own last output; corrected for their beginning at zero.
     """
-    numbers = torch.cat([numbers, torch.ones_like(numbers[..., :1])], dim=-1)  # the one tells the weight
-    first = second = torch.zeros_like(numbers[:, 0])
-    outputs = []
-    for t in range(numbers.shape[1]):
-        first = smoothing * first + (1 - smoothing) * numbers[:, t]
+    columns = torch.einsum("btij,btnj->btni", root, pose.unflatten(-1, (-1, 3)))
+    first = second = torch.zeros_like(columns[:, 0])
+    outputs, one, two = [], 0.0, 0.0  # the last two tell the weight
+    for t in range(pose.shape[1]):
+        first = smoothing * first + (1 - smoothing) * columns[:, t]
         second = smoothing * second + (1 - smoothing) * first
-        outputs.append(second[:, :-1] / second[:, -1:])
+        one = smoothing * one + (1 - smoothing)
+        two = smoothing * two + (1 - smoothing) * one
+        outputs.append(torch.einsum("bij,bni->bnj", root[:, t], second / two).flatten(1))
     return torch.stack(outputs, dim=1)
 
 
@@ -198,20 +210,19 @@ def test_a_stream_gives_what_streamed_training_computed(parts, tiny, wearers, fu
         close(a[:, : 14 - future], b)
 
 
-@pytest.mark.parametrize("kind", ["rnn", "birnn"])
-def test_smoothing_is_a_two_pole_low_pass_of_the_pose_numbers(parts, kind):
-    """Against its definition, frame by frame; the reconstructed accelerations are left as they are."""
-    shape = BIRNN._replace(kind=kind, smoothing=SMOOTH)
-    network, _ = parts(shape)
-    x = torch.randn(2, 20, 60, generator=torch.Generator().manual_seed(0))
-    with torch.no_grad():
-        mean, deviation = network(x)
-        network.shape = shape._replace(smoothing=0.0)
-        sharp, same = network(x)
-    size = shape.pose_outputs
-    close(mean[..., :size], low_pass(sharp[..., :size], SMOOTH))
-    close(mean[..., size:], sharp[..., size:], atol=0)
-    close(deviation, same, atol=0)
+def test_smoothing_is_a_two_pole_low_pass_of_rotations_seen_from_t(wearers):
+    """Against its definition, frame by frame."""
+    root = wearers(2, 20)[0][:, :, -1]
+    pose = torch.randn(2, 20, BIRNN.pose_outputs, generator=torch.Generator().manual_seed(0))
+    close(smoothed(pose, root, SMOOTH), low_pass(pose, root, SMOOTH))
+
+
+def test_smoothing_keeps_a_bone_at_rest_at_rest(wearers):
+    """However the pelvis turns under it."""
+    root = wearers(2, 20)[0][:, :, -1]
+    bone = torch.tensor(Rotation.random(10, random_state=1).as_matrix()).float()
+    pose = rotation_to_6d(root.mT.unsqueeze(2) @ bone).flatten(-2)
+    close(smoothed(pose, root, 0.9), pose)
 
 
 def test_wearers_of_a_batch_do_not_meet(shape, tiny, wearers):

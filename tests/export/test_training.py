@@ -11,6 +11,7 @@ import torch
 
 from edgepose.errors import EdgeposeError
 from edgepose.features import network_input
+from edgepose.placements import ROOT
 from edgepose.skeleton import PARENTS, PREDICTED, default_body
 from edgepose_export import training
 from edgepose_export.archive import Statistics
@@ -19,7 +20,7 @@ from edgepose_export.cli.synthesize import LICENSES
 from edgepose_export.config import TrainConfig, config_from
 from edgepose_export.dataset import read_take, tape, training_paths
 from edgepose_export.mocap import read_motion, resample
-from edgepose_export.networks import NetworkShape, PoseDecoder
+from edgepose_export.networks import NetworkShape, PoseDecoder, smoothed
 from edgepose_export.synthesis import recording_arrays, virtual_imus
 from edgepose_export.training import Trainer, read_checkpoint, save_checkpoint
 
@@ -505,6 +506,23 @@ def test_loss_without_accelerations_is_the_poses_alone(takes):
     targets = (training.pose_targets(batch[2], SMALL.network) - s.target_mean) / s.target_std
     torch.testing.assert_close(alone._loss(zero, batch, 0.0), 0.5 * targets.square().mean())
     assert both._loss(zero, batch, 0.0) != alone._loss(zero, batch, 0.0)
+
+
+def test_loss_is_of_what_the_low_pass_gives(takes):
+    shape = SMALL.network._replace(smoothing=0.5)
+    one = trainer(takes, replace(SMALL, network=shape, beta=0.0, acceleration_loss=False))
+
+    def zero(x):
+        nothing = torch.zeros(*x.shape[:-1], shape.pose_outputs + 15)
+        return nothing, nothing + 1
+
+    batch = training.windows(one.train_tape, torch.tensor([0]), 20)
+    s = one.statistics
+    steady = s.target_mean.expand(1, 20, -1)  # to the root, so it moves as the root does
+    smooth = smoothed(steady, batch[0][:, :, ROOT], 0.5)
+    assert (smooth - steady).abs().max() > 1e-3
+    errors = (training.pose_targets(batch[2], shape) - smooth) / s.target_std
+    torch.testing.assert_close(one._loss(zero, batch, 0.0), 0.5 * errors.square().mean())
 
 
 def test_warm_up_and_decay(takes):
