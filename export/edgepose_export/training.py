@@ -19,7 +19,7 @@ from edgepose.features import ACCELERATIONS, rotation_to_6d
 from edgepose.placements import ROOT
 from edgepose.skeleton import PARENTS
 from edgepose_export.archive import Statistics, new_network
-from edgepose_export.augmentation import augment
+from edgepose_export.augmentation import augment, small_rotations
 from edgepose_export.config import TrainConfig, config_from, config_values
 from edgepose_export.dataset import Tape, describe
 from edgepose_export.networks import NetworkShape, smoothed
@@ -146,9 +146,33 @@ def draw(starts: Starts, count: int, free_share: float, generator: torch.Generat
 
 
 def windows(tape: Tape, starts: Tensor, length: int) -> Batch:
-    """Orientations, accelerations and true rotations of windows, each (len(starts), length, ...)."""
+    """Orientations, accelerations and true rotations of windows, each (len(starts), length, ...).
+
+    Takes that follow each other in a window go on in the heading of the one before.
+    """
     index = starts[:, None] + torch.arange(length)
-    return tape.orientation[index], tape.acceleration[index], tape.relative[index]
+    orientation, acceleration = tape.orientation[index], tape.acceleration[index]
+    take = torch.searchsorted(tape.starts, index, right=True)
+    several = take[:, 0] != take[:, -1]
+    if several.any():
+        turn = _onward(orientation[several, :, ROOT], take[several]).unsqueeze(2)
+        orientation[several] = turn @ orientation[several]
+        acceleration[several] = (turn @ acceleration[several].unsqueeze(-1)).squeeze(-1)
+    return orientation, acceleration, tape.relative[index]
+
+
+def _onward(root: Tensor, take: Tensor) -> Tensor:
+    """Turns about Y (B, T, 3, 3) after which each take begins in the heading in which the one before ends.
+
+    Args:
+        root: (B, T, 3, 3) orientation of the pelvis.
+        take: (B, T) which take each frame is of.
+    """
+    heading = torch.atan2(root[..., 0, 2], root[..., 2, 2])
+    leap = torch.where(take.diff(dim=1) > 0, heading.diff(dim=1), 0.0)
+    about = torch.zeros(*heading.shape, 3)
+    about[:, 1:, 1] = -leap.cumsum(1)
+    return small_rotations(about)
 
 
 def describe_tape(tape: Tape, processes: Processes = ALONE) -> dict[str, Any]:
