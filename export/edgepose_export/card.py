@@ -43,7 +43,7 @@ def card(metadata: dict[str, Any]) -> str:
         f"- Targets: {metadata['targets']}; bones that carry a sensor are {metadata['measured_bones']}"
         f"{_smoothing(metadata)}.",
         f"- Trained on: {training['summary']}; {training['takes']} takes, {training['hours']:.2f} h, "
-        f"{training['steps']} steps.",
+        f"{training['steps']} steps{_mean(training)}.",
         "- Licences of that motion:",
         *(f"  - {text}" for text in training["licenses"]),
         "- Weights: for non-commercial use wherever a licence above says NC; edgepose's own code is MIT.",
@@ -110,7 +110,15 @@ def _table(rows: dict[str, dict[str, list[float]]]) -> list[str]:
 def _smoothing(metadata: dict[str, Any]) -> str:
     if not metadata["smoothing"]:
         return ""
-    return f"; a low-pass of two poles at {metadata['smoothing']:g} behind the network, learnt with it"
+    return (
+        f"; a low-pass of two poles at {metadata['smoothing']:g} behind the network, over rotations as seen "
+        "from the room"
+    )
+
+
+def _mean(training: dict[str, Any]) -> str:
+    count = training.get("checkpoints", 1)
+    return f"; the mean weights of {count} checkpoints, this one the first" if count > 1 else ""
 
 
 def _seated(metadata: dict[str, Any]) -> bool:

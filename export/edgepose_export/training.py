@@ -6,7 +6,7 @@ import io
 import json
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -389,7 +389,7 @@ class Trainer:
 
     def _check_shape(self, state: dict[str, Any], **other: Any) -> None:
         """The checkpoint's network is the config's, apart from `other` fields."""
-        shape = config_from(json.loads(state["config"])).network
+        shape = _shape_of(state)
         if shape._replace(**other) != self.config.network:
             raise EdgeposeError(f"the checkpoint holds {shape}, the config asks for {self.config.network}")
 
@@ -429,13 +429,39 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     if not isinstance(state, dict) or not set(_WEIGHTS_ONLY) <= set(state):
         raise EdgeposeError(f"{path}: not a checkpoint of edgepose train (entries are missing)")
     try:
-        network = new_network(config_from(json.loads(state["config"])).network)
+        network = new_network(_shape_of(state))
         network.load_state_dict(state["averaged"])
         Statistics(**state["statistics"])
     except (TypeError, ValueError, RuntimeError, AttributeError) as error:
         reason = str(error).splitlines()[0]
         raise EdgeposeError(f"{path}: not a checkpoint that this edgepose reads ({reason})") from error
     return state
+
+
+def mean_of(states: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+    """The first of some checkpoints by name, with the mean of their averaged weights (Wortsman et al. 2022).
+
+    Raises:
+        EdgeposeError: their networks or statistics differ, so that they did not begin from one another; only
+            `smoothing` may differ.
+    """
+    (name, first), *others = states.items()
+    shape = _shape_of(first)
+    for other, state in others:
+        numbers = zip(first["statistics"].values(), state["statistics"].values(), strict=True)
+        if _shape_of(state)._replace(smoothing=shape.smoothing) != shape or not all(
+            torch.equal(a, b) for a, b in numbers
+        ):
+            raise EdgeposeError(
+                f"{other}: not a network that began from {name} or the reverse: their weights have no mean"
+            )
+    weights = [state["averaged"] for state in states.values()]
+    mean = {key: torch.stack([one[key] for one in weights]).mean(dim=0) for key in weights[0]}
+    return first | {"averaged": mean}
+
+
+def _shape_of(state: dict[str, Any]) -> NetworkShape:
+    return config_from(json.loads(state["config"])).network
 
 
 _WEIGHTS_ONLY = ("config", "statistics", "averaged", "step", "data")

@@ -16,8 +16,10 @@ from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 from edgepose.recording import read_recording
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics
+from edgepose_export.archive import Statistics, new_network, script
+from edgepose_export.config import config_from
 from edgepose_export.dataset import read_take
-from edgepose_export.training import read_checkpoint
+from edgepose_export.training import mean_of, read_checkpoint
 
 DATA = Path(__file__).parents[1] / "data" / "mocap"
 WALK = DATA / "dataset-2_walk_normal_001.bvh"
@@ -313,6 +315,32 @@ def test_export_faults(made, tmp_path):
     assert CliRunner().invoke(cli, ["export", str(best), "--out", str(tmp_path / "x.md")]).exit_code == 2
     (tmp_path / "file").write_text("")
     assert "cannot be written" in fails("export", best, "--out", tmp_path / "file" / "x.pt")
+
+
+def test_mean_weights_of_checkpoints(made, tmp_path):
+    folder, _, train = made
+    first, tuned = folder / "run" / "best.pt", tmp_path / "tuned" / "checkpoint.pt"
+    edgepose(*train, "--out", tuned.parent, "--init", first, "--steps", 3)
+    edgepose("export", tuned, first, "--out", tmp_path / "mean.pt")
+    about = archive.inspect(tmp_path / "mean.pt").metadata
+    assert (about["training"]["checkpoints"], about["training"]["steps"]) == (2, 3)
+    card = (tmp_path / "mean.md").read_text(encoding="utf-8")
+    assert "3 steps; the mean weights of 2 checkpoints, this one the first." in card
+    states = [read_checkpoint(path) for path in (tuned, first)]
+    weights = mean_of({"tuned": states[0], "first": states[1]})["averaged"]
+    for name, mean in weights.items():
+        torch.testing.assert_close(mean, (states[0]["averaged"][name] + states[1]["averaged"][name]) / 2)
+    network = new_network(config_from(json.loads(states[0]["config"])).network)
+    network.load_state_dict(weights)
+    expected = script(network, Statistics(**states[0]["statistics"]))
+    still = torch.eye(3).expand(1, 9, 6, 3, 3), torch.zeros(1, 9, 6, 3)
+    module = archive.load(archive.inspect(tmp_path / "mean.pt"), trust=True)
+    for got, wanted in zip(module(*still), expected(*still), strict=True):
+        torch.testing.assert_close(got, wanted)
+    (tmp_path / "wide.toml").write_text(CONFIG.replace("hidden = 8", "hidden = 9"))
+    edgepose(*train, "--config", tmp_path / "wide.toml", "--out", tmp_path / "other", "--steps", 1)
+    refused = fails("export", first, tmp_path / "other" / "checkpoint.pt", "--out", tmp_path / "x.pt")
+    assert "other/checkpoint.pt: not a network that began from" in refused
 
 
 def test_errors_are_one_line(made, tmp_path):

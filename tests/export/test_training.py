@@ -518,8 +518,8 @@ def test_joined_takes_go_on_in_one_heading(takes):
     forward = torch.nn.functional.normalize(root[:, [0, 2], 2], dim=-1)
     for join in joins:
         torch.testing.assert_close(forward[join], forward[join - 1], rtol=0, atol=1e-4)
-        leap = (before[join] @ before[join - 1].mT).diagonal().sum()
-        assert leap < 2.99  # it was another heading
+    leaps = [(before[join] @ before[join - 1].mT).diagonal().sum() for join in joins]
+    assert min(leaps) < 2.97  # 10 deg: it was another heading
     # Each take is turned as one, about the vertical, and all that the network sees stays as it is.
     turn = root @ before.mT
     torch.testing.assert_close(turn[:, 1], torch.tensor([0.0, 1, 0]).expand(length, 3), rtol=0, atol=1e-5)

@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 
 
 @click.command(short_help="Make an archive of a trained network.")
-@click.argument("checkpoint", type=click.Path(path_type=Path))
+@click.argument(
+    "checkpoints", metavar="CHECKPOINT...", nargs=-1, required=True, type=click.Path(path_type=Path)
+)
 @click.option(
     "--out",
     required=True,
@@ -63,14 +65,24 @@ if TYPE_CHECKING:
     help="Shipped or trusted model whose figures stand beside in the card, with --measure.",
 )
 def export(
-    checkpoint: Path, out: Path, past: int, future: int, precision: str, data: Path | None, beside: str | None
+    checkpoints: tuple[Path, ...],
+    out: Path,
+    past: int,
+    future: int,
+    precision: str,
+    data: Path | None,
+    beside: str | None,
 ) -> None:
     """Turn a checkpoint of `edgepose train` into a TorchScript archive for `edgepose run --model FILE
     --trust`.
 
+    Of several checkpoints that were trained on from each other (`train --init`), the archive gets the mean
+    weights, which often do better on motion they have not seen than any of them; all else is the first's.
+
     \b
-    Example:
+    Examples:
       edgepose export runs/birnn/checkpoint.pt --out my-birnn.pt --measure recordings/
+      edgepose export runs/tuned/checkpoint.pt runs/birnn/checkpoint.pt --out my-birnn.pt
     """
     if out.suffix != ".pt":
         raise click.UsageError("--out is the name of a .pt file")
@@ -88,13 +100,14 @@ def export(
     if beside:
         info = inspect(find(beside))
         others = {f"`{beside}`": (load(info), info.metadata)}
-    state = training.read_checkpoint(checkpoint)
+    state = training.mean_of({str(path): training.read_checkpoint(path) for path in checkpoints})
     config = config_from(json.loads(state["config"]))
     network = archive.new_network(config.network)
     network.load_state_dict(state["averaged"])
     statistics = archive.Statistics(**state["statistics"])
     metadata = archive.describe(out.stem, network, state, past, future)
     metadata["precision"] = precision
+    metadata["training"]["checkpoints"] = len(checkpoints)
     scale = None
     if data:
         fitted = _std_scale(archive.script(network, statistics), metadata, data)
