@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.placements import PLACEMENTS, ROOT
-from edgepose.rotations import about_axis, matrix_to_rotvec, transpose
+from edgepose.rotations import about_axis, turn_about_y
 
 Array = NDArray[np.float64]
 
@@ -38,13 +38,19 @@ def carried(
     orientation, acceleration = orientation.copy(), acceleration.copy()
     if held[ROOT]:
         legs = _LOWER_LEGS & ~held
-        turns = matrix_to_rotvec(orientation[legs] @ transpose(before[legs]))[:, 1]
+        turns = _turns(before[legs], orientation[legs])
         orientation[ROOT] = about_axis("y", turns.mean() if legs.any() else 0.0) @ before[ROOT]
         acceleration[ROOT] = 0.0
     turn = orientation[ROOT] @ before[ROOT].T
     others = held & (np.arange(len(held)) != ROOT)
     legs = others & _LOWER_LEGS
     orientation[others] = turn @ before[others]
-    orientation[legs] = about_axis("y", matrix_to_rotvec(turn)[1]) @ before[legs]
+    orientation[legs] = about_axis("y", _turns(before[ROOT], orientation[ROOT])) @ before[legs]
     acceleration[others] = acceleration[ROOT]
     return orientation, acceleration
+
+
+def _turns(before: Array, now: Array) -> Array:
+    """How far headings of (..., 3, 3) turned, (...) from -pi to pi."""
+    turns: Array = (turn_about_y(now) - turn_about_y(before) + np.pi) % (2.0 * np.pi) - np.pi
+    return turns

@@ -99,6 +99,13 @@ def heading(q: ArrayLike) -> Array:
     return 2.0 * np.arctan2(q[..., 3], q[..., 0])
 
 
+def turn_about_y(r: ArrayLike) -> Array:
+    """Angle (...), radians, of the part of rotation matrices (..., 3, 3) that turns about Y, up in T."""
+    r = np.asarray(r, float)
+    angle: Array = np.arctan2(r[..., 0, 2] - r[..., 2, 0], r[..., 0, 0] + r[..., 2, 2])
+    return angle
+
+
 def about_z(angle: ArrayLike) -> Array:
     """Unit quaternions (..., 4) of turns about Z."""
     half = np.asarray(angle, float) / 2.0

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from edgepose.placements import PLACEMENTS, ROOT
 from edgepose.skeleton import JOINTS
+from edgepose_export.normalisation import turn_about_y
 
 
 def _swapped(names: tuple[str, ...]) -> list[int]:
@@ -39,7 +40,8 @@ class Augmentation(NamedTuple):
         pelvis_pitch_deg: deviation of a turn of the pelvis about its own X axis, of bone and sensor alike: as
             if another actor's skeleton, in whom the trunk leans otherwise against the pelvis, did the same.
             `Trainer` leaves sequences with made sitting alone, which the pelvis' pitch tells from standing.
-        silent: share of sequences in which one sensor is silent for a while.
+        silent: share of sequences in which one sensor is silent for a while, unless that ends before the
+            sequence begins or begins after it (an eighth of them).
     """
 
     mirror: float = 0.5
@@ -65,7 +67,7 @@ def mirror(orientation: Tensor, acceleration: Tensor, relative: Tensor) -> tuple
     )
 
 
-def small_rotations(vectors: Tensor) -> Tensor:
+def rotations_of(vectors: Tensor) -> Tensor:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), radians."""
     zero = torch.zeros_like(vectors[..., 0])
     x, y, z = vectors.unbind(-1)
@@ -92,10 +94,10 @@ def silenced(
     lower_legs = [i for i, name in enumerate(PLACEMENTS) if name.endswith("lower_leg")]
     if sensor == ROOT or sensor in lower_legs:
         leading = lower_legs if sensor == ROOT else [ROOT]
-        angle = _turned(orientation[:, :, leading]).mean(-1).cumsum(1)
+        angle = _turns(orientation[:, :, leading]).mean(-1)
         about = torch.zeros(*angle.shape, 3)
         about[..., 1] = angle - angle[sequence, before]
-        turn = small_rotations(about)
+        turn = rotations_of(about)
     else:
         root = orientation[:, :, ROOT]
         turn = root @ root[sequence, before].mT
@@ -107,14 +109,11 @@ def silenced(
     return orientation, acceleration
 
 
-def _turned(orientation: Tensor) -> Tensor:
-    """Rotation since the frame before, its vector's part about Y, radians; (B, T, N) of (B, T, N, 3, 3)."""
-    step = orientation[:, 1:] @ orientation[:, :-1].mT
-    axis = torch.stack([step[..., i, j] - step[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], dim=-1) / 2
-    sine = axis.norm(dim=-1)
-    angle = torch.atan2(sine, (step.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2)
-    about = axis[..., 1] * torch.where(sine > 1e-6, angle / sine.clamp(min=1e-6), 1.0)
-    return nn.functional.pad(about, (0, 0, 1, 0))
+def _turns(orientation: Tensor) -> Tensor:
+    """Heading (B, T, N) of (B, T, N, 3, 3) since their first frame, radians, whole turns counted."""
+    step = turn_about_y(orientation).diff(dim=1)
+    step = torch.remainder(step + torch.pi, 2.0 * torch.pi) - torch.pi
+    return nn.functional.pad(step.cumsum(1), (0, 0, 1, 0))
 
 
 def augment(
@@ -137,7 +136,7 @@ def augment(
     if how.pelvis_pitch_deg:
         pitch = torch.zeros(size, 1, 3)
         pitch[..., 0] = torch.deg2rad(how.pelvis_pitch_deg * normal(size, 1))
-        turn = small_rotations(pitch)
+        turn = rotations_of(pitch)
         orientation, relative = orientation.clone(), relative.clone()
         orientation[:, :, ROOT] = orientation[:, :, ROOT] @ turn
         relative[:, :, 1:] = turn.mT.unsqueeze(2) @ relative[:, :, 1:]
@@ -146,12 +145,12 @@ def augment(
     )
     if how.misalignment_deg:
         angles = how.misalignment_deg * normal(size, 1, 6, 3) * turned[:, None, None, None]
-        error = small_rotations(torch.deg2rad(angles))
+        error = rotations_of(torch.deg2rad(angles))
         orientation = orientation @ error
     if how.heading_deg:
         vertical = torch.zeros(size, 1, 6, 3)
         vertical[..., :-1, 1] = torch.deg2rad(how.heading_deg * normal(size, 1, 5) * turned[:, None, None])
-        turn = small_rotations(vertical)
+        turn = rotations_of(vertical)
         orientation = turn @ orientation
         acceleration = (turn @ acceleration.unsqueeze(-1)).squeeze(-1)
     if how.acceleration_scale:

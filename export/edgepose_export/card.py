@@ -31,6 +31,7 @@ def card(metadata: dict[str, Any]) -> str:
         latency=1e3 * metadata["future"] / metadata["rate_hz"],
     )
     training = metadata["training"]
+    several = training.get("checkpoints", 1) > 1
     mixed = "Bandai-Namco" in training["summary"]
     bandai = ", and both Bandai-Namco Research motion datasets" if mixed else ""
     lines = [
@@ -77,13 +78,14 @@ def card(metadata: dict[str, Any]) -> str:
         f"edgepose synthesize MOCAP/{'*_normal_*' if mixed else '*'}.bvh --hold 3 --out recordings/standing",
         *(["edgepose synthesize SOME --seated 1 --out recordings/seated"] if _seated(metadata) else []),
         f"edgepose train --config {metadata['name']} --data recordings --out runs/{metadata['name']}",
-        f"edgepose export runs/{metadata['name']}/checkpoint.pt --out {metadata['name']}.pt "
-        "--measure recordings",
+        f"edgepose export runs/{metadata['name']}/checkpoint.pt {'OTHERS ' * several}--out "
+        f"{metadata['name']}.pt --measure recordings",
         "```",
         "",
         "MOCAP is a folder with the motion named above. For the shipped models: the BVH files of CMU "
         f"subjects 01, 02, 03, 05 - 09 and some further takes (cgspeed's conversion){bandai}. The whole "
-        "config is in the archive's metadata.",
+        "config is in the archive's metadata."
+        + (" OTHERS are the checkpoints that it was trained on from, see docs/models.md." * several),
         "",
     ]
     return "\n".join(lines)
@@ -112,13 +114,13 @@ def _smoothing(metadata: dict[str, Any]) -> str:
         return ""
     return (
         f"; a low-pass of two poles at {metadata['smoothing']:g} behind the network, over rotations as seen "
-        "from the room"
+        "from a level pelvis"
     )
 
 
 def _mean(training: dict[str, Any]) -> str:
     count = training.get("checkpoints", 1)
-    return f"; the mean weights of {count} checkpoints, this one the first" if count > 1 else ""
+    return f" in the last of {count} trainings, the mean of whose weights this is" if count > 1 else ""
 
 
 def _seated(metadata: dict[str, Any]) -> bool:

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from edgepose.features import ACCELERATIONS, local_rotations, nearest_rotation, rotation_from_6d
 from edgepose.placements import BONES, PLACEMENTS, ROOT
 from edgepose.skeleton import PARENTS, PREDICTED, UNOBSERVED
+from edgepose_export.normalisation import tilt_of
 
 SIGMA_FLOOR = 0.02
 """Smallest standard deviation a network may claim, in normalised units.
@@ -35,9 +36,10 @@ class NetworkShape(NamedTuple):
         acceleration: whether accelerations are inputs (without: DIP appendix D).
         smoothing: of a recurrent network, both poles of a low-pass over its rotations, 0 (none) to 0.99: each
             of two stages keeps this share of what it gave in the last frame. It is there in training too, so
-            that the network learns to make up for its delay. It works on rotations as seen from T: seen from
-            the root, a bone at rest moves whenever the pelvis does, and smoothing would leave it the
-            pelvis' trembling. Needs "global-6d".
+            that the network learns to make up for its delay. It works on rotations as seen from a level
+            pelvis (`normalisation.tilt_of`). Seen from the pelvis itself a bone at rest moves whenever the
+            pelvis shakes, and smoothing would leave it that; seen from the room the body would stay behind
+            in every turn, of which the inputs tell nothing. Needs "global-6d".
     """
 
     kind: str = "birnn"
@@ -120,8 +122,8 @@ class PoseNetwork(nn.Module):
 
 
 def smoothed(pose: Tensor, root: Tensor, smoothing: float) -> Tensor:
-    """Low-pass over the frames of "global-6d" numbers (B, T, 6 N) as seen from T: weighted means of each
-    frame and all before it, which `recurrent.Ends.smoothed` carries on but for their scale.
+    """Low-pass over the frames of "global-6d" numbers (B, T, 6 N) as seen from a level pelvis: weighted means
+    of each frame and all before it, which `recurrent.Ends.smoothed` carries on but for their scale.
 
     Args:
         pose: numbers in the targets' own units.
@@ -133,10 +135,8 @@ def smoothed(pose: Tensor, root: Tensor, smoothing: float) -> Tensor:
     weights = ((age + 1.0) * smoothing**age).tril()  # what two equal poles answer to an impulse
     weights = weights * (weights > 1e-20)  # numbers that are smaller still make products slow
     weights = weights / weights.sum(dim=1, keepdim=True)
-    # The means in full precision: bfloat16 steps are as large as the trembling that is left.
-    with torch.autocast(pose.device.type, enabled=False):
-        columns = turned(pose, root)
-        return turned(weights @ columns, root.transpose(-1, -2))
+    tilt = tilt_of(root)
+    return turned(weights @ turned(pose, tilt), tilt.transpose(-1, -2))
 
 
 def turned(pose: Tensor, rotation: Tensor) -> Tensor:

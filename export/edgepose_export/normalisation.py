@@ -25,6 +25,23 @@ def heading_of(root: Tensor) -> Tensor:
     return torch.stack([c, zero, s, zero, one, zero, -s, zero, c], dim=-1).unflatten(-1, (3, 3))
 
 
+def turn_about_y(r: Tensor) -> Tensor:
+    """Angle (...), radians, of the part of rotations (..., 3, 3) that turns about Y (swing-twist split).
+
+    Where `heading_of` is lost when a wearer bends until the pelvis faces the floor, this is only when the
+    pelvis is upside down.
+    """
+    return torch.atan2(r[..., 0, 2] - r[..., 2, 0], r[..., 0, 0] + r[..., 2, 2])
+
+
+def tilt_of(root: Tensor) -> Tensor:
+    """Roots (..., 3, 3) without their turn about Y: a pelvis as seen from its own level frame."""
+    angle = turn_about_y(root).unsqueeze(-1)
+    s, c = angle.sin(), angle.cos()
+    x, z = root[..., 0, :], root[..., 2, :]
+    return torch.stack([c * x - s * z, root[..., 1, :], s * x + c * z], dim=-2)
+
+
 def seen_from(reference: Tensor, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
     """Orientations and accelerations in the frames of reference rotations (..., 3, 3)."""
     back = reference.transpose(-1, -2).unsqueeze(-3)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from edgepose_export.networks import SIGMA_FLOOR, PoseDecoder, PoseNetwork, turned
-from edgepose_export.normalisation import network_inputs
+from edgepose_export.normalisation import network_inputs, tilt_of
 from edgepose_export.products import Product
 
 
@@ -145,19 +145,20 @@ class Ends(nn.Module):
         return rotations, self.decoder.deviations(deviation), lowpass
 
     def smoothed(self, pose: Tensor, root: Tensor, lowpass: Tensor) -> tuple[Tensor, Tensor]:
-        """Two-pole low-pass over the frames of (B, T, pose outputs) seen from the root (B, T, 3, 3), and its
-        new state; as seen from T.
+        """Two-pole low-pass over the frames of (B, T, pose outputs) as seen from the root (B, T, 3, 3), made
+        level; and its new state.
 
         It begins at zero and is not corrected for it: the first outputs are too small, but rotations are
         made from the numbers' directions alone.
         """
+        tilt = tilt_of(root)
         first, second = lowpass.unbind(1)
         outputs: list[Tensor] = []
-        for row in turned(pose, root).unbind(1):
+        for row in turned(pose, tilt).unbind(1):
             first = torch.lerp(row, first, self.smoothing)
             second = torch.lerp(first, second, self.smoothing)
             outputs.append(second)
-        pose = turned(torch.stack(outputs, dim=1), root.transpose(-1, -2))
+        pose = turned(torch.stack(outputs, dim=1), tilt.transpose(-1, -2))
         return pose, torch.stack([first, second], dim=1)
 
 

@@ -51,6 +51,18 @@ def test_a_silent_lower_leg_stays_upright_when_the_wearer_bends(walk):
     np.testing.assert_allclose(orientation[:, arm], turn @ bend, atol=1e-12)
 
 
+def test_headings_do_not_drift_with_a_pelvis_that_circles(walk):
+    _, acceleration = walk
+    around = np.linspace(0.0, 6.0 * np.pi, 30)
+    lean = rot.rotvec_to_matrix(0.3 * np.stack([np.cos(around), 0.0 * around, np.sin(around)], axis=-1))
+    measured = np.repeat(lean[:, None], 6, axis=1)
+    for silent in (PLACEMENTS.index("left_lower_leg"), ROOT):
+        held = np.zeros((30, 6), bool)
+        held[5:, silent] = True
+        orientation, _ = through(np.where(held[..., None, None], measured[4], measured), acceleration, held)
+        np.testing.assert_allclose(orientation[5:, silent], np.stack([measured[4, silent]] * 25), atol=1e-12)
+
+
 def test_what_measures_again_counts_at_once(walk):
     true, acceleration = walk
     held = np.zeros((30, 6), bool)

@@ -15,8 +15,8 @@ from edgepose_export.augmentation import (
     Augmentation,
     augment,
     mirror,
+    rotations_of,
     silenced,
-    small_rotations,
 )
 from edgepose_export.dataset import read_take, root_relative_pose
 from edgepose_export.mocap import read_motion, resample
@@ -97,10 +97,10 @@ def test_share_of_mirrored_sequences():
         torch.testing.assert_close(a[changed[0]], b[changed[0]])
 
 
-def test_small_rotations_against_scipy():
+def test_rotations_of_against_scipy():
     vectors = torch.randn(20, 3, generator=generator(), dtype=torch.float64)
     expected = Rotation.from_rotvec(vectors.numpy()).as_matrix()
-    np.testing.assert_allclose(small_rotations(vectors).numpy(), expected, atol=1e-12)
+    np.testing.assert_allclose(rotations_of(vectors).numpy(), expected, atol=1e-12)
 
 
 def test_misalignment_is_one_turn_a_sensor_behind_its_orientation():

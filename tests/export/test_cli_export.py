@@ -325,7 +325,8 @@ def test_mean_weights_of_checkpoints(made, tmp_path):
     about = archive.inspect(tmp_path / "mean.pt").metadata
     assert (about["training"]["checkpoints"], about["training"]["steps"]) == (2, 3)
     card = (tmp_path / "mean.md").read_text(encoding="utf-8")
-    assert "3 steps; the mean weights of 2 checkpoints, this one the first." in card
+    assert "3 steps in the last of 2 trainings, the mean of whose weights this is." in card
+    assert "checkpoint.pt OTHERS --out" in card
     states = [read_checkpoint(path) for path in (tuned, first)]
     weights = mean_of({"tuned": states[0], "first": states[1]})["averaged"]
     for name, mean in weights.items():
@@ -340,7 +341,24 @@ def test_mean_weights_of_checkpoints(made, tmp_path):
     (tmp_path / "wide.toml").write_text(CONFIG.replace("hidden = 8", "hidden = 9"))
     edgepose(*train, "--config", tmp_path / "wide.toml", "--out", tmp_path / "other", "--steps", 1)
     refused = fails("export", first, tmp_path / "other" / "checkpoint.pt", "--out", tmp_path / "x.pt")
-    assert "other/checkpoint.pt: not a network that began from" in refused
+    assert "other/checkpoint.pt: did not begin from" in refused
+    twice = CliRunner().invoke(cli, ["export", str(first), str(first), "--out", str(tmp_path / "x.pt")])
+    assert (twice.exit_code, "named twice" in twice.output) == (2, True)
+
+
+def test_means_keep_licences_and_refuse_strangers(made):
+    folder, _, _ = made
+    first = read_checkpoint(folder / "run" / "best.pt")
+    data = first["data"] | {"licenses": ["another"], "hours": 99.0}
+    mean = mean_of({"a": first, "b": first | {"data": data}})
+    assert mean["data"]["licenses"] == sorted([*first["data"]["licenses"], "another"])
+    assert mean["data"]["hours"] == 99.0
+    torch.manual_seed(1)
+    stranger = new_network(config_from(json.loads(first["config"])).network).state_dict()
+    odd = first["statistics"] | {"input_std": first["statistics"]["input_std"] + 1.0}
+    for change in ({"averaged": stranger}, {"statistics": odd}):
+        with pytest.raises(EdgeposeError, match="b: did not begin from a"):
+            mean_of({"a": first, "b": first | change})
 
 
 def test_errors_are_one_line(made, tmp_path):

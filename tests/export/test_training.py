@@ -508,32 +508,6 @@ def test_loss_without_accelerations_is_the_poses_alone(takes):
     assert both._loss(zero, batch, 0.0) != alone._loss(zero, batch, 0.0)
 
 
-def test_joined_takes_go_on_in_one_heading(takes):
-    whole = tape(takes)
-    first, length = int(whole.starts[1]) - 10, int(whole.starts[2] - whole.starts[1]) + 20  # parts of three
-    orientation, acceleration, relative = training.windows(whole, torch.tensor([0, first]), length)
-    frames = slice(first, first + length)
-    root, before = orientation[1, :, ROOT], whole.orientation[frames, ROOT]
-    joins = [10, length - 10]
-    forward = torch.nn.functional.normalize(root[:, [0, 2], 2], dim=-1)
-    for join in joins:
-        torch.testing.assert_close(forward[join], forward[join - 1], rtol=0, atol=1e-4)
-    leaps = [(before[join] @ before[join - 1].mT).diagonal().sum() for join in joins]
-    assert min(leaps) < 2.97  # 10 deg: it was another heading
-    # Each take is turned as one, about the vertical, and all that the network sees stays as it is.
-    turn = root @ before.mT
-    torch.testing.assert_close(turn[:, 1], torch.tensor([0.0, 1, 0]).expand(length, 3), rtol=0, atol=1e-5)
-    for part in (slice(0, 10), slice(10, length - 10), slice(length - 10, None)):
-        torch.testing.assert_close(turn[part], turn[part][:1].expand_as(turn[part]), rtol=0, atol=1e-5)
-    sensors = network_input(orientation[1], acceleration[1])
-    expected = network_input(whole.orientation[frames], whole.acceleration[frames])
-    torch.testing.assert_close(sensors, expected, rtol=0, atol=1e-4)
-    assert torch.equal(relative[1], whole.relative[frames])
-    # A window of one take is left alone, and so is the tape.
-    single = training.windows(whole, torch.tensor([0, first]), 10)
-    assert torch.equal(single[0][1], whole.orientation[first : first + 10])
-
-
 def test_loss_is_of_what_the_low_pass_gives(takes):
     shape = SMALL.network._replace(smoothing=0.5)
     one = trainer(takes, replace(SMALL, network=shape, beta=0.0, acceleration_loss=False))

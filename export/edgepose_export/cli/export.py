@@ -88,6 +88,8 @@ def export(
         raise click.UsageError("--out is the name of a .pt file")
     if beside and not data:
         raise click.UsageError("--beside is for --measure")
+    if len({path.resolve() for path in checkpoints}) < len(checkpoints):
+        raise click.UsageError("one checkpoint is named twice")
     import torch
 
     from edgepose.archive import find, inspect, load
