@@ -447,7 +447,7 @@ with Keys() as keys:
         while b"ready True" not in screen:
             screen += os.read(outside, 4096)
         os.write(outside, b"r")
-        while b"ben" not in screen:
+        while b"ben" not in screen or not screen.endswith(b"\n"):  # a line may come in parts
             screen += os.read(outside, 4096)
         assert process.wait(30) == 0
     finally:
