@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from edgepose.placements import PLACEMENTS, ROOT
 from edgepose.skeleton import JOINTS
 from edgepose_export.normalisation import turn_about_y
+from edgepose_export.postures import other_postures, rotations_of
 
 
 def _swapped(names: tuple[str, ...]) -> list[int]:
@@ -42,6 +43,8 @@ class Augmentation(NamedTuple):
             `Trainer` leaves sequences with made sitting alone, which the pelvis' pitch tells from standing.
         silent: share of sequences in which one sensor is silent for a while, unless that ends before the
             sequence begins or begins after it (an eighth of them).
+        posture: factor on `postures.DEVIATIONS`, by which wearers hold their joints otherwise. `Trainer`
+            leaves sequences with made sitting alone.
     """
 
     mirror: float = 0.5
@@ -52,6 +55,7 @@ class Augmentation(NamedTuple):
     aligned: float = 0.0
     pelvis_pitch_deg: float = 0.0
     silent: float = 0.0
+    posture: float = 0.0
 
 
 def mirror(orientation: Tensor, acceleration: Tensor, relative: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -65,14 +69,6 @@ def mirror(orientation: Tensor, acceleration: Tensor, relative: Tensor) -> tuple
         acceleration[..., SENSOR_MIRROR, :] * flip,
         relative[..., JOINT_MIRROR, :, :] * signs,
     )
-
-
-def rotations_of(vectors: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), radians."""
-    zero = torch.zeros_like(vectors[..., 0])
-    x, y, z = vectors.unbind(-1)
-    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
-    return torch.linalg.matrix_exp(skew)
 
 
 def silenced(
@@ -119,9 +115,11 @@ def _turns(orientation: Tensor) -> Tensor:
 def augment(
     batch: tuple[Tensor, Tensor, Tensor], how: Augmentation, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Disturbed copies of sequences (B, T, 6, 3, 3), (B, T, 6, 3) and, mirrored and with other pelvises only,
-    their true poses (B, T, 24, 3, 3).
+    """Disturbed copies of sequences (B, T, 6, 3, 3), (B, T, 6, 3) and, mirrored, in other postures and with
+    other pelvises only, their true poses (B, T, 24, 3, 3).
     """
+    if how.posture:
+        batch = other_postures(batch, how.posture, generator)
     orientation, acceleration, relative = batch
     size = len(orientation)
 

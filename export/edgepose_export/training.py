@@ -279,8 +279,9 @@ class Trainer:
     def _batch(self, starts: Tensor) -> Batch:
         """Disturbed windows from some first frames on, those with made sitting last."""
         how = self.config.augmentation
-        # The pelvis' pitch is what tells sitting from standing.
-        kinds = ((~self.sits[starts], how), (self.sits[starts], how._replace(pelvis_pitch_deg=0.0)))
+        # The pelvis' pitch is what tells sitting from standing; made legs are where a seat wants them.
+        seated = how._replace(pelvis_pitch_deg=0.0, posture=0.0)
+        kinds = ((~self.sits[starts], how), (self.sits[starts], seated))
         parts = [
             augment(windows(self.train_tape, starts[kind], self.config.window), its, self.generator)
             for kind, its in kinds

@@ -213,10 +213,11 @@ def test_share_of_made_sitting(takes):
 
 
 @pytest.mark.parametrize("joined", [False, True])
-def test_windows_with_made_sitting_keep_their_pelvis(takes, monkeypatch, joined):
-    """Its pitch is what tells sitting from standing."""
+@pytest.mark.parametrize("how", [{"pelvis_pitch_deg": 40.0}, {"posture": 1.0}])
+def test_windows_with_made_sitting_keep_their_pelvis_and_posture(takes, monkeypatch, joined, how):
+    """The pelvis' pitch is what tells sitting from standing."""
     made = [takes[0], takes[1]._replace(name=f"{takes[1].name}.seated"), *takes[2:]]
-    how = Augmentation(mirror=0.0, pelvis_pitch_deg=40.0)
+    how = Augmentation(mirror=0.0, **how)
     config = replace(SMALL, sequences=64, seated_share=0.5, free_share=0.0, joined=joined, augmentation=how)
     one = Trainer(config, tape(made), tape(takes), ABOUT)
     first, length = len(made[0].pose), len(made[1].pose)
