@@ -37,7 +37,8 @@ def card(metadata: dict[str, Any]) -> str:
     lines = [
         f"# {metadata['name']}",
         "",
-        f"- Network: {kind}; {_size(metadata)}, {metadata['parameters'] / 1e6:.2f} million weights.",
+        f"- Network: {kind}; {_size(metadata)}, {metadata['parameters'] / 1e6:.2f} million weights"
+        f"{', rounded by about a hundredth' if metadata.get('rounded') else ''}.",
         f"- Input: calibrated orientations{' and accelerations' if metadata['acceleration'] else ''} of "
         f"{', '.join(metadata['placements'])} at {metadata['rate_hz']:g} Hz, "
         f"{_INPUTS[metadata['normalisation']]}.",
@@ -79,7 +80,7 @@ def card(metadata: dict[str, Any]) -> str:
         *(["edgepose synthesize SOME --seated 1 --out recordings/seated"] if _seated(metadata) else []),
         f"edgepose train --config {metadata['name']} --data recordings --out runs/{metadata['name']}",
         f"edgepose export runs/{metadata['name']}/checkpoint.pt {'OTHERS ' * several}--out "
-        f"{metadata['name']}.pt --measure recordings",
+        f"{metadata['name']}.pt{' --rounded' * metadata.get('rounded', False)} --measure recordings",
         "```",
         "",
         "MOCAP is a folder with the motion named above. For the shipped models: the BVH files of CMU "

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
 from edgepose.errors import EdgeposeError
 from edgepose.precision import PRECISIONS, pack_weights
@@ -22,7 +23,25 @@ from edgepose_export.evaluation import (
     takes_of,
 )
 
+STEPS = 32
+"""Steps in a typical weight once weights are rounded."""
+
 KEYS = ("sip_error_deg", "joint_angle_error_10_deg")
+
+
+@torch.no_grad()
+def round_weights(network: nn.Module) -> None:
+    """Makes a network's weights whole multiples of powers of two, one for each parameter, near 1 / STEPS of
+    its root mean square.
+
+    They move by about a hundredth of their size. fp16 holds such numbers exactly (below 2048 steps), and an
+    archive of them compresses to two fifths of what it would.
+    """
+    for weight in network.parameters():
+        typical = weight.square().mean().sqrt()
+        if typical > 0:
+            step = torch.exp2(torch.log2(typical / STEPS).round())
+            weight.copy_((weight / step).round() * step)
 
 
 def compare(

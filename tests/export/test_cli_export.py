@@ -346,6 +346,22 @@ def test_mean_weights_of_checkpoints(made, tmp_path):
     assert (twice.exit_code, "named twice" in twice.output) == (2, True)
 
 
+def test_rounded_weights(made, tmp_path):
+    folder, _, _ = made
+    edgepose("export", folder / "run" / "best.pt", "--out", tmp_path / "short.pt", "--rounded")
+    info = archive.inspect(tmp_path / "short.pt")
+    assert info.metadata["rounded"]
+    assert "weights, rounded by about a hundredth." in (card := (tmp_path / "short.md").read_text("utf-8"))
+    assert "--out short.pt --rounded --measure" in card
+    weights = [
+        weight
+        for name, weight in archive.load(info, trust=True).named_buffers()
+        if name.endswith("weight") and not name.startswith("ends.")
+    ]
+    assert len(weights) >= 8
+    assert all(torch.equal(weight.half().float(), weight) for weight in weights)
+
+
 def test_means_keep_licences_and_refuse_strangers(made):
     folder, _, _ = made
     first = read_checkpoint(folder / "run" / "best.pt")

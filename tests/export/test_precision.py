@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from edgepose_export.archive import save, script
 from edgepose_export.dataset import take_paths
 from edgepose_export.evaluation import Mode, run_archive, takes_of
 from edgepose_export.networks import NetworkShape
-from edgepose_export.precisions import compare
+from edgepose_export.precisions import compare, round_weights
 
 BIRNN = NetworkShape("birnn", 32, "global-6d", "passed", "tilt")
 RNN = BIRNN._replace(kind="rnn")
@@ -168,3 +169,26 @@ def make_takes():
         return folder / "takes"
 
     return make
+
+
+def test_rounded_weights_are_exact_in_fp16_and_compress(parts):
+    network, _ = parts(RNN._replace(hidden=128))[:2]
+    with torch.no_grad():
+        network.mean.bias.zero_()
+    before = {name: weight.clone() for name, weight in network.named_parameters()}
+    round_weights(network)
+    for name, weight in network.named_parameters():
+        assert torch.equal(weight.half().float(), weight)
+        typical = before[name].square().mean().sqrt()
+        assert (weight - before[name]).square().mean().sqrt() <= 0.013 * typical
+        assert (weight - before[name]).abs().max() <= 2**0.5 / 64 * typical + 1e-9
+    again = {name: weight.clone() for name, weight in network.named_parameters()}
+    round_weights(network)
+    assert all(torch.equal(weight, again[name]) for name, weight in network.named_parameters())
+
+    def size(weights):
+        return len(
+            zlib.compress(torch.cat([w.detach().flatten() for w in weights.values()]).numpy().tobytes())
+        )
+
+    assert size(again) < 0.45 * size(before)
