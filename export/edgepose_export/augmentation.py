@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from edgepose.placements import PLACEMENTS, ROOT
 from edgepose.skeleton import JOINTS
-from edgepose_export.normalisation import turn_about_y
-from edgepose_export.postures import other_postures, rotations_of
+from edgepose_export.normalisation import rotations_of, turn_about_y
+from edgepose_export.postures import Batch
 
 
 def _swapped(names: tuple[str, ...]) -> list[int]:
@@ -43,8 +43,7 @@ class Augmentation(NamedTuple):
             `Trainer` leaves sequences with made sitting alone, which the pelvis' pitch tells from standing.
         silent: share of sequences in which one sensor is silent for a while, unless that ends before the
             sequence begins or begins after it (an eighth of them).
-        posture: factor on `postures.DEVIATIONS`, by which wearers hold their joints otherwise. `Trainer`
-            leaves sequences with made sitting alone.
+        posture: factor on `postures.DEVIATIONS`, by which wearers hold their joints otherwise.
     """
 
     mirror: float = 0.5
@@ -112,14 +111,10 @@ def _turns(orientation: Tensor) -> Tensor:
     return nn.functional.pad(step.cumsum(1), (0, 0, 1, 0))
 
 
-def augment(
-    batch: tuple[Tensor, Tensor, Tensor], how: Augmentation, generator: torch.Generator
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Disturbed copies of sequences (B, T, 6, 3, 3), (B, T, 6, 3) and, mirrored, in other postures and with
-    other pelvises only, their true poses (B, T, 24, 3, 3).
+def augment(batch: Batch, how: Augmentation, generator: torch.Generator) -> Batch:
+    """Disturbed copies of sequences; their true poses are mirrored and get other pelvises only. All but
+    `posture`, which needs the frames around them.
     """
-    if how.posture:
-        batch = other_postures(batch, how.posture, generator)
     orientation, acceleration, relative = batch
     size = len(orientation)
 

@@ -6,6 +6,8 @@ the order of PLACEMENTS, the root last; `acceleration` is (..., 6, 3), m/s^2 in 
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -23,6 +25,16 @@ def heading_of(root: Tensor) -> Tensor:
     s, c = forward[..., 0], forward[..., 1]
     zero, one = torch.zeros_like(s), torch.ones_like(s)
     return torch.stack([c, zero, s, zero, one, zero, -s, zero, c], dim=-1).unflatten(-1, (3, 3))
+
+
+def rotations_of(vectors: Tensor) -> Tensor:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), radians (Rodrigues)."""
+    angle = vectors.norm(dim=-1, keepdim=True).unsqueeze(-1)
+    zero = torch.zeros_like(vectors[..., 0])
+    x, y, z = vectors.unbind(-1)
+    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+    sine, versine = torch.sinc(angle / math.pi), 0.5 * torch.sinc(angle / (2.0 * math.pi)).square()
+    return torch.eye(3) + sine * skew + versine * (skew @ skew)
 
 
 def turn_about_y(r: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""What packing an archive's weights does to its poses."""
+"""Rounded weights, and what packing an archive's weights does to its poses."""
 
 from __future__ import annotations
 

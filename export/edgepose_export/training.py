@@ -24,6 +24,7 @@ from edgepose_export.config import TrainConfig, config_from, config_values
 from edgepose_export.dataset import Tape, describe
 from edgepose_export.networks import NetworkShape, smoothed
 from edgepose_export.normalisation import network_inputs, seen_from_first
+from edgepose_export.postures import AFTER, BEFORE, Batch, other_postures
 from edgepose_export.processes import ALONE, Processes
 
 CHECKPOINT = "checkpoint.pt"
@@ -95,9 +96,6 @@ def tremble_loss(mean: Tensor, target: Tensor) -> Tensor:
 
 # --- batches ------------------------------------------------------------------------------------------------
 
-
-Batch = tuple[Tensor, Tensor, Tensor]
-"""Orientations, accelerations and true rotations of sequences."""
 
 Starts = tuple[Tensor, Tensor]
 """First frames of windows: of other takes, of CMU's."""
@@ -279,16 +277,24 @@ class Trainer:
     def _batch(self, starts: Tensor) -> Batch:
         """Disturbed windows from some first frames on, those with made sitting last."""
         how = self.config.augmentation
-        # The pelvis' pitch is what tells sitting from standing; made legs are where a seat wants them.
-        seated = how._replace(pelvis_pitch_deg=0.0, posture=0.0)
-        kinds = ((~self.sits[starts], how), (self.sits[starts], seated))
+        # The pelvis' pitch is what tells sitting from standing.
+        kinds = ((~self.sits[starts], how), (self.sits[starts], how._replace(pelvis_pitch_deg=0.0)))
         parts = [
-            augment(windows(self.train_tape, starts[kind], self.config.window), its, self.generator)
-            for kind, its in kinds
-            if kind.any()
+            augment(self._windows(starts[kind]), its, self.generator) for kind, its in kinds if kind.any()
         ]
         orientation, acceleration, relative = map(torch.cat, zip(*parts, strict=True))
         return orientation, acceleration, relative
+
+    def _windows(self, starts: Tensor) -> Batch:
+        """Windows from some first frames on, in other postures if that is wanted."""
+        tape, window, size = self.train_tape, self.config.window, self.config.augmentation.posture
+        if not size:
+            return windows(tape, starts, window)
+        index = starts[:, None] + torch.arange(-BEFORE, window + AFTER)
+        take = torch.searchsorted(tape.starts, index, right=True)
+        index = index.clamp(0, len(tape.relative) - 1)
+        batch = tape.orientation[index], tape.acceleration[index], tape.relative[index]
+        return other_postures(batch, take, size, self.generator)
 
     def _validation_starts(self) -> Tensor:
         window = self.config.window

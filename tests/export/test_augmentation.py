@@ -171,7 +171,7 @@ def test_nothing_asked_nothing_done_and_the_input_is_never_written():
     data = batch(20)
     kept = [x.clone() for x in data]
     assert all(a is b for a, b in zip(augment(data, Augmentation(mirror=0), generator()), data, strict=True))
-    everything = Augmentation(0.5, 4.0, 3.0, 0.1, 0.02, pelvis_pitch_deg=5.0, silent=0.5, posture=1.0)
+    everything = Augmentation(0.5, 4.0, 3.0, 0.1, 0.02, pelvis_pitch_deg=5.0, silent=0.5)
     first, again = (augment(data, everything, generator(3)) for _ in range(2))
     for a, b, original, copy in zip(first, again, data, kept, strict=True):
         assert torch.equal(a, b)

@@ -360,6 +360,9 @@ def test_rounded_weights(made, tmp_path):
     ]
     assert len(weights) >= 8
     assert all(torch.equal(weight.half().float(), weight) for weight in weights)
+    twice = ["export", "x.pt", "--out", "y.pt", "--rounded", "--precision", "int8"]
+    refused = CliRunner().invoke(cli, twice)
+    assert (refused.exit_code, "not for --precision int8" in refused.output) == (2, True)
 
 
 def test_means_keep_licences_and_refuse_strangers(made):

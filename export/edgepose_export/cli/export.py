@@ -95,6 +95,8 @@ def export(
         raise click.UsageError("--out is the name of a .pt file")
     if beside and not data:
         raise click.UsageError("--beside is for --measure")
+    if rounded and precision == "int8":
+        raise click.UsageError("--rounded is not for --precision int8, which rounds in its own way")
     if len({path.resolve() for path in checkpoints}) < len(checkpoints):
         raise click.UsageError("one checkpoint is named twice")
     import torch
