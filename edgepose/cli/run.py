@@ -62,8 +62,9 @@ if TYPE_CHECKING:
     type=click.Choice(CHOICES),
     default="auto",
     show_default=True,
-    help="Numbers that the model's weights are kept in: fewer bytes run faster. auto is fp16 where this "
-    "machine has products for it, else f32; int8 is the fastest, about 0.2 deg from f32.",
+    help="Numbers that the model's weights are kept in: fewer bytes run faster. auto is fp16 on "
+    "x86-64 and on ARM processors with asimdfhm, else f32 (Raspberry Pi); int8 is the fastest on x86-64 alone, "
+    "about 0.2 deg from f32.",
 )
 def run(
     rigs: list[RigFlags],

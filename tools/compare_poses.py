@@ -1,0 +1,18 @@
+"""How far the poses of two files are apart: the largest angle of any joint in any frame, degrees."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from edgepose.poses import read_poses
+from edgepose.rotations import matrix_to_rotvec
+
+if __name__ == "__main__":
+    one, other = (read_poses(Path(name)).rotations for name in sys.argv[1:3])
+    if one.shape != other.shape:
+        sys.exit(f"{len(one)} and {len(other)} poses")
+    away = np.linalg.norm(matrix_to_rotvec(np.swapaxes(one, -1, -2) @ other), axis=-1)
+    print(f"{len(one)} poses, at most {np.degrees(away.max()):.6f} deg apart")

@@ -1,0 +1,84 @@
+#!/usr/bin/env bash
+# Follows docs/install.md word by word on an emulated 64-bit ARM computer, and compares its poses with this machine's.
+#
+#   sudo tools/emulate_arm64.sh [bookworm|trixie] [CPU...]
+#
+# CPU: as qemu names them, by default cortex-a72 (Raspberry Pi 4) and cortex-a76 (Raspberry Pi 5).
+# Needs root, Debian's packages qemu-user-static, binfmt-support and mmdebstrap, and a .venv here (tools/demo makes it).
+# Takes half an hour and 3 GB below FOLDER (/var/tmp/edgepose-arm64); what is installed there is used again.
+set -eu
+cd "$(dirname "$0")/.."
+suite=${1:-bookworm}
+[ $# -gt 0 ] && shift
+[ $# -gt 0 ] || set -- cortex-a72 cortex-a76
+folder=${FOLDER:-/var/tmp/edgepose-arm64}/$suite
+repository=/root/repository
+log=$folder.log
+
+register() {  # programs for ARM are run by qemu, from inside a root without it, too
+  [ -e /proc/sys/fs/binfmt_misc/register ] || mount -t binfmt_misc binfmt_misc /proc/sys/fs/binfmt_misc
+  [ -e /proc/sys/fs/binfmt_misc/qemu-aarch64 ] || cat /usr/lib/binfmt.d/qemu-aarch64.conf > /proc/sys/fs/binfmt_misc/register
+}
+
+make_root() {
+  mkdir -p "$folder"
+  mmdebstrap --quiet --arch=arm64 --variant=apt --include=ca-certificates,sudo "$suite" "$folder" || return 1
+  # The network as here, also behind a proxy with certificates of its own.
+  cp /etc/resolv.conf "$folder/etc/resolv.conf"
+  cp /etc/ssl/certs/ca-certificates.crt "$folder/etc/ssl/certs/ca-certificates.crt"
+}
+
+inside() {  # CPU, COMMANDS
+  env -i HOME=/root PATH=/usr/sbin:/usr/bin:/sbin:/bin LANG=C.UTF-8 DEBIAN_FRONTEND=noninteractive QEMU_CPU="$1" \
+    PIP_CERT=/etc/ssl/certs/ca-certificates.crt chroot "$folder" bash -ec "cd /root; $2"
+}
+
+block() {  # N: the Nth block of commands of the install page
+  awk -v wanted="$1" '/^```/ { inside = !inside; if (inside) count++; next } inside && count == wanted' docs/install.md
+}
+
+register
+[ -e "$folder/root" ] || make_root
+for device in null zero urandom tty; do
+  [ -e "$folder/dev/$device" ] || cp -a "/dev/$device" "$folder/dev/$device"
+done
+mountpoint -q "$folder/proc" || mount --bind /proc "$folder/proc"
+trap 'umount "$folder/proc"' EXIT
+
+rm -rf "$folder$repository" "$folder/root/edgepose.new"
+git clone --quiet --bare . "$folder$repository"
+if [ -e "$folder/root/edgepose" ]; then  # what is installed stays, the sources are today's
+  inside "$1" "cd edgepose && git fetch --quiet $repository HEAD && git reset --quiet --hard FETCH_HEAD &&
+    .venv/bin/pip install --quiet --constraint constraints.txt ." > "$log" 2>&1
+else
+  block 1 | sed "s|REPOSITORY|$repository|; s|apt install|apt install -y|; s|pip install|pip install --progress-bar off|" > "$folder/root/install.sh"
+  SECONDS=0
+  inside "$1" "bash -e /root/install.sh" > "$log" 2>&1
+  echo "installed in $SECONDS s under emulation"
+  echo "apt: $(grep -h '^Need to get' "$log")"
+  awk '/^ *Downloading .*[0-9.]+ [kM]B\)/ { size = $(NF - 1); sub(/\(/, "", size); total += /MB\)/ ? size : size / 1000 }
+       END { printf "pip: %.0f MB downloaded\n", total }' "$log"
+  echo "size of .venv: $(du -sm "$folder/root/edgepose/.venv" | cut -f1) MB"
+fi
+inside "$1" "edgepose/.venv/bin/pip list 2>/dev/null | grep -E '^(torch|numpy|scipy) '"
+
+here=$(mktemp -d)
+trap 'umount "$folder/proc"; rm -rf "$here"' EXIT
+tries=$(block 2)
+edgepose() { .venv/bin/python -m edgepose "$@"; }
+calibrate=$(grep ' calibrate ' <<< "$tries") run=$(grep ' run ' <<< "$tries")
+for model in birnn rnn; do
+  eval "$(sed "s|.venv/bin/edgepose|edgepose|; s|calib.json|$here/calib.json|" <<< "$calibrate")" > /dev/null 2>&1
+  eval "$(sed "s|.venv/bin/edgepose|edgepose|; s|calib.json|$here/calib.json|; s|poses.csv|$here/$model.csv|" <<< "$run") --model $model --precision f32" 2> /dev/null
+  rm "$here/calib.json"
+done
+for cpu in "$@"; do
+  for model in birnn rnn; do
+    rm -f "$folder/root/edgepose/calib.json" "$folder/root/edgepose/poses.csv"
+    SECONDS=0
+    inside "$cpu" "cd edgepose; $calibrate; $run --model $model" > "$log" 2>&1 || { tail -n 5 "$log"; exit 1; }
+    echo "$cpu $model: $(grep -o 'running.*;' "$log") $SECONDS s; $(.venv/bin/python tools/compare_poses.py "$here/$model.csv" "$folder/root/edgepose/poses.csv")"
+  done
+  inside "$cpu" "cd edgepose; $run --precision fp16 --csv /dev/null" > "$log" 2>&1 && echo "$cpu: fp16 ran" ||
+    echo "$cpu: fp16: $(tail -n 1 "$log")"
+done
