@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from edgepose import dip_imu, mtmanager, totalcapture, xio
-from edgepose.appending import replace_file
+from edgepose.durable_files import replace_file
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.mvnx import read_mvnx

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from edgepose.durable_files import replace_file
 from edgepose.errors import EdgeposeError
+from edgepose.output_targets import check_output, is_stream
 from edgepose.skeleton import forward_kinematics
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 
@@ -81,13 +86,35 @@ def require_matplotlib(what: str) -> None:
         ) from error
 
 
-def check_picture(path: Path, what: str) -> None:
-    """Before long work: raises EdgeposeError unless this kind of picture can be drawn in this folder."""
+def check_picture(path: Path, what: str, overwrite: bool = False) -> None:
+    """Before long work: raises EdgeposeError unless this kind of picture can be drawn in this folder without
+    loss."""
     require_matplotlib(what)
+    if is_stream(path):
+        return
     if path.suffix.lower() not in PICTURES:
         raise EdgeposeError(f"{path}: pictures are written as {', '.join(PICTURES)}")
     if not path.resolve().parent.is_dir():
         raise EdgeposeError(f"{path}: no folder {path.parent}; make it first or choose another name")
+    check_output(path, "the picture", PICTURES, overwrite)
+
+
+def save_picture(figure: Figure, path: str | Path, **options: Any) -> None:
+    """Write a figure; the file is whole or as it was before.
+
+    Args:
+        figure: to draw.
+        path: of the picture; the ending says the kind (png, svg, pdf), a device or pipe without one gets png.
+        options: of matplotlib's `savefig`.
+
+    Raises:
+        EdgeposeError: it cannot be written.
+    """
+    kind = Path(path).suffix[1:] or "png"
+    try:
+        replace_file(path, lambda part: figure.savefig(part, format=kind, **options), "the picture")
+    except ValueError as error:  # an ending that matplotlib does not know
+        raise EdgeposeError(f"cannot write the picture {path}: {error}") from error
 
 
 def skeleton_strip(
@@ -150,10 +177,7 @@ def skeleton_strip(
     if title:
         figure.text(0.02, 1.0 - 0.6 * title_in * inch, title, ha="left", va="center", fontsize=10, color=INK)
     _legend(figure, 1.0 - (title_in + 0.5 * legend_in) * inch, reference is not None)
-    try:
-        figure.savefig(path, dpi=DPI)
-    except (OSError, ValueError) as error:  # ValueError: an ending that matplotlib does not know.
-        raise EdgeposeError(f"cannot write the picture {path}: {error}") from error
+    save_picture(figure, path, dpi=DPI)
 
 
 def _figures(poses: ArrayLike, offsets: ArrayLike) -> list[_Figure]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from edgepose.appending import replace_file
+from edgepose.durable_files import replace_file
 from edgepose.poses import Poses, salvage_poses
 from edgepose.sinks import Sink
 from edgepose.sinks.bvh import BvhSink

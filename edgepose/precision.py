@@ -32,7 +32,8 @@ def has_fp16_products(machine: str, hwcap: int) -> bool:
     """Whether fp16 weights can be multiplied on a processor.
 
     On 64-bit ARM torch packs them everywhere, and their first product ends the process ("Illegal
-    instruction") unless the processor has FEAT_FHM, which Linux calls asimdfhm. A Raspberry Pi 4 or 5 has not.
+    instruction") unless the processor has FEAT_FHM, which Linux calls asimdfhm. No Raspberry Pi has
+    it.
 
     Args:
         machine: kind of processor, as `platform.machine` names it.
@@ -42,7 +43,7 @@ def has_fp16_products(machine: str, hwcap: int) -> bool:
 
 
 def is_int8_fast(machine: str) -> bool:
-    """Whether int8 weights are faster than f32 on such a processor; on 64-bit ARM they are 20 times slower."""
+    """Whether int8 weights are faster than f32 on such a processor; on 64-bit ARM they are much slower."""
     return machine in ("x86_64", "AMD64")
 
 

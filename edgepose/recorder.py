@@ -6,16 +6,19 @@ What cannot be written bit by bit goes through a journal next to it that can: `w
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TextIO, cast
 
-from edgepose.appending import Appender, replace_file
 from edgepose.capture import times_header, times_path, times_row
+from edgepose.durable_files import replace_file
 from edgepose.errors import EdgeposeError
+from edgepose.growing_files import Appender
 from edgepose.imu import ImuSample
+from edgepose.output_targets import check_output
 from edgepose.placements import PLACEMENTS
 from edgepose.recording import csv_header, csv_row, salvage_recording, write_npz
 from edgepose.sources import Source
@@ -35,14 +38,12 @@ class Output(NamedTuple):
         samples: takes those that came together.
         raw: takes what came together on a line: arrival in Unix time, seconds, and bytes or CAN messages.
         finish: called when the files are closed and something is in them.
-        paths: all that is on the disk until then.
     """
 
     files: list[Appender]
     samples: Callable[[list[ImuSample]], None]
     raw: Callable[[float, Any], None]
     finish: Callable[[], None]
-    paths: list[Path]
 
 
 @dataclass
@@ -87,14 +88,15 @@ def check_free(path: str, overwrite: bool) -> None:
         overwrite: whether one that is there already may be replaced.
 
     Raises:
-        EdgeposeError: one is there, whole or its journal.
+        EdgeposeError: one is there, whole or its journal, or it cannot be written.
     """
-    if path == "-" or overwrite:
+    if path == "-":
         return
     there, journal = Path(path), _journal(Path(path))
-    if there.is_file():  # not a device such as /dev/null
-        raise EdgeposeError(f"{path} is there already; choose another name or give --overwrite")
-    if journal != there and journal.exists():
+    beside = [times_path(there)] if kind(path) == "port" else []
+    for file in (there, *beside):
+        check_output(file, "the recording", (*CAPTURES, *CAN_LOGS, ".csv", ".npz", ".times"), overwrite)
+    if journal != there and os.path.lexists(journal) and not overwrite:
         to = "npz" if there.suffix.lower() == ".npz" else "csv"
         raise EdgeposeError(
             f"{journal} is of a recording that was cut short; keep it with  edgepose convert {journal} "
@@ -102,22 +104,23 @@ def check_free(path: str, overwrite: bool) -> None:
         )
 
 
-def open_output(path: str, metadata: Mapping[str, str]) -> Output:
-    """Start a recording, in the place of one that is there already.
+def open_output(path: str, metadata: Mapping[str, str], overwrite: bool = True) -> Output:
+    """Start a recording; its file appears with the first samples.
 
     Args:
         path: its name says what it takes, see `kind`; "-" is CSV on standard output.
         metadata: goes into it, where it has a place for that.
+        overwrite: whether it may take the place of one that is there already.
 
     Raises:
         EdgeposeError: it cannot be written.
     """
     takes = kind(path)
     if takes == "port":
-        return _capture(Path(path), metadata)
+        return _capture(Path(path), metadata, overwrite)
     if takes == "bus":
-        return _can_log(Path(path))
-    return _samples(path, metadata)
+        return _can_log(Path(path), overwrite)
+    return _samples(path, metadata, overwrite)
 
 
 def record(
@@ -135,7 +138,7 @@ def record(
 
     Args:
         source: the source.
-        output: where to; closed at the end, and taken away again if nothing came.
+        output: where to; closed at the end. Nothing appears, and nothing is replaced, if nothing came.
         raw: what came on the line since the last batch; the source fills it, it is emptied here.
         seconds: length of the recording on the source's clock.
         on_batch: called after each batch.
@@ -169,8 +172,6 @@ def record(
             except EdgeposeError as error:
                 summary.error = summary.error or error
     if not something:
-        for path in output.paths:
-            path.unlink(missing_ok=True)
         return summary
     try:
         output.finish()
@@ -190,24 +191,32 @@ def _write(output: Output, samples: list[ImuSample], raw: list[tuple[float, Any]
 # --- kinds --------------------------------------------------------------------------------------------------
 
 
-def _samples(path: str, metadata: Mapping[str, str]) -> Output:
+def _samples(path: str, metadata: Mapping[str, str], overwrite: bool) -> Output:
     journal = path if path == "-" else str(_journal(Path(path)))
-    file = Appender(journal, "samples", csv_header(metadata).encode())
+    header = csv_header(metadata).encode()
+    file = Appender(journal, "samples", header, overwrite=overwrite, follow=journal == path)
 
     def take(samples: list[ImuSample]) -> None:
         file.add("".join(map(csv_row, samples)).encode())
 
     def finish() -> None:
         if journal != path:
-            _finish(Path(path), Path(journal), lambda part: write_npz(part, salvage_recording(journal)))
+            _finish(
+                Path(path), Path(journal), lambda part: write_npz(part, salvage_recording(journal)), overwrite
+            )
 
-    return Output([file], take, _ignore, finish, [] if path == "-" else [Path(journal)])
+    return Output([file], take, _ignore, finish)
 
 
-def _capture(path: Path, metadata: Mapping[str, str]) -> Output:
+def _capture(path: Path, metadata: Mapping[str, str], overwrite: bool) -> Output:
     times = times_path(path)
-    bytes_file = Appender(str(path), "bytes", b"", end=b"")
-    times_file = Appender(str(times), "arrival times", times_header(metadata).encode())
+    bytes_file = Appender(str(path), "bytes", b"", end=b"", overwrite=overwrite)
+    try:
+        header = times_header(metadata).encode()
+        times_file = Appender(str(times), "arrival times", header, overwrite=overwrite)
+    except EdgeposeError:
+        bytes_file.close()
+        raise
     end = 0
 
     def take(arrival_s: float, data: bytes) -> None:
@@ -216,14 +225,14 @@ def _capture(path: Path, metadata: Mapping[str, str]) -> Output:
         bytes_file.add(data)
         times_file.add(times_row(arrival_s, end).encode())
 
-    return Output([bytes_file, times_file], _ignore, take, lambda: None, [path, times])
+    return Output([bytes_file, times_file], _ignore, take, lambda: None)
 
 
-def _can_log(path: Path) -> Output:
+def _can_log(path: Path, overwrite: bool) -> Output:
     import can
 
     journal = _journal(path)
-    file = Appender(str(journal), "CAN frames", b"")
+    file = Appender(str(journal), "CAN frames", b"", overwrite=overwrite, follow=journal == path)
     writer = can.CanutilsLogWriter(cast(TextIO, _TextFile(file)))
 
     def take(arrival_s: float, message: can.Message) -> None:
@@ -244,9 +253,9 @@ def _can_log(path: Path) -> Output:
 
     def finish() -> None:
         if journal != path:
-            _finish(path, journal, convert)
+            _finish(path, journal, convert, overwrite)
 
-    return Output([file], _ignore, take, finish, [journal])
+    return Output([file], _ignore, take, finish)
 
 
 class _TextFile:
@@ -266,10 +275,10 @@ def _ignore(*_: Any) -> None:
     """What this kind does not keep."""
 
 
-def _finish(path: Path, journal: Path, write: Callable[[Path], None]) -> None:
+def _finish(path: Path, journal: Path, write: Callable[[Path], None], overwrite: bool) -> None:
     """Make the recording of its journal."""
     try:
-        replace_file(path, write, "recording")
+        replace_file(path, write, "recording", overwrite)
     except (EdgeposeError, MemoryError) as error:
         why = str(error) or f"{path}: not enough memory"
         raise EdgeposeError(

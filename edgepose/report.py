@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.angles import ANGLES, LIMBS, Walk, joint_angles, walks
-from edgepose.appending import replace_file
+from edgepose.durable_files import write_whole
 from edgepose.figures import INK, PREDICTION, require_matplotlib, skeleton_strip
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import FILLING_WINDOW, held_sensors, longest_holds, status_bits
@@ -76,11 +76,7 @@ def write_report(path: Path, poses: Poses, body: Body, name: str) -> None:
         f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{html.escape(name)}</title>"
         f"<style>{STYLE}</style></head><body>{chr(10).join(parts)}</body></html>\n"
     )
-
-    def write(part: Path) -> None:
-        part.write_text(page, encoding="utf-8")
-
-    replace_file(path, write, "report")
+    write_whole(path, page, "the report")
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from edgepose.calibration.body_frame import check_body_frame
 from edgepose.calibration.bones import POSES, Calibration
 from edgepose.calibration.mounting import mounting
+from edgepose.durable_files import write_whole
 from edgepose.errors import EdgeposeError
 from edgepose.imu import FILTERS
 from edgepose.placements import PLACEMENTS
@@ -104,12 +105,13 @@ def from_json(text: str, where: str = "calibration") -> Calibration:
     )
 
 
-def save(calibration: Calibration, path: str | Path) -> None:
-    """Writes the calibration as JSON."""
-    try:
-        Path(path).write_text(to_json(calibration), encoding="utf-8")
-    except OSError as error:
-        raise EdgeposeError(f"{path}: cannot write the calibration ({error.strerror or error})") from error
+def save(calibration: Calibration, path: str | Path, overwrite: bool = True) -> None:
+    """Writes the calibration as JSON; the file is whole or as it was before.
+
+    Raises:
+        EdgeposeError: it cannot be written, or is there already and not to be overwritten.
+    """
+    write_whole(path, to_json(calibration), "the calibration", overwrite)
 
 
 def load_calibration(path: str | Path) -> Calibration:

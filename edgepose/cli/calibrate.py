@@ -17,8 +17,9 @@ from edgepose.calibration import Calibration, HeadingReset, HoldSummary
 from edgepose.cli.guide import Guide
 from edgepose.cli.measuring import ROUTINE_S, Plan, finds_forward, live, recorded
 from edgepose.cli.options import Orientations, SourceFlags, filter_options, source_options
-from edgepose.cli.outputs import check_files
+from edgepose.cli.outputs import check_files, overwrite_option
 from edgepose.errors import EdgeposeError
+from edgepose.output_targets import check_output
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 from edgepose.sources.sensor_map import read_map
@@ -59,6 +60,7 @@ def _span(ctx: click.Context, param: click.Parameter, value: str | None) -> tupl
     show_default=True,
     help="Calibration to write, JSON; - is stdout.",
 )
+@overwrite_option
 @click.option(
     "--pose",
     type=click.Choice(list(calibration.POSES)),
@@ -125,6 +127,7 @@ def calibrate(
     filter: str,
     no_mag: bool,
     out: str,
+    overwrite: bool,
     pose: str,
     body_frame: str | None,
     heading_reset: str | None,
@@ -149,7 +152,7 @@ def calibrate(
     lying = None if heading_reset is None or not Path(heading_reset).is_file() else Path(heading_reset)
     inputs = {"--file": source.file, "--sensors": source.sensors, "--heading-reset": lying}
     check_files({"--out": out}, inputs)
-    _check_writable(out)
+    _check_writable(out, overwrite)
     said = None if source.sensors is None else read_map(source.sensors)
     mounted = {} if said is None else {name: device.mounting for name, device in said.devices.items()}
     plan = Plan(pose, heading_reset, _words(heading_reset, mounted), motion, hold, from_s, countdown)
@@ -188,7 +191,7 @@ def calibrate(
     if out == "-":
         click.echo(calibration.to_json(result), nl=False)
     else:
-        calibration.save(result, out)
+        calibration.save(result, out, overwrite)
     say(_table(result, summary, reset))
     say(f"Wrote {'stdout' if out == '-' else out}.")
 
@@ -239,10 +242,11 @@ def _by_sensor(values: Array) -> dict[str, float | None]:
     }
 
 
-def _check_writable(out: str) -> None:
+def _check_writable(out: str, overwrite: bool) -> None:
     # Before anybody stands still for it.
     if out != "-" and not Path(out).parent.is_dir():
         raise EdgeposeError(f"{out}: no folder {Path(out).parent}; make it first or choose another --out")
+    check_output(out, "the calibration", (".json",), overwrite)
 
 
 # --- result -------------------------------------------------------------------------------------------------

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING
 import click
 
 from edgepose.cli.options import protocol_option, sensors_option
+from edgepose.cli.outputs import overwrite_option
 from edgepose.errors import EdgeposeError
+from edgepose.output_targets import check_free
 
 if TYPE_CHECKING:
     from edgepose.converter import Result
@@ -57,6 +59,7 @@ if TYPE_CHECKING:
     help="Recordings converted at a time, each by a process of its own.",
 )
 @click.option("--skip-existing", is_flag=True, help="Leave out recordings whose output is there already.")
+@overwrite_option
 def convert(
     inputs: tuple[Path, ...],
     to: str,
@@ -67,6 +70,7 @@ def convert(
     sensors: Path | None,
     jobs: int,
     skip_existing: bool,
+    overwrite: bool,
 ) -> None:
     """Convert recordings: CSV, NPZ, raw captures of a port, logs of a CAN bus, sessions of x-io's
     software and of Xsens' MT Manager, MVNX of Xsens' MVN, TotalCapture's .sensors and DIP-IMU's .pkl.
@@ -92,6 +96,8 @@ def convert(
     from edgepose.skeleton import default_body
     from edgepose.sources.sensor_map import read_map
 
+    if skip_existing and overwrite:
+        raise click.UsageError("--skip-existing leaves alone what --overwrite replaces: give one of them")
     # A mistake in one of these is told once.
     default_body(height)
     if sensors is not None:
@@ -99,6 +105,8 @@ def convert(
     planned = plan(inputs, to, out)
     done = {job: Result(job, skipped=True) for job in planned if skip_existing and job.target.exists()}
     todo = [job for job in planned if job not in done]
+    if not overwrite:
+        check_free((job.target for job in todo), "give --skip-existing, --overwrite or another --out")
     try:
         options = Options(protocol, sensors, filter, height)
         for result in _with_progress(convert_all(todo, options, jobs), len(todo)):

@@ -56,14 +56,19 @@ class OpenRig:
             self._orient = Orientations(flags.filter, magnetometer=calibration.north)
         self._sinks: list[Sink] = []
 
-    def open_outputs(self, stack: ExitStack, rate: float) -> None:
-        """Opens the outputs, which the stack closes, for so many poses a second.
+    def open_outputs(self, stack: ExitStack, rate: float, stopped: Callable[[], bool]) -> None:
+        """Opens the outputs.
+
+        Args:
+            stack: closes them.
+            rate: poses a second.
+            stopped: whether the run is to end, see `OutputFlags.open`.
 
         Raises:
             EdgeposeError: one cannot be written to.
         """
         with named(self._flags.name):
-            self._sinks = self._flags.outputs.open(stack, rate)
+            self._sinks = self._flags.outputs.open(stack, rate, stopped)
 
     def walk(self, rate: float, several: bool, on_pose: Callable[[RunSummary], None]) -> Walk:
         """From samples to the outputs.

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from edgepose.errors import EdgeposeError
+from edgepose.output_targets import check_output
 
 if TYPE_CHECKING:
     from edgepose.sinks import Sink
@@ -30,6 +31,7 @@ class OutputFlags(NamedTuple):
     tcp: tuple[str, int] | None
     view: bool
     height: float
+    overwrite: bool
 
     @property
     def any(self) -> bool:
@@ -42,39 +44,60 @@ class OutputFlags(NamedTuple):
         """The files that are asked for, by flag."""
         return {"--csv": self.csv, "--npz": self.npz, "--bvh": self.bvh}
 
-    def open(self, stack: ExitStack, rate: float = 60.0) -> list[Sink]:
-        """The sinks, which the stack closes; `rate` is that of the poses, per second.
+    def check(self) -> None:
+        """Make sure that no file is lost by what is asked for.
+
+        Raises:
+            EdgeposeError: one is there already, or cannot be written.
+        """
+        for name, ending in ((self.csv, ".csv"), (self.npz, ".npz"), (self.bvh, ".bvh")):
+            if name is not None:
+                check_output(name, "poses", (ending,), self.overwrite)
+
+    def open(
+        self, stack: ExitStack, rate: float = 60.0, stopped: Callable[[], bool] = lambda: False
+    ) -> list[Sink]:
+        """The sinks, which the stack closes.
+
+        Args:
+            stack: closes them.
+            rate: of the poses, per second.
+            stopped: whether the run is to end: then a reader that takes nothing is not waited for.
 
         Raises:
             EdgeposeError: a file or address cannot be written to.
         """
-        from edgepose.sinks.bvh import BvhSink
-        from edgepose.sinks.csv_file import CsvSink
-        from edgepose.sinks.npz import NpzSink
+        from edgepose.sinks.files import bvh_sink, csv_sink, npz_sink
         from edgepose.sinks.tcp import TcpSink
         from edgepose.sinks.udp import UdpSink
-        from edgepose.sinks.view import ViewSink
+        from edgepose.sinks.view import ViewSink, check_viewer
         from edgepose.sinks.vmc import VmcSink
         from edgepose.skeleton import default_body
 
+        self.check()
+        if self.view:
+            check_viewer()
         body = default_body(self.height)
         sinks: list[Sink] = []
 
         def add(sink: Sink) -> None:
             sinks.append(stack.enter_context(sink))
 
-        if self.csv is not None:
-            add(CsvSink(self.csv, self.rotations, self.std))
-        if self.npz is not None:
-            add(NpzSink(self.npz, rate))
-        if self.bvh is not None:
-            add(BvhSink(self.bvh, rate, body))
+        # Addresses first: a wrong one is told before anybody is waited for who reads a pipe.
         if self.udp is not None:
             add(UdpSink(*self.udp))
         if self.osc is not None:
             add(VmcSink(*self.osc, body))
         if self.tcp is not None:
             add(TcpSink(*self.tcp))
+        if self.npz is not None:
+            add(npz_sink(self.npz, rate, overwrite=self.overwrite, stopped=stopped))
+        if self.bvh is not None:
+            add(bvh_sink(self.bvh, rate, body, overwrite=self.overwrite, stopped=stopped))
+        if self.csv is not None:
+            add(csv_sink(self.csv, self.rotations, self.std, overwrite=self.overwrite, stopped=stopped))
+        for sink in sinks:
+            sink.start()
         if self.view:
             add(ViewSink(self.height))
         return sinks
@@ -142,6 +165,10 @@ def address(ctx: click.Context, param: click.Parameter, value: str | None) -> tu
         raise click.BadParameter(str(error)) from None
 
 
+overwrite_option = click.option("--overwrite", is_flag=True, help="Replace files that are there already.")
+"""The flag --overwrite."""
+
+
 def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Adds the flags that say where poses go; the command gets them as `outputs: OutputFlags`."""
     flags = [
@@ -188,6 +215,7 @@ def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
             show_default=True,
             help="The wearer's stature, for the bones of --bvh, --osc and --view, metres.",
         ),
+        overwrite_option,
     ]
 
     @functools.wraps(command)

@@ -14,6 +14,7 @@ import click
 
 from edgepose import __version__
 from edgepose.cli.options import SourceFlags, source_options
+from edgepose.cli.outputs import overwrite_option
 from edgepose.cli.stop import Stop
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     type=click.FloatRange(0, min_open=True),
     help="Length of the recording from the first sample on.  [default: until Ctrl-C or the end of --file]",
 )
-@click.option("--overwrite", is_flag=True, help="Replace a recording of that name.")
+@overwrite_option
 def record(source: SourceFlags, out: str, seconds: float | None, overwrite: bool) -> None:
     """Write what arrives to OUT until Ctrl-C; at most the last second is lost when the power goes.
 
@@ -60,7 +61,7 @@ def record(source: SourceFlags, out: str, seconds: float | None, overwrite: bool
         recorder.check_free(out, overwrite)
         opened = stack.enter_context(source.open(raw if kind != "samples" else None))
         stop = stack.enter_context(Stop())
-        output = recorder.open_output(out, _metadata(source))
+        output = recorder.open_output(out, _metadata(source), overwrite)
         _say(f"recording to {out}; Ctrl-C ends it. Samples are counted in the order {', '.join(PLACEMENTS)}")
         summary = recorder.record(
             opened,

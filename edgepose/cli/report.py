@@ -6,13 +6,16 @@ from pathlib import Path
 
 import click
 
+from edgepose.cli.outputs import overwrite_option
+from edgepose.output_targets import check_output
+
 
 @click.command(short_help="Make a page with angles, steps and sensors of poses.")
 @click.argument("poses", type=click.Path(path_type=Path))
 @click.option(
     "--out",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="HTML file to write, replaced if it is there.  [default: POSES with the ending .html]",
+    help="HTML file to write.  [default: POSES with the ending .html]",
 )
 @click.option(
     "--height",
@@ -21,7 +24,8 @@ import click
     show_default=True,
     help="The wearer's stature, for the figures and for telling steps, metres.",
 )
-def report(poses: Path, out: Path | None, height: float) -> None:
+@overwrite_option
+def report(poses: Path, out: Path | None, height: float, overwrite: bool) -> None:
     """Make one HTML page about the poses of a file (CSV, BVH, or NPZ with the keys of AMASS): figures, steps
     and cadence, joint angles over time, ranges of motion, and how often each sensor was silent.
 
@@ -39,6 +43,7 @@ def report(poses: Path, out: Path | None, height: float) -> None:
     path = poses.with_suffix(".html") if out is None else out
     if path.resolve() == poses.resolve():
         raise click.UsageError(f"--out would overwrite {poses}; name another file")
+    check_output(path, "the report", (".html", ".htm"), overwrite)
     body = default_body(height)
     write_report(path, read_poses(poses), body, poses.name)
     click.echo(f"Wrote {path}.")

@@ -63,8 +63,8 @@ if TYPE_CHECKING:
     default="auto",
     show_default=True,
     help="Numbers that the model's weights are kept in: fewer bytes run faster. auto is fp16 on "
-    "x86-64 and on ARM processors with asimdfhm, else f32 (Raspberry Pi); int8 is the fastest on x86-64 alone, "
-    "about 0.2 deg from f32.",
+    "x86-64 and on ARM processors with asimdfhm, else f32 (Raspberry Pi); int8 is the fastest on x86-64 "
+    "alone, about 0.2 deg from f32.",
 )
 def run(
     rigs: list[RigFlags],
@@ -124,7 +124,7 @@ def run(
         engine = _engine(module, past, future, rigs, windows, precision)
         stop = stack.enter_context(Stop())
         for rig in opened:
-            rig.open_outputs(stack, rate)
+            rig.open_outputs(stack, rate, lambda: stop.asked)
         whose = f"{len(rigs)} wearers with " if several else ""
         hint = ", r re-zeroes headings" if keys.listening else ""
         _say(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import stat
-import sys
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
@@ -11,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from edgepose.appending import is_regular
 from edgepose.cli.outputs import check_files
 from edgepose.errors import EdgeposeError, named
+from edgepose.output_targets import has_reader
 
 if TYPE_CHECKING:
     from edgepose.cli.rigs import RigFlags
@@ -47,11 +45,14 @@ def check_all_files(rigs: Sequence[RigFlags], model: Path) -> None:
         outputs |= {whose + flag: file for flag, file in rig.outputs.files.items()}
         inputs |= {whose + flag: file for flag, file in _inputs(rig).items()}
     check_files(outputs, inputs)
+    for rig in rigs:
+        with named(rig.name):
+            rig.outputs.check()
     if sum(rig.outputs.csv == "-" for rig in rigs) > 1:
         raise click.UsageError("several wearers write CSV to standard output; give all but one a file")
     if len(rigs) > 1:
         for flag, file in outputs.items():
-            if file is not None and not _keeps_up(str(file)):
+            if file is not None and has_reader(file):
                 raise click.UsageError(
                     f"{flag} {file} is no file on a disk: a slow reader of it would hold up every wearer; "
                     "give each a file, --udp or --tcp"
@@ -98,13 +99,3 @@ def _map(rig: RigFlags) -> SensorMap | None:
     from edgepose.sources.sensor_map import read_map
 
     return None if rig.source.sensors is None else read_map(rig.source.sensors)
-
-
-def _keeps_up(file: str) -> bool:
-    """Whether it is a file on a disk, or nothing that could be opened yet."""
-    if file == "-":
-        return is_regular(sys.stdout.buffer)
-    try:
-        return stat.S_ISREG(Path(file).stat().st_mode)
-    except OSError:
-        return True

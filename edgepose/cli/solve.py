@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 import click
 
 from edgepose.cli.bodies import BodyFlags, body_options
-from edgepose.cli.outputs import check_files
+from edgepose.cli.outputs import check_files, overwrite_option
 from edgepose.errors import EdgeposeError
+from edgepose.output_targets import check_output
 
 if TYPE_CHECKING:
     from edgepose.offline.measurements import Measurements
@@ -107,6 +108,7 @@ def _weights(ctx: click.Context, param: click.Parameter, value: str) -> Weights:
 @click.option("--npz", metavar="FILE", help="Write poses as NPZ with AMASS's keys.")
 @click.option("--bvh", metavar="FILE", help="Write poses as BVH.")
 @click.option("--plot", metavar="FILE", help="Draw costs and residuals over time, a picture.")
+@overwrite_option
 def solve(
     recording: Path,
     calibration_path: Path,
@@ -123,6 +125,7 @@ def solve(
     npz: str | None,
     bvh: str | None,
     plot: str | None,
+    overwrite: bool,
 ) -> None:
     """Find the poses of a whole recording at once: Sparse Inertial Poser.
 
@@ -141,10 +144,13 @@ def solve(
         {"--csv": csv, "--npz": npz, "--bvh": bvh, "--plot": plot},
         {"IN": recording, "--calibration": calibration_path},
     )
+    for name, ending in ((csv, ".csv"), (npz, ".npz"), (bvh, ".bvh")):
+        if name is not None:
+            check_output(name, "poses", (ending,), overwrite)
     if plot is not None:
         from edgepose.figures import check_picture
 
-        check_picture(Path(plot), "--plot")
+        check_picture(Path(plot), "--plot", overwrite)
 
     from edgepose.calibration import load_calibration
     from edgepose.offline import reading, report
@@ -155,9 +161,7 @@ def solve(
     from edgepose.offline.solve import Settings
     from edgepose.offline.solve import solve as solve_all
     from edgepose.offline.translation import pelvis_path
-    from edgepose.sinks.bvh import BvhSink
-    from edgepose.sinks.csv_file import CsvSink
-    from edgepose.sinks.npz import NpzSink
+    from edgepose.sinks.files import bvh_sink, csv_sink, npz_sink
 
     wearer, prior = body.build(), load_prior(prior_path)
     calibration = load_calibration(calibration_path)
@@ -171,12 +175,19 @@ def solve(
     with ExitStack() as stack:
         # Opened before the work: a wrong name is told at once.
         sinks: list[Sink] = []
-        if csv is not None:
-            sinks.append(stack.enter_context(CsvSink(csv, rotations, translation=True)))
+
+        def add(sink: Sink) -> None:
+            sinks.append(stack.enter_context(sink))
+
+        interrupted = False
         if npz is not None:
-            sinks.append(stack.enter_context(NpzSink(npz, rate, translation=True)))
+            add(npz_sink(npz, rate, True, overwrite=overwrite, stopped=lambda: interrupted))
         if bvh is not None:
-            sinks.append(stack.enter_context(BvhSink(bvh, rate, wearer)))
+            add(bvh_sink(bvh, rate, wearer, overwrite=overwrite, stopped=lambda: interrupted))
+        if csv is not None:
+            add(csv_sink(csv, rotations, translation=True, overwrite=overwrite, stopped=lambda: interrupted))
+        for sink in sinks:
+            sink.start()
         solutions, interrupted = _collect(solve_all(measurements, settings, jobs, _progress()))
         if not solutions:
             raise KeyboardInterrupt

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from edgepose.durable_files import replace_file
 from edgepose.errors import EdgeposeError
 from edgepose.npz import BROKEN, open_npz
 from edgepose.offline.kinematics import JOINT_COUNT
@@ -65,11 +66,12 @@ def save_prior(path: str | Path, prior: Prior) -> None:
         EdgeposeError: the file cannot be written.
     """
     numbers = {name: getattr(prior, name).astype(np.float32) for name in Prior._fields[:-1]}
-    try:
-        with Path(path).open("wb") as file:
+
+    def write(part: Path) -> None:
+        with part.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, about=np.array(prior.about), **numbers)
-    except OSError as error:
-        raise EdgeposeError(f"{path}: cannot write the prior ({error.strerror or error})") from error
+
+    replace_file(path, write, "the prior")
 
 
 def load_prior(path: str | Path | None = None) -> Prior:

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from edgepose.errors import EdgeposeError
-from edgepose.figures import require_matplotlib
+from edgepose.figures import require_matplotlib, save_picture
 from edgepose.offline.measurements import Measurements
 from edgepose.offline.solve import Solution
 from edgepose.offline.terms import Costs
@@ -87,7 +86,4 @@ def plot(path: str | Path, solution: Solution, measurements: Measurements) -> No
     pulls.set_xlabel("time, s")
     for axes in (costs, turns):
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7, frameon=False)
-    try:
-        figure.savefig(path)
-    except (OSError, ValueError) as error:  # ValueError: an ending that matplotlib does not know
-        raise EdgeposeError(f"cannot write the picture {path}: {error}") from error
+    save_picture(figure, path)

@@ -14,6 +14,13 @@ Self = TypeVar("Self", bound="Sink")
 class Sink(ABC):
     """An output of poses, open from its construction until `close`; use it in a `with` statement."""
 
+    def start(self) -> None:  # noqa: B027 - most outputs have nothing to do
+        """The run begins: a file may appear.
+
+        Raises:
+            EdgeposeError: it cannot.
+        """
+
     @abstractmethod
     def write(self, pose: PoseFrame) -> None:
         """Take the next pose.
@@ -26,6 +33,10 @@ class Sink(ABC):
     def close(self) -> None:
         """Finish the output; a second call does nothing."""
 
+    def discard(self) -> None:
+        """Finish the output after a failure: as `close`, but without a pose no file appears."""
+        self.close()
+
     def __enter__(self: Self) -> Self:
         """The sink itself, open since its construction."""
         return self
@@ -34,4 +45,7 @@ class Sink(ABC):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Close, whatever happened."""
-        self.close()
+        if kind is None:
+            self.close()
+        else:
+            self.discard()

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from edgepose.appending import FLUSH_S, explain, open_output, write_rows
 from edgepose.errors import EdgeposeError
+from edgepose.growing_files import FLUSH_S, GrowingFile
+from edgepose.output_targets import is_stream
 from edgepose.pose import PoseFrame
 from edgepose.rotations import matrix_to_euler_zxy
 from edgepose.sinks import Sink
@@ -79,58 +80,78 @@ class BvhSink(Sink):
     The body frame T is the file's world: X to the wearer's left, Y up, Z forward; lengths in cm.
     """
 
-    def __init__(self, path: str | Path, rate: float = 60.0, body: Body | None = None) -> None:
+    def __init__(
+        self, path: str | Path, rate: float = 60.0, body: Body | None = None, *, overwrite: bool = True
+    ) -> None:
         """Open the file and write the skeleton.
 
         Args:
-            path: file to write, replaced if it exists.
+            path: file to write; it appears with the first poses.
             rate: frames per second.
             body: whose bone lengths the file gets; the default body if None.
+            overwrite: whether it may take the place of a file.
 
         Raises:
             EdgeposeError: the file cannot be written.
         """
-        self._path = str(path)
         offsets = (body or default_body()).offsets.copy()
         self._standing = standing_place(offsets)
         self._channels = np.array(depth_first())
         self._before = np.zeros((len(JOINTS), 3))
         self._poses: list[PoseFrame] = []
-        self._count, self._closed = 0, False
-        if self._path == "-" or (Path(path).exists() and not Path(path).is_file()):
+        self._count, self._closed, self._empty = 0, False, True
+        if is_stream(path):
             raise EdgeposeError(
                 f"cannot write BVH to {path}: it must be a file on a disk, as its start tells how long it is"
             )
-        self._file = open_output(self._path, "poses")
+        output = GrowingFile(path, "poses", overwrite=overwrite)
+        self._output, self._file = output, output.file
         head = f"{hierarchy(offsets * 100)}MOTION\n{_COUNT}"
         self._count_at = len(head)
         head += f"{0:<{_DIGITS}}\nFrame Time: {1 / rate:.8f}\n"
         self._flushed = time.monotonic()
         try:
-            self._append(head.encode())
+            output.write(head.encode())
         except EdgeposeError:
-            self._closed = True
-            self._file.close()
+            self.discard()
             raise
+
+    def start(self) -> None:
+        """Let the file appear; where one is there already, with the first pose.
+
+        Raises:
+            EdgeposeError: another file is there now.
+        """
+        if not self._output.exists:
+            self._output.start()
 
     def write(self, pose: PoseFrame) -> None:
         """Add a frame."""
+        if self._empty:
+            self._empty = False
+            self._output.start()
         self._poses.append(pose)
         if len(self._poses) >= BLOCK or time.monotonic() - self._flushed >= FLUSH_S:
             self._flush()
 
     def close(self) -> None:
-        """Write what is still held back and close the file; a second call does nothing."""
+        """Write what is still held back and close the file; a second call does nothing. A file that is there
+        already stays if no pose has come."""
         if self._closed:
             return
         self._closed = True
         try:
             self._flush()
         finally:
-            try:
-                self._file.close()
-            except OSError as error:  # Network file systems may report a full disk only here.
-                raise EdgeposeError(explain(error, self._path, "poses")) from error
+            self._output.close()
+
+    def discard(self) -> None:
+        """As `close`, but without a pose no file appears."""
+        if not self._empty:
+            self.close()
+            return
+        self._closed = True
+        self._output.discard()
 
     def _flush(self) -> None:
         poses, self._poses = self._poses, []
@@ -140,7 +161,7 @@ class BvhSink(Sink):
         rows = self._rows(poses)
         start = self._file.tell()
         try:
-            self._append(rows)
+            self._output.write(rows)
         finally:
             self._count += rows[: self._file.tell() - start].count(b"\n")
             end = self._file.seek(0, 2)
@@ -161,9 +182,3 @@ class BvhSink(Sink):
         table = np.concatenate([100.0 * np.array(places, float), values], axis=1)
         line = " ".join(["%.4f"] * table.shape[1]) + "\n"
         return "".join(line % tuple(row) for row in table.tolist()).encode()
-
-    def _append(self, data: bytes) -> None:
-        try:
-            write_rows(self._file, data)
-        except OSError as error:
-            raise EdgeposeError(explain(error, self._path, "poses")) from error

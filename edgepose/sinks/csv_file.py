@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
-from edgepose.appending import FLUSH_S, explain, is_regular, open_output, write_rows
 from edgepose.errors import EdgeposeError
+from edgepose.growing_files import FLUSH_S, GrowingFile
 from edgepose.pose import PoseFrame
 from edgepose.rotations import matrix_to_euler_zxy, matrix_to_quat, matrix_to_rotvec
 from edgepose.sinks import Sink
@@ -55,14 +56,21 @@ class CsvSink(Sink):
         rotations: str = "axis-angle",
         std: bool = False,
         translation: bool = False,
+        *,
+        overwrite: bool = True,
+        follow: bool = True,
+        stopped: Callable[[], bool] = lambda: False,
     ) -> None:
         """Open the file and write the header.
 
         Args:
-            path: file to write, replaced if it exists; "-" is standard output.
+            path: file to write; "-" is standard output. It appears with the first pose.
             rotations: a key of `FORMS`; angles are in radians.
             std: add the network's standard deviation of each joint, radians.
             translation: add the place of the pelvis, metres, which every pose must then have.
+            overwrite: whether it may take the place of a file.
+            follow: write to the file at the end of a link; without, in the place of the link.
+            stopped: whether the run is to end: then a reader that takes nothing is not waited for.
 
         Raises:
             EdgeposeError: the file cannot be written.
@@ -72,19 +80,29 @@ class CsvSink(Sink):
         self._rotations, self._std, self._translation = rotations, std, translation
         columns = pose_columns(rotations, std, translation)
         self._format = ",".join(["%d,%.6f,%s"] + ["%.6f"] * (len(columns) - 3)) + "\n"
-        self._path = str(path)
-        self._closed = False
-        self._file = open_output(self._path, "poses")
-        self._regular = is_regular(self._file)
+        self._closed, self._empty = False, True
+        self._file = GrowingFile(path, "poses", overwrite=overwrite, follow=follow, stopped=stopped)
         self._rows = [",".join(columns) + "\n"]
         try:
             self._flush()
         except EdgeposeError:
-            self.close()
+            self.discard()
             raise
+
+    def start(self) -> None:
+        """Let the file appear; where one is there already, with the first pose.
+
+        Raises:
+            EdgeposeError: another file is there now.
+        """
+        if not self._file.exists:
+            self._file.start()
 
     def write(self, pose: PoseFrame) -> None:
         """Add a row; a file has it on disk within about a second."""
+        if self._empty:
+            self._empty = False
+            self._file.start()
         numbers = _numbers(self._rotations, pose.rotations).ravel().tolist()
         if self._std:
             numbers += pose.std.tolist()
@@ -93,27 +111,30 @@ class CsvSink(Sink):
                 raise ValueError(f"pose {pose.index} has no translation")
             numbers += pose.translation.tolist()
         self._rows.append(self._format % (pose.index, pose.time_s, pose.status, *numbers))
-        if not self._regular or time.monotonic() - self._flushed >= FLUSH_S:
+        if not self._file.regular or time.monotonic() - self._flushed >= FLUSH_S:
             self._flush()
 
     def close(self) -> None:
-        """Write what is still held back and close the file; standard output stays open."""
+        """Write what is still held back and close the file; standard output stays open. A file that is there
+        already stays if no pose has come."""
         if self._closed:
             return
         self._closed = True
         try:
             self._flush()
         finally:
-            if self._path != "-":
-                try:
-                    self._file.close()
-                except OSError as error:  # Network file systems may report a full disk only here.
-                    raise EdgeposeError(explain(error, self._path, "poses")) from error
+            self._file.close()
+
+    def discard(self) -> None:
+        """As `close`, but without a pose no file appears."""
+        if not self._empty:
+            self.close()
+            return
+        self._closed = True
+        self._file.discard()
 
     def _flush(self) -> None:
         rows, self._rows = "".join(self._rows).encode(), []
         self._flushed = time.monotonic()
-        try:
-            write_rows(self._file, rows)
-        except OSError as error:
-            raise EdgeposeError(explain(error, self._path, "poses")) from error
+        if rows:
+            self._file.write(rows)

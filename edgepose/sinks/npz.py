@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edgepose.appending import replace_file
+from edgepose.durable_files import replace_file
 from edgepose.errors import EdgeposeError
+from edgepose.output_targets import find_target
 from edgepose.pose import FILLING_WINDOW, PoseFrame, held_sensors, status_bits
 from edgepose.poses import Poses, read_blocks
 from edgepose.rotations import Z_UP_TO_T, matrix_to_rotvec
@@ -83,32 +85,38 @@ class NpzSink(Sink):
     a file of poses that everything reads, and no more than a second of them is in memory.
     """
 
-    def __init__(self, path: str | Path, rate: float = 60.0, translation: bool = False) -> None:
+    def __init__(
+        self, path: str | Path, rate: float = 60.0, translation: bool = False, *, overwrite: bool = True
+    ) -> None:
         """Open the CSV file.
 
         Args:
-            path: file to write, replaced if it exists.
+            path: file to write.
             rate: frames per second.
             translation: whether the poses have a translation.
+            overwrite: whether it may take the place of a file; that of another run's CSV file it never takes.
 
         Raises:
             EdgeposeError: it cannot be written, or poses of a run that was cut off are where they would go.
         """
-        self._path = Path(path)
-        if str(path) == "-" or self._path.is_dir():
+        self._path, self._overwrite = Path(path), overwrite
+        target = find_target(path, "poses")
+        if target.stream:
             raise EdgeposeError(f"cannot write poses to {path}: an NPZ file needs a file's name")
         self._part = self._path.with_name(f"{self._path.stem}.part.csv")
-        if self._part.exists():
+        if os.path.lexists(self._part):
             raise EdgeposeError(
                 f"{self._part} is there already, perhaps of a run that was cut off: keep its poses with "
                 f"edgepose convert {self._part} --to npz --out saved, then delete it"
             )
-        self._rate, self._closed = rate, False
-        self._csv = CsvSink(self._part, translation=translation)
+        self._rate, self._closed, self._count = rate, False, 0
+        self._csv = CsvSink(self._part, translation=translation, overwrite=False, follow=False)
+        self._csv.start()
 
     def write(self, pose: PoseFrame) -> None:
         """Add a pose."""
         self._csv.write(pose)
+        self._count += 1
 
     def close(self) -> None:
         """Write the file and take the other away; a second call does nothing.
@@ -118,21 +126,39 @@ class NpzSink(Sink):
         """
         if self._closed:
             return
+        if not self._count:
+            self.discard()
+            return
         self._closed = True
         try:
             self._csv.close()
         finally:  # A full disk may have room for this one, which is smaller.
             self._finish()
 
+    def discard(self) -> None:
+        """As `close`."""
+        if self._count:
+            self.close()
+            return
+        self._closed = True
+        self._csv.discard()
+
     def _finish(self) -> None:
-        with self._part.open("rb") as file:
-            count = sum(piece.count(b"\n") for piece in iter(lambda: file.read(1 << 20), b"")) - 1
+        try:
+            with self._part.open("rb") as file:
+                count = sum(piece.count(b"\n") for piece in iter(lambda: file.read(1 << 20), b"")) - 1
+        except OSError as error:
+            raise EdgeposeError(
+                f"cannot write poses to {self._path}: {self._part}, which has them, is gone: "
+                f"{error.strerror or error}"
+            ) from error
         if count > 0:
             try:
                 replace_file(
                     self._path,
                     lambda path: write_npz(path, read_blocks(self._part), count, self._rate),
                     "poses",
+                    self._overwrite,
                 )
             except EdgeposeError as error:
                 raise EdgeposeError(f"{error}; all poses are in {self._part}") from error

@@ -14,6 +14,12 @@ STOP_S = 5.0
 """Time that the viewer has to end, seconds."""
 
 
+def check_viewer() -> None:
+    """Raises EdgeposeError unless what the viewer needs is installed."""
+    if find_spec("viser") is None:
+        raise EdgeposeError("the viewer needs viser: install it with pip install 'edgepose[view]'")
+
+
 class ViewSink(UdpSink):
     """Starts `edgepose view` and sends it each pose as a datagram, of which it shows the newest."""
 
@@ -26,8 +32,7 @@ class ViewSink(UdpSink):
         Raises:
             EdgeposeError: what the viewer needs is not installed.
         """
-        if find_spec("viser") is None:
-            raise EdgeposeError("the viewer needs viser: install it with pip install 'edgepose[view]'")
+        check_viewer()
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]

@@ -6,6 +6,7 @@ import json
 import subprocess
 import warnings
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor, nn
 
 from edgepose import __version__
 from edgepose.archive import FORMAT, METADATA_FILE
+from edgepose.durable_files import write_whole
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 from edgepose.skeleton import JOINTS
@@ -89,12 +91,15 @@ def save(module: torch.jit.ScriptModule, path: Path, metadata: dict[str, object]
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with warnings.catch_warnings():
+        with TemporaryDirectory() as folder, warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="`torch.jit", category=DeprecationWarning)
-            torch.jit.save(module, str(path), _extra_files={METADATA_FILE: json.dumps(metadata, indent=2)})
+            named = Path(folder) / path.name  # the name goes into the file
+            torch.jit.save(module, str(named), _extra_files={METADATA_FILE: json.dumps(metadata, indent=2)})
+            content = named.read_bytes()
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
         raise EdgeposeError(f"{path}: cannot be written: {reason}") from error
+    write_whole(path, content, "the archive")
 
 
 def revision() -> str | None:

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edgepose.durable_files import reason
 from edgepose.errors import EdgeposeError
-from edgepose.figures import require_matplotlib
+from edgepose.figures import require_matplotlib, save_picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -101,6 +102,6 @@ def _legend(figure: Figure, axes: list[Any]) -> None:
 
 def _save(figure: Figure, path: Path) -> None:
     try:
-        figure.savefig(path, dpi=DPI)
-    except OSError as error:
-        raise EdgeposeError(f"{path}: cannot be written: {error.strerror or error}") from error
+        save_picture(figure, path, dpi=DPI)
+    except EdgeposeError as error:
+        raise EdgeposeError(f"{path}: cannot be written: {reason(error)}") from error

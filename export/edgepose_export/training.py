@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import os
 from collections.abc import Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from edgepose.durable_files import reason, write_whole
 from edgepose.errors import EdgeposeError
 from edgepose.features import ACCELERATIONS, rotation_to_6d
 from edgepose.placements import ROOT
@@ -383,18 +383,12 @@ def save_checkpoint(state: dict[str, Any], path: Path) -> None:
     Raises:
         EdgeposeError: it cannot be written (disk full).
     """
-    partial = path.with_suffix(".partial")
     content = io.BytesIO()
     torch.save(state, content)
     try:
-        with partial.open("wb") as file:
-            file.write(content.getbuffer())
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise EdgeposeError(f"{path}: cannot be written: {error.strerror or error}") from error
+        write_whole(path, content.getbuffer(), "the checkpoint")
+    except EdgeposeError as error:
+        raise EdgeposeError(f"{path}: cannot be written: {reason(error)}") from error
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

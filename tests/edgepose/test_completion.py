@@ -35,7 +35,7 @@ def completions(line: str) -> list[str]:
     [
         ("edgepose re", {"record", "report"}),
         ("edgepose convert --to ", {"csv", "npz", "bvh"}),
-        ("edgepose run --o", {"--online", "--osc"}),
+        ("edgepose run --o", {"--online", "--osc", "--overwrite"}),
         ("edgepose synth", {"synthesize"}),
     ],
 )

@@ -224,7 +224,6 @@ def two_outputs(first: Output, second: Output) -> Output:
         first.samples,
         second.raw,
         lambda: (first.finish(), second.finish()),
-        first.paths + second.paths,
     )
 
 

@@ -218,7 +218,7 @@ def test_calibrate_compares_how_sensors_are_worn(command, wearer, tmp_path):
     sits["head"] = "x up, z left" if sits["head"] != "x up, z left" else "x down, z left"
     rig = tmp_path / "rig.toml"
     rig.write_text("\n".join(f'{n} = {{ port = "{n}", mounting = "{text}" }}' for n, text in sits.items()))
-    result = command(*flags, "--sensors", rig)
+    result = command(*flags, "--overwrite", "--sensors", rig)
     assert result.returncode == 0, result.stderr
     warnings = [line for line in result.stderr.splitlines() if "rig.toml" in line]
     assert len(warnings) == 1

@@ -83,7 +83,8 @@ def test_bodies_of_every_kind(command, wearer, tmp_path):
     ):
         out = tmp_path / "poses.csv"
         result = command(
-            "solve", part, "--calibration", wearer.calibration, "--csv", out, "--evaluations", 4, *words
+            *("solve", part, "--calibration", wearer.calibration, "--csv", out, "--overwrite"),
+            *("--evaluations", 4, *words),
         )
         assert result.returncode == 0, (words, result.stderr)
         assert len(read_poses(out).rotations) == 180

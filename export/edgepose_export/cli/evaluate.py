@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from edgepose.cli.outputs import overwrite_option
+
 if TYPE_CHECKING:
     import torch
 
@@ -96,6 +98,7 @@ class _Model(NamedTuple):
     type=PICTURE,
     help="Draw actual errors against predicted standard deviations, and print them.",
 )
+@overwrite_option
 def evaluate(
     names: tuple[str, ...],
     trust: bool,
@@ -110,6 +113,7 @@ def evaluate(
     heat_map: Path | None,
     every: int,
     reliability: Path | None,
+    overwrite: bool,
 ) -> None:
     """Measure models against true poses. Every frame counts, those at the start and end of a take too.
 
@@ -135,7 +139,7 @@ def evaluate(
 
     for picture in (histogram, heat_map, reliability):
         if picture:
-            check_picture(picture, "drawing")
+            check_picture(picture, "drawing", overwrite)
     models = [_model(name, trust, modes, past, future, table) for name in names]
     if len({model.name for model in models}) < len(models):  # files of one name in several folders
         models = [model._replace(name=name) for model, name in zip(models, names, strict=True)]

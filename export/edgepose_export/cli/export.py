@@ -5,10 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from edgepose.cli.outputs import overwrite_option
+from edgepose.durable_files import write_whole
+from edgepose.output_targets import check_output
 from edgepose.precision import PRECISIONS
 from edgepose.skeleton import JOINTS
 
@@ -70,6 +74,7 @@ if TYPE_CHECKING:
     "--beside",
     help="Shipped or trusted model whose figures stand beside in the card, with --measure.",
 )
+@overwrite_option
 def export(
     checkpoints: tuple[Path, ...],
     out: Path,
@@ -79,6 +84,7 @@ def export(
     rounded: bool,
     data: Path | None,
     beside: str | None,
+    overwrite: bool,
 ) -> None:
     """Turn a checkpoint of `edgepose train` into a TorchScript archive for `edgepose run --model FILE
     --trust`.
@@ -99,6 +105,10 @@ def export(
         raise click.UsageError("--rounded is not for --precision int8, which rounds in its own way")
     if len({path.resolve() for path in checkpoints}) < len(checkpoints):
         raise click.UsageError("one checkpoint is named twice")
+    beside_it = out.with_suffix(".md")
+    if out.parent.is_dir():  # made with what it is for otherwise
+        check_output(out, "the archive", (".pt",), overwrite)
+        check_output(beside_it, "the card", (".md",), overwrite)
     import torch
 
     from edgepose.archive import find, inspect, load
@@ -134,13 +144,15 @@ def export(
 
     module = script()
     pack_weights(module, precision)
-    archive.save(module, out, metadata)
     if data:
-        metadata |= _measures(out, data, others)
+        with TemporaryDirectory() as folder:
+            measured = Path(folder) / out.name
+            archive.save(module, measured, metadata)
+            metadata |= _measures(measured, data, others)
         metadata["precisions"] = _precisions(script, metadata, data)
-        archive.save(module, out, metadata)
-    out.with_suffix(".md").write_text(card(metadata), encoding="utf-8")
-    click.echo(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB) and {out.with_suffix('.md')}", err=True)
+    archive.save(module, out, metadata)
+    write_whole(beside_it, card(metadata), "the card")
+    click.echo(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB) and {beside_it}", err=True)
 
 
 def _precisions(

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import click
 
+from edgepose.cli.outputs import overwrite_option
 from edgepose.errors import EdgeposeError
+from edgepose.output_targets import check_output
 
 RATE = 6.0
 """Poses a second that are taken; neighbours say the same."""
@@ -25,7 +27,8 @@ RATE = 6.0
     default="",
     help="What the data are and their licence, kept in the file.  [default: what the files say]",
 )
-def learn_prior(inputs: tuple[Path, ...], out: Path, about: str) -> None:
+@overwrite_option
+def learn_prior(inputs: tuple[Path, ...], out: Path, about: str, overwrite: bool) -> None:
     """Learn mean, covariance and limits of poses from motion capture (.bvh, .amc, AMASS .npz; folders are
     searched), for `edgepose solve`.
 
@@ -46,6 +49,7 @@ def learn_prior(inputs: tuple[Path, ...], out: Path, about: str) -> None:
     from edgepose_export.mocap import pieces, read_motion
     from edgepose_export.splits import part_of
 
+    check_output(out, "the prior", (".npz",), overwrite)
     files = [path for root in inputs for path in motion_files(root) if part_of(path.stem) == "train"]
     poses, sources = [np.empty((0, 24, 3))], set()
     for path in progress(files, "reading"):

@@ -11,7 +11,10 @@ from typing import NamedTuple
 
 import click
 
+from edgepose.cli.outputs import overwrite_option
+from edgepose.durable_files import replace_file
 from edgepose.errors import EdgeposeError
+from edgepose.output_targets import check_free
 from edgepose.skeleton import Body
 
 KINDS = (".bvh", ".amc", ".npz")
@@ -79,6 +82,7 @@ class Job(NamedTuple):
     help="Keep only the upper bodies: play each to and fro while the wearer stands, sits, squats and rises "
     "as drawn with this seed; half a minute a take",
 )
+@overwrite_option
 @click.option(
     "--jobs", type=click.IntRange(1), default=1, show_default=True, help="Files to work on at once."
 )
@@ -91,6 +95,7 @@ def synthesize(
     hold: float,
     mounting_seed: int | None,
     seated_seed: int | None,
+    overwrite: bool,
     jobs: int,
 ) -> None:
     """Make IMU recordings with true poses from motion capture (.bvh, .amc, AMASS .npz; folders are searched).
@@ -114,11 +119,9 @@ def synthesize(
     files = [(root, path) for root in inputs for path in motion_files(root)]
     if not files:
         raise EdgeposeError(f"no motion files ({', '.join(KINDS)}) in {', '.join(map(str, inputs))}")
-    tasks = [
-        (path, Job(out, root if root.is_dir() else root.parent, rate, body, hold, mounting_seed, seated_seed))
-        for root, path in files
-    ]
-    _check_targets(tasks)
+    how = (rate, body, hold, mounting_seed, seated_seed)
+    tasks = [(path, Job(out, root if root.is_dir() else root.parent, *how)) for root, path in files]
+    _check_targets(tasks, overwrite)
     failed = []
     with ExitStack() as stack:
         if jobs == 1:
@@ -139,8 +142,9 @@ def synthesize(
         )
 
 
-def _check_targets(tasks: list[tuple[Path, Job]]) -> None:
-    """Raises EdgeposeError if two files would become one recording, such as a take's .amc and .bvh."""
+def _check_targets(tasks: list[tuple[Path, Job]], overwrite: bool) -> None:
+    """Raises EdgeposeError if two files would become one recording, such as a take's .amc and .bvh, or if a
+    recording is there already and not to be overwritten."""
     seen: dict[Path, Path] = {}
     for path, job in tasks:
         target = job.out / path.relative_to(job.root).with_suffix(".npz")
@@ -149,6 +153,17 @@ def _check_targets(tasks: list[tuple[Path, Job]]) -> None:
         if target.resolve() == path.resolve():
             raise EdgeposeError(f"{path} would be overwritten by its recording; give another --out")
         seen[target] = path
+    if not overwrite:
+        targets = (_target(path, job, part) for path, job in tasks for part in ("", ".part1"))
+        check_free(targets, "give --overwrite or another --out")
+
+
+def _target(path: Path, job: Job, part: str) -> Path:
+    """The recording of a motion file, or of a part of it."""
+    from edgepose_export.dataset import SEATED
+
+    kind = "" if job.seated_seed is None else SEATED
+    return job.out / path.relative_to(job.root).with_name(f"{path.stem}{part}{kind}.npz")
 
 
 def motion_files(root: Path) -> list[Path]:
@@ -162,7 +177,6 @@ def convert(path: Path, job: Job) -> str | None:
     """Converts one file, in parts where its source jumps; what was wrong with it, or None."""
     import numpy as np
 
-    from edgepose_export.dataset import SEATED
     from edgepose_export.mocap import pieces, read_motion, resample
     from edgepose_export.seating import seated
     from edgepose_export.synthesis import random_mounting, recording_arrays, virtual_imus, with_hold
@@ -182,10 +196,10 @@ def convert(path: Path, job: Job) -> str | None:
                 motion = with_hold(motion, job.hold_s)
             imus = virtual_imus(motion, job.body, mounting)
             part = f".part{i + 1}" if len(takes) > 1 else ""
-            kind = "" if job.seated_seed is None else SEATED
-            target = job.out / path.relative_to(job.root).with_name(f"{path.stem}{part}{kind}.npz")
+            target = _target(path, job, part)
             target.parent.mkdir(parents=True, exist_ok=True)
-            np.savez(target, **recording_arrays(motion, imus, LICENSES[motion.source]))
+            arrays = recording_arrays(motion, imus, LICENSES[motion.source])
+            replace_file(target, lambda file, arrays=arrays: np.savez(file, **arrays), "recording")
     except EdgeposeError as error:
         return str(error)
     except OSError as error:
