@@ -14,6 +14,22 @@ class EdgeposeError(Exception):
     """
 
 
+def as_told(error: Exception) -> EdgeposeError:
+    """An error as the user is told of it; what nobody has foreseen is the cause of what it becomes."""
+    if isinstance(error, EdgeposeError):
+        return error
+    text = (str(error).splitlines() or [""])[0]
+    if isinstance(error, MemoryError):
+        told = EdgeposeError("not enough memory; give it a shorter file")
+    else:
+        told = EdgeposeError(
+            f"an unexpected fault ({type(error).__name__}: {text}); please report it, with what edgepose --debug "
+            "shows"
+        )
+    told.__cause__ = error
+    return told
+
+
 @contextmanager
 def named(whose: str) -> Iterator[None]:
     """Errors say whose they are, where he has a name."""

@@ -6,15 +6,26 @@ its state, and arrays are built from those.
 
 from __future__ import annotations
 
+import io
 import pickle
 import re
+import struct
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, ClassVar
 
 import numpy as np
 
 from edgepose.errors import EdgeposeError
+
+MOST_STEPS = 5_000_000
+"""Instructions of a pickle that are followed; a file of arrays has some hundred. About five seconds."""
+
+MOST_PARTS = 100_000
+"""Parts of a tuple, those of the tuples in it counted as often as they are there."""
+
+MOST_KEY_PARTS = 100
+"""Parts of a tuple that is a key: hashing goes through all of them, each time."""
 
 
 class Inert:
@@ -67,6 +78,36 @@ def _encode(text: str, encoding: str) -> bytes:
     return text.encode("latin1")
 
 
+def _no_bytes(*count: Any) -> bytes:
+    """How protocol 2 writes bytes where there are none; an argument could ask for any number of them."""
+    if count:
+        raise pickle.UnpicklingError("bytes made of something else")
+    return b""
+
+
+def _set(items: Any = ()) -> set[Any]:
+    """A set of a list; what is no list could be of any length."""
+    if not isinstance(items, (list, tuple)):
+        raise pickle.UnpicklingError(f"a set of {type(items).__name__}")
+    for item in items:
+        _check_key(item)
+    return set(items)
+
+
+class _Tuple(tuple):
+    """A tuple that knows of how many parts it is, as those of the tuples in it count anew each time.
+
+    A few bytes of a pickle can put a tuple into itself forty times; to hash or compare it would never end.
+    """
+
+    parts = 0
+
+
+def _check_key(key: Any) -> None:
+    if isinstance(key, _Tuple) and key.parts > MOST_KEY_PARTS:
+        raise pickle.UnpicklingError("a key of too many parts")
+
+
 def _functions() -> dict[tuple[str, str], Any]:
     """What a pickle may call, by module and name, made anew for each file."""
     # A pickle can set attributes of what it names, so it gets classes and functions of its own.
@@ -82,20 +123,38 @@ def _functions() -> dict[tuple[str, str], Any]:
             shape, dtype, order == "F", data
         )
     for module in ("builtins", "__builtin__"):
-        functions.update({(module, "object"): object, (module, "set"): set, (module, "bytes"): bytes})
+        functions.update({(module, "object"): object, (module, "set"): _set, (module, "bytes"): _no_bytes})
     for module in ("copyreg", "copy_reg"):
         # How protocols 0 and 1 make an object; every class that can be named here is a stand-in.
         functions[module, "_reconstructor"] = lambda kind, *_: kind()
     return functions
 
 
-class _Unpickler(pickle.Unpickler):
-    """Builds stand-ins; refuses by name every class and function that arrays do not need."""
+def _counted(follow: Callable[[Any], None]) -> Callable[[Any], None]:
+    def step(self: _Unpickler) -> None:
+        self.steps += 1
+        if self.steps > MOST_STEPS:
+            raise pickle.UnpicklingError("it is too long")
+        follow(self)
 
-    def __init__(self, file: BinaryIO, path: Path, inert: Callable[[str, str], bool], advice: str) -> None:
-        super().__init__(file, encoding="latin1")
+    return step
+
+
+_PythonUnpickler: Any = pickle._Unpickler
+
+
+class _Unpickler(_PythonUnpickler):
+    """Builds stand-ins; refuses by name every class and function that arrays do not need.
+
+    The one in Python rather than that in C, which a few bytes keep busy for ever, or make take all memory:
+    this one can be told where to end.
+    """
+
+    def __init__(self, content: bytes, path: Path, inert: Callable[[str, str], bool], advice: str) -> None:
+        super().__init__(io.BytesIO(content), encoding="latin1")
         self.path, self.inert, self.advice = path, inert, advice
         self.functions = _functions()
+        self.steps = 0
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) in self.functions:
@@ -103,6 +162,68 @@ class _Unpickler(pickle.Unpickler):
         if self.inert(module, name):
             return type(name, (Inert,), {})
         raise EdgeposeError(f"{self.path}: the file asks for {module}.{name}, {self.advice}")
+
+    def _tuple_of(self, items: list[Any]) -> _Tuple:
+        made = _Tuple(items)
+        made.parts = 1 + sum(item.parts if isinstance(item, _Tuple) else 1 for item in items)
+        if made.parts > MOST_PARTS:
+            raise pickle.UnpicklingError("a tuple of too many parts")
+        return made
+
+    def _check_keys(self, keys: list[Any]) -> None:
+        for key in keys:
+            _check_key(key)
+
+    def load_tuple(self) -> None:
+        items = self.pop_mark()
+        self.append(self._tuple_of(items))
+
+    def _load_tuple_of_last(self, count: int) -> None:
+        self.stack[-count:] = [self._tuple_of(self.stack[-count:])]
+
+    def load_tuple1(self) -> None:
+        self._load_tuple_of_last(1)
+
+    def load_tuple2(self) -> None:
+        self._load_tuple_of_last(2)
+
+    def load_tuple3(self) -> None:
+        self._load_tuple_of_last(3)
+
+    def load_setitem(self) -> None:
+        self._check_keys(self.stack[-2:-1])
+        super().load_setitem()
+
+    def load_setitems(self) -> None:
+        self._check_keys(self.stack[::2])
+        super().load_setitems()
+
+    def load_dict(self) -> None:
+        self._check_keys(self.stack[::2])
+        super().load_dict()
+
+    def load_additems(self) -> None:
+        self._check_keys(self.stack)
+        super().load_additems()
+
+    def load_frozenset(self) -> None:
+        self._check_keys(self.stack)
+        super().load_frozenset()
+
+    def load_bytearray8(self) -> None:
+        (size,) = struct.unpack("<Q", self.read(8))
+        self.append(bytearray(self.read(size)))
+
+    _OWN = (
+        *((pickle.TUPLE, load_tuple), (pickle.TUPLE1, load_tuple1), (pickle.TUPLE2, load_tuple2)),
+        *((pickle.TUPLE3, load_tuple3), (pickle.SETITEM, load_setitem), (pickle.SETITEMS, load_setitems)),
+        *((pickle.DICT, load_dict), (pickle.ADDITEMS, load_additems), (pickle.FROZENSET, load_frozenset)),
+        (pickle.BYTEARRAY8, load_bytearray8),
+    )
+    dispatch: ClassVar = {
+        code: _counted(follow)
+        for code, follow in (_PythonUnpickler.dispatch | {code[0]: follow for code, follow in _OWN}).items()
+    }
 
 
 def read_pickle(
@@ -120,14 +241,14 @@ def read_pickle(
         EdgeposeError: the file asks for code, is broken, or is no dictionary.
         OSError: it cannot be read.
     """
-    with path.open("rb") as file:
-        try:
-            content = _Unpickler(file, path, inert, advice).load()
-        except (EdgeposeError, OSError):
-            raise
-        except Exception as error:  # a broken pickle can fail in any way
-            reason = str(error).partition("\n")[0]
-            raise EdgeposeError(f"{path}: not a readable {what}: {reason}") from error
+    data = path.read_bytes()
+    try:
+        content = _Unpickler(data, path, inert, advice).load()
+    except EdgeposeError:
+        raise
+    except Exception as error:  # a broken pickle can fail in any way
+        reason = str(error).partition("\n")[0]
+        raise EdgeposeError(f"{path}: not a readable {what}: {reason}") from error
     if not isinstance(content, dict):
         raise EdgeposeError(f"{path}: {what} holds a dictionary, this one a {type(content).__name__}")
     return content
@@ -145,12 +266,25 @@ def numbers(value: Any, name: str, path: Path) -> np.ndarray:
     return array
 
 
+def _bounded(value: Any) -> Any:
+    """A value that numpy can make an array of without end: a list may hold itself many times."""
+    waiting, parts = [value], 0
+    while waiting:
+        own = waiting.pop()
+        if isinstance(own, (list, tuple)):
+            parts += len(own)
+            if parts > MOST_STEPS:
+                raise ValueError("a list of too many parts")
+            waiting += own
+    return value
+
+
 def array_of(value: Any, name: str, path: Path) -> np.ndarray:
     """As `numbers`, with NaN and infinity as they are."""
     if isinstance(value, Inert) and isinstance(value.state, dict):
         value = value.state.get("x")
     try:
-        array = value.build() if isinstance(value, _Array) else np.asarray(value)
+        array = value.build() if isinstance(value, _Array) else np.asarray(_bounded(value))
     except (TypeError, ValueError) as error:
         raise EdgeposeError(f"{path}: {name} is not an array of numbers") from error
     if array.dtype.kind not in "fiu":

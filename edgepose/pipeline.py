@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from edgepose.calibration import apply
 from edgepose.engine import Body, Engine, EngineOutput
-from edgepose.errors import EdgeposeError
+from edgepose.errors import EdgeposeError, as_told
 from edgepose.held import carried
 from edgepose.imu import ImuFrame, ImuSample
 from edgepose.placements import PLACEMENTS
@@ -149,8 +149,8 @@ class Walk:
         for sink in self._sinks:
             try:
                 sink.close()
-            except EdgeposeError as error:
-                self.summary.error = self.summary.error or error
+            except Exception as error:
+                self.summary.error = self.summary.error or as_told(error)
 
     def _bodies(self, frames: list[ImuFrame]) -> Iterator[Body]:
         for frame in frames:
@@ -191,8 +191,8 @@ def run(
                 yield from walk.take(now_s, samples, behind_s())
                 if stopped():
                     break
-        except EdgeposeError as error:
-            walk.end(error)
+        except Exception as error:
+            walk.end(as_told(error))
         yield from walk.flush()
 
     try:
@@ -200,6 +200,6 @@ def run(
             walk.write(engine.push(*body), walk.arrived)
         walk.write(engine.finish(), walk.arrived)
         walk.end()
-    except EdgeposeError as error:
-        walk.end(error)
+    except Exception as error:
+        walk.end(as_told(error))
     return walk.summary

@@ -16,7 +16,7 @@ from math import ceil
 from typing import NamedTuple
 
 from edgepose.engine import BatchEngine, Body, EngineOutput
-from edgepose.errors import EdgeposeError
+from edgepose.errors import as_told
 from edgepose.pipeline import RunSummary, Walk
 from edgepose.sources import Source
 
@@ -30,7 +30,7 @@ class _Waiting(NamedTuple):
 
 
 class Wearer:
-    """One of several wearers; an error ends only his part.
+    """One of several wearers; an error of any kind ends only their part.
 
     Attributes:
         walk: his.
@@ -59,7 +59,7 @@ class Wearer:
             if batch is not None:
                 self._put(self.walk.take(*batch, self._source.behind_s))
                 return
-        except EdgeposeError as error:
+        except Exception as error:
             self._fail(error)
         self.end()
 
@@ -68,10 +68,10 @@ class Wearer:
         if self.ended:
             return
         self.ended = True
-        self._batches.close()
         try:
+            self._batches.close()
             self._put(self.walk.flush())
-        except EdgeposeError as error:
+        except Exception as error:
             self._fail(error)
 
     def write(self, outputs: list[EngineOutput], arrived: float) -> None:
@@ -79,19 +79,28 @@ class Wearer:
         try:
             if not self._spoilt:
                 self.walk.write(outputs, arrived)
-        except EdgeposeError as error:
+        except Exception as error:
             self._spoilt = True
             self._fail(error)
             self.end()
             self.waiting.clear()
 
+    def close(self) -> None:
+        """Closes outputs and source: what they were open on is free for others."""
+        self.walk.close()
+        try:
+            self._source.__exit__(None, None, None)
+        except Exception as error:
+            self.walk.end(as_told(error))
+
     def _put(self, bodies: Iterable[Body]) -> None:
         self.waiting += (_Waiting(body, self.walk.arrived) for body in bodies)
 
-    def _fail(self, error: EdgeposeError) -> None:
+    def _fail(self, error: Exception) -> None:
+        told = as_told(error)
         if self.walk.summary.error is None:
-            self._tell(f"ended: {error}")
-        self.walk.end(error)
+            self._tell(f"ended: {told}")
+        self.walk.end(told)
 
 
 def run_together(
@@ -129,7 +138,7 @@ def run_together(
                 wearer = going.pop(i)
                 wearer.write(engine.finish(i), wearer.walk.arrived)
                 wearer.walk.end()
-                closed.append(closing.submit(wearer.walk.close))
+                closed.append(closing.submit(wearer.close))
             on_turn(_total([wearer.walk.summary for wearer in wearers]))
             if look_s and not any(wearer.waiting for wearer in going.values()):
                 # Looks that are missed are left out.

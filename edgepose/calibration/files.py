@@ -19,6 +19,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.imu import FILTERS
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
+from edgepose.text_files import read_text
 
 _FORMAT, _VERSION = "edgepose-calibration", 1
 
@@ -117,7 +118,7 @@ def save(calibration: Calibration, path: str | Path, overwrite: bool = True) -> 
 def load_calibration(path: str | Path) -> Calibration:
     """The calibration in a JSON file; see `from_json` for errors, which name the file."""
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = read_text(Path(path))
     except OSError as error:
         raise EdgeposeError(f"{path}: cannot read the calibration ({error.strerror or error})") from error
     except UnicodeDecodeError as error:

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import importlib
-import logging
 import os
 import signal
 import sys
 from importlib.metadata import entry_points
+from io import StringIO
 from types import FrameType
 from typing import NoReturn
 
 import click
 
 from edgepose import __version__
-from edgepose.errors import EdgeposeError
+from edgepose.cli.stop import endings
+from edgepose.cli.terminal import prepare, say
+from edgepose.errors import as_told
 
 COMMANDS = (
     "bench",
@@ -70,33 +72,33 @@ def _terminate(number: int, frame: FrameType | None) -> NoReturn:
 
 
 def main() -> NoReturn:
-    """Entry point: errors become one line on stderr. Exit codes: 0 done, 1 the job failed, 2 wrong use, 130
-    interrupted.
+    """Entry point: errors become one line on stderr.
+
+    Exit codes: 0 done, 1 the job failed, 2 wrong use, 130 interrupted.
     """
-    signal.signal(signal.SIGTERM, _terminate)  # ends a run as Ctrl-C does: files complete, counts printed
+    prepare()
+    # These end a run as Ctrl-C does: files complete, counts printed. Under nohup, SIGHUP ends nothing.
+    for number in endings():
+        if number != signal.SIGINT:
+            signal.signal(number, _terminate)
     # torch warns of its own plans when it reads int8 weights; nobody at a terminal can change these.
     os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
     debug = "--debug" in sys.argv[1:]
-    # On a terminal a warning takes the place of the line that shows how far a command is.
-    logging.basicConfig(format="\r\033[K%(message)s" if sys.stderr.isatty() else "%(message)s")
     try:
         sys.exit(cli.main(standalone_mode=False) or 0)
-    except EdgeposeError as error:
-        if debug:
-            raise
-        click.echo(f"edgepose: {error}", err=True)
-        sys.exit(1)
-    except MemoryError:
-        if debug:
-            raise
-        click.echo("edgepose: not enough memory; give it a shorter file", err=True)
-        sys.exit(1)
     except click.ClickException as error:
-        error.show()
+        text = StringIO()
+        error.show(text)
+        say(text.getvalue().rstrip())
         sys.exit(error.exit_code)
     except (click.Abort, KeyboardInterrupt):
-        click.echo("edgepose: stopped", err=True)
+        say("edgepose: stopped")
         sys.exit(130)
-    except BrokenPipeError:
-        sys.stderr.close()
+    except BrokenPipeError:  # of standard output; what it held must not be tried again at the end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        sys.exit(1)
+    except Exception as error:
+        if debug:
+            raise
+        say(f"edgepose: {as_told(error)}")
         sys.exit(1)

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from edgepose.cli.terminal import say, show
+
 if TYPE_CHECKING:
     from edgepose.orientation.comparison import Score
 
@@ -54,7 +56,7 @@ def _speed(models: tuple[str, ...], trust: bool, as_json: bool) -> None:
 
     report: dict[str, Any] = {"machine": speed.machine(), "models": []}
     for info in infos:
-        _say(f"measuring {info.path.stem}")
+        say(f"measuring {info.path.stem}")
         start = speed.start_up(info, trust)
         with TemporaryDirectory() as folder:
             engine = speed.load_engine(info, trust, "auto")
@@ -67,11 +69,7 @@ def _speed(models: tuple[str, ...], trust: bool, as_json: bool) -> None:
         report["models"].append(
             {"name": info.path.stem, "start": start._asdict(), "steps_us": steps, **walks, "ways": ways}
         )
-    click.echo(json.dumps(report, indent=1) if as_json else _speed_tables(report, speed.BUDGET_US))
-
-
-def _say(text: str) -> None:
-    click.echo(text, err=True)
+    show(json.dumps(report, indent=1) if as_json else _speed_tables(report, speed.BUDGET_US))
 
 
 def _speed_tables(report: dict[str, Any], budget_us: float) -> str:
@@ -141,14 +139,14 @@ def orientation(data: Path, as_json: bool) -> None:
     cost = cost_us(read_trial(files[0]))
     if as_json:
         rows = [score._asdict() for score in scores]
-        click.echo(json.dumps({"scores": rows, "us_a_sample_at_286_hz": cost}, indent=1))
+        show(json.dumps({"scores": rows, "us_a_sample_at_286_hz": cost}, indent=1))
         return
-    click.echo(f"{len(files)} trials; RMSE over movement in deg, mean over trials; us a sample on one core\n")
-    click.echo("with magnetometer")
-    click.echo(_table(scores, magnetometer=True))
-    click.echo("\nwithout; heading set to the truth's in the first second of motion")
-    click.echo(_table(scores, magnetometer=False))
-    click.echo(f"\nedgepose, online, at 286 Hz: {cost:.1f} us a sample of a sensor on one core")
+    show(f"{len(files)} trials; RMSE over movement in deg, mean over trials; us a sample on one core\n")
+    show("with magnetometer")
+    show(_table(scores, magnetometer=True))
+    show("\nwithout; heading set to the truth's in the first second of motion")
+    show(_table(scores, magnetometer=False))
+    show(f"\nedgepose, online, at 286 Hz: {cost:.1f} us a sample of a sensor on one core")
 
 
 def _with_progress(trials: Iterable[list[Score]], count: int) -> Iterator[list[Score]]:
@@ -161,7 +159,7 @@ def _with_progress(trials: Iterable[list[Score]], count: int) -> Iterator[list[S
         return
     for number, scores in enumerate(trials, start=1):
         yield scores
-        click.echo(f"{number} of {count}  {scores[0].trial}", err=True)
+        say(f"{number} of {count}  {scores[0].trial}")
 
 
 def _table(scores: list[Score], magnetometer: bool) -> str:

@@ -169,7 +169,7 @@ def calibrate(
         summary, reset, metadata["from_s"] = recorded(source, plan, orient, say)
     warnings = [*summary.warnings, *(() if reset is None else reset.warnings)]
     for warning in warnings:
-        click.echo(f"warning: {warning}", err=True)
+        terminal.say(f"warning: {warning}")
     metadata["samples"] = dict(zip(PLACEMENTS, summary.samples, strict=True))
     metadata["force_m_s2"] = _by_sensor(np.linalg.norm(summary.force, axis=-1))
     metadata["warnings"] = warnings
@@ -187,7 +187,7 @@ def calibrate(
     )
     if said is not None:
         for warning in calibration.mounting_warnings(result, mounted, said.path):
-            click.echo(f"warning: {warning}", err=True)
+            terminal.say(f"warning: {warning}")
     if out == "-":
         click.echo(calibration.to_json(result), nl=False)
     else:

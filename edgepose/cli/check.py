@@ -19,6 +19,7 @@ import click
 from edgepose.cli.options import SourceFlags, source_options
 from edgepose.cli.page import Page, is_coloured, is_terminal
 from edgepose.cli.stop import Stop
+from edgepose.cli.terminal import printable, say, show
 from edgepose.errors import EdgeposeError
 
 if TYPE_CHECKING:
@@ -97,7 +98,7 @@ def check(
         def watch(now: Callable[[], State]) -> None:
             if page is not None:
                 width = shutil.get_terminal_size().columns
-                title = f"edgepose check  {source.name}; Ctrl-C ends"
+                title = printable(f"edgepose check  {source.name}; Ctrl-C ends")
                 state = now()
                 table = ["listening ..."] if state.seconds < LISTEN_S else _lines(state, width)
                 page.draw([title[:width], *table, *_wrapped(warnings, width)])
@@ -105,13 +106,14 @@ def check(
         state, error = _listen(opened, health, source.file is None, seconds, lambda: stop.asked, watch)
     if page is not None:
         for warning in warnings:
-            click.echo(f"warning: {warning}", err=True)
+            say(f"warning: {warning}")
     if opened.damage:
-        click.echo(f"warning: {opened.damage}", err=True)
+        say(f"warning: {opened.damage}")
         warnings.append(opened.damage)
     if as_json:
-        click.echo(_json(source.name, state, warnings))
+        show(_json(source.name, state, warnings))
     else:
+        # With styles; what is in it is clean.
         click.echo("\n".join(_lines(state, shutil.get_terminal_size().columns if is_terminal() else None)))
     if error is not None:
         raise error
@@ -155,7 +157,7 @@ def _warnings(hidden: bool) -> Iterator[list[str]]:
     """What the program warns of meanwhile; hidden, it is not written elsewhere."""
     result: list[str] = []
     handler = logging.Handler()
-    handler.emit = lambda record: result.append(record.getMessage())  # type: ignore[method-assign]
+    handler.emit = lambda record: result.append(printable(record.getMessage()))  # type: ignore[method-assign]
     logger = logging.getLogger("edgepose")
     logger.addHandler(handler)
     logger.propagate = not hidden

@@ -11,6 +11,7 @@ import click
 
 from edgepose.cli.options import protocol_option, sensors_option
 from edgepose.cli.outputs import overwrite_option
+from edgepose.cli.terminal import printable, say, show
 from edgepose.errors import EdgeposeError
 from edgepose.output_targets import check_free
 
@@ -112,7 +113,7 @@ def convert(
         for result in _with_progress(convert_all(todo, options, jobs), len(todo)):
             done[result.job] = result
     finally:
-        click.echo(_table([done[job] for job in planned if job in done]))
+        show(_table([done[job] for job in planned if job in done]))
     failed = sum(result.problem is not None for result in done.values())
     if failed:
         raise EdgeposeError(
@@ -132,7 +133,7 @@ def _with_progress(results: Iterable[Result], count: int) -> Iterator[Result]:
         return
     for number, result in enumerate(results, start=1):
         yield result  # first: what is told must be in the table, whenever Ctrl-C comes
-        click.echo(_printable(f"{number} of {count}  {result.job.source}: {describe(result)}"), err=True)
+        say(_one_line(f"{number} of {count}  {result.job.source}: {describe(result)}"))
 
 
 def _table(results: Sequence[Result]) -> str:
@@ -142,10 +143,10 @@ def _table(results: Sequence[Result]) -> str:
     lines = [f"{'file':{width}}  {'samples':>9}  {'seconds':>9}  result"]
     for result in results:
         counts = f"{result.samples:9d}  {result.seconds:9.1f}" if result.samples else f"{'-':>9}  {'-':>9}"
-        lines.append(_printable(f"{result.job.source!s:{width}}  {counts}  {describe(result)}"))
+        lines.append(_one_line(f"{result.job.source!s:{width}}  {counts}  {describe(result)}"))
     return "\n".join(lines)
 
 
-def _printable(line: str) -> str:
-    """A line in which the names of files may have any bytes, without what would break it."""
-    return "".join(character if character.isprintable() else "?" for character in line)
+def _one_line(text: str) -> str:
+    """Text in which names of files may have line breaks."""
+    return printable(text).replace("\n", "?").replace("\t", "?")

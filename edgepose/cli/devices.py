@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from edgepose.cli.terminal import say, show
 from edgepose.errors import EdgeposeError
 
 if TYPE_CHECKING:
@@ -33,27 +34,27 @@ def devices(names: tuple[str, ...], probe: bool) -> None:
     ports = dict.fromkeys((name for name in names if not _is_bus(name)), "") if names else _ports()
     buses = [name for name in names if _is_bus(name)] if names else None
     if ports or not names:
-        click.echo("Serial ports (edgepose run --port NAME):")
+        show("Serial ports (edgepose run --port NAME):")
         width = max(map(len, ports), default=0)
         for name, what in ports.items():
-            click.echo(f"  {name.ljust(width)}  {what}".rstrip())
+            show(f"  {name.ljust(width)}  {what}".rstrip())
             if probe:
-                click.echo(f"    {_port_says(name)}")
+                show(f"    {_port_says(name)}")
         if not ports:
-            click.echo(
+            show(
                 "  none found; plug the hub in, or check that its driver is loaded and you may read it "
                 "(group dialout)"
             )
     if buses is None:
         buses = _buses()
     if buses or not names:
-        click.echo("CAN interfaces (edgepose run --can NAME):")
+        show("CAN interfaces (edgepose run --can NAME):")
         for name in buses:
-            click.echo(f"  {name}")
+            show(f"  {name}")
             if probe:
-                click.echo(f"    {_bus_says(name)}")
+                show(f"    {_bus_says(name)}")
         if not buses:
-            click.echo("  none found; adapters on a serial port are named slcan:PORT")
+            show("  none found; adapters on a serial port are named slcan:PORT")
 
 
 def _is_bus(name: str) -> bool:
@@ -107,7 +108,7 @@ def _bus_says(name: str) -> str:
 
 def _tell(name: str) -> None:
     if sys.stderr.isatty():
-        click.echo(f"listening to {name} ...", err=True)
+        say(f"listening to {name} ...")
 
 
 def _says(finding: Finding, unit: str, speed: str) -> str:

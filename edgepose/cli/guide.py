@@ -12,6 +12,7 @@ import click
 
 from edgepose import calibration
 from edgepose.calibration import Hold, MovedError, WeakMotionError
+from edgepose.cli import terminal
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
@@ -40,7 +41,7 @@ class Guide:
 
     def __call__(self, text: str) -> None:
         """Says a line."""
-        click.echo(text, err=self.err)
+        (terminal.say if self.err else terminal.show)(text)
 
 
 def all_reporting(batches: Iterator[Batch], say: Guide) -> Iterator[Batch]:
@@ -144,7 +145,7 @@ def moved(batches: Iterator[Batch], say: Guide, check: Callable[[Hold], Any]) ->
 
 def wait_for_enter(batches: Iterator[Batch], say: Guide) -> None:
     """Time to put the sensors on; elsewhere than on a terminal --countdown has to give it."""
-    if not sys.stdin.isatty():
+    if sys.stdin is None or not sys.stdin.isatty():
         return
     say("Put the sensors on. Press Enter when the wearer stands ready.")
     # Samples have to be taken off the port meanwhile, so that none of them is old afterwards.

@@ -6,8 +6,6 @@ from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
-import click
-
 from edgepose import calibration
 from edgepose.calibration import HeadingReset, Hold, HoldSummary
 from edgepose.cli.guide import Guide, all_reporting, held, moved, wait_for_enter
@@ -155,7 +153,7 @@ def _window(
     """The part of a recording that is a hold, and its start on the recording's clock, seconds."""
     everything, damage = read
     if damage:
-        click.echo(f"warning: {damage}", err=True)
+        say(f"warning: {damage}")
     start = calibration.stillest_start(everything, seconds) if from_s is None else from_s
     first = min((s.time_s[0] for s in everything if len(s.time_s)), default=0.0)
     last = max((s.time_s[-1] for s in everything if len(s.time_s)), default=0.0)

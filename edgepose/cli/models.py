@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from edgepose import archive
+from edgepose.cli.terminal import show
 
 
 @click.command(short_help="List model archives, show their cards.")
@@ -48,17 +49,15 @@ def _list() -> None:
         )
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     for row in rows:
-        click.echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+        show("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
 
 
 def _show(info: archive.ArchiveInfo) -> None:
     card = info.path.with_suffix(".md")
     if info.path.parent == archive.MODELS and card.is_file():
-        click.echo(card.read_text(encoding="utf-8").rstrip())
+        show(card.read_text(encoding="utf-8").rstrip())
     else:
         for key, value in info.metadata.items():
             # JSON, so that a text from a stranger's file cannot steer the terminal.
-            click.echo(f"{json.dumps(key)[1:-1]}: {json.dumps(value)}")
-    click.echo(
-        f"\nfile: {Path(info.path)}\nsha256: {info.sha256}\ntrusted: {'yes' if info.trusted else 'no'}"
-    )
+            show(f"{json.dumps(key)[1:-1]}: {json.dumps(value)}")
+    show(f"\nfile: {Path(info.path)}\nsha256: {info.sha256}\ntrusted: {'yes' if info.trusted else 'no'}")

@@ -6,10 +6,9 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
-import click
-
 from edgepose.cli.options import Orientations
 from edgepose.cli.rigs import RigFlags
+from edgepose.cli.terminal import say
 from edgepose.cli.wishes import Wishes
 from edgepose.errors import EdgeposeError, named
 from edgepose.placements import PLACEMENTS
@@ -183,4 +182,4 @@ def _begins_anew(calibration: Calibration) -> bool:
 
 def voice(name: str) -> Callable[[str], None]:
     """Says things of a wearer on stderr; one without a name needs none."""
-    return lambda text: click.echo(f"{name}: {text}" if name else text, err=True)
+    return lambda text: say(f"{name}: {text}" if name else text)

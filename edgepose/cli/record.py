@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -16,6 +15,7 @@ from edgepose import __version__
 from edgepose.cli.options import SourceFlags, source_options
 from edgepose.cli.outputs import overwrite_option
 from edgepose.cli.stop import Stop
+from edgepose.cli.terminal import end_status, has_terminal, say, status
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 
@@ -62,7 +62,7 @@ def record(source: SourceFlags, out: str, seconds: float | None, overwrite: bool
         opened = stack.enter_context(source.open(raw if kind != "samples" else None))
         stop = stack.enter_context(Stop())
         output = recorder.open_output(out, _metadata(source), overwrite)
-        _say(f"recording to {out}; Ctrl-C ends it. Samples are counted in the order {', '.join(PLACEMENTS)}")
+        say(f"recording to {out}; Ctrl-C ends it. Samples are counted in the order {', '.join(PLACEMENTS)}")
         summary = recorder.record(
             opened,
             output,
@@ -89,14 +89,9 @@ def _metadata(source: SourceFlags) -> dict[str, str]:
     }
 
 
-def _say(text: str) -> None:
-    click.echo(text, err=True)
-
-
 def _progress(source: Source) -> Callable[[RecordSummary], None]:
     """A callback that keeps one line on a terminal up to date; elsewhere it writes a line now and then."""
-    terminal = sys.stderr.isatty()
-    every_s = 1.0 if terminal else 10.0
+    every_s = 1.0 if has_terminal() else 10.0
     shown_s, before = time.monotonic(), 0
 
     def show(summary: RecordSummary) -> None:
@@ -106,25 +101,23 @@ def _progress(source: Source) -> Callable[[RecordSummary], None]:
             total = sum(summary.samples)
             rate = (total - before) / (now_s - shown_s)
             shown_s, before = now_s, total
-            text = (
+            status(
                 f"{summary.seconds:.0f} s, {' '.join(map(str, summary.samples))}, {rate:.0f} a second, "
                 f"{source.counters.lost} lost"
             )
-            click.echo(f"\r{text}  " if terminal else text, nl=not terminal, err=True)
 
     return show
 
 
 def _report(out: str, summary: RecordSummary, source: Source) -> None:
     """Prints the counts of a finished recording."""
-    if sys.stderr.isatty():
-        _say("")
+    end_status()
     total = sum(summary.samples)
     rate = total / summary.seconds if summary.seconds else 0.0
     counts = source.counters
-    _say(f"samples  {total} in {summary.seconds:.1f} s, {rate:.0f} a second; to {out}")
-    _say(f"sensors  {', '.join(f'{n} {name}' for name, n in zip(PLACEMENTS, summary.samples, strict=True))}")
-    _say(f"packets  {counts.packets} good, {counts.lost} lost, {counts.bad} bad, {counts.unknown} unknown")
+    say(f"samples  {total} in {summary.seconds:.1f} s, {rate:.0f} a second; to {out}")
+    say(f"sensors  {', '.join(f'{n} {name}' for name, n in zip(PLACEMENTS, summary.samples, strict=True))}")
+    say(f"packets  {counts.packets} good, {counts.lost} lost, {counts.bad} bad, {counts.unknown} unknown")
     silent = [name for name, n in zip(PLACEMENTS, summary.samples, strict=True) if not n]
     if total and silent:
-        _say(f"warning: nothing came from {', '.join(silent)}; poses need all six sensors")
+        say(f"warning: nothing came from {', '.join(silent)}; poses need all six sensors")

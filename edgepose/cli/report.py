@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from edgepose.cli.outputs import overwrite_option
+from edgepose.cli.terminal import show
 from edgepose.output_targets import check_output
 
 
@@ -46,4 +47,4 @@ def report(poses: Path, out: Path | None, height: float, overwrite: bool) -> Non
     check_output(path, "the report", (".html", ".htm"), overwrite)
     body = default_body(height)
     write_report(path, read_poses(poses), body, poses.name)
-    click.echo(f"Wrote {path}.")
+    show(f"Wrote {path}.")

@@ -122,7 +122,7 @@ def read_rigs(paths: Sequence[Path]) -> list[RigFlags]:
 
 
 def _read(path: Path) -> RigFlags:
-    from edgepose.sources.sensor_map import read_toml
+    from edgepose.text_files import read_toml
 
     content = read_toml(path)
     name = content.pop("name", path.stem)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -16,6 +15,7 @@ from edgepose.cli.opened import OpenRig, calibration_of
 from edgepose.cli.rigs import RigFlags, rig_options
 from edgepose.cli.sharing import check_all_files
 from edgepose.cli.stop import Stop
+from edgepose.cli.terminal import end_status, has_terminal, say, status
 from edgepose.cli.wishes import heard_by
 from edgepose.errors import EdgeposeError
 from edgepose.precision import CHOICES, pack
@@ -120,20 +120,19 @@ def run(
         if live:
             stack.enter_context(keys)
         module = archive.load(info, trust)
-        precision = pack(module, info, precision, _say)
+        precision = pack(module, info, precision, say)
         engine = _engine(module, past, future, rigs, windows, precision)
         stop = stack.enter_context(Stop())
         for rig in opened:
             rig.open_outputs(stack, rate, lambda: stop.asked)
         whose = f"{len(rigs)} wearers with " if several else ""
         hint = ", r re-zeroes headings" if keys.listening else ""
-        _say(
+        say(
             f"running {whose}{model} ({kind}, {'window' if windows else 'stream'}) in {precision}; "
             f"Ctrl-C ends the run{hint}"
         )
         walks = _walks(opened, engine, rate, live, stop)
-    if sys.stderr.isatty():
-        _say("")
+    end_status()
     reports = [rig.report(walk, rate, future) for rig, walk in zip(opened, walks, strict=True)]
     failed = {rig.name: error for rig, error in zip(rigs, reports, strict=True) if error is not None}
     if several and failed:
@@ -200,14 +199,9 @@ BEHIND_S = 1.0
 """A run that is further behind its sensors says so, seconds."""
 
 
-def _say(text: str) -> None:
-    click.echo(text, err=True)
-
-
 def _progress() -> Callable[[RunSummary], None]:
     """A callback that keeps one line on a terminal up to date; elsewhere it writes a line now and then."""
-    terminal = sys.stderr.isatty()
-    every_s = 1.0 if terminal else 10.0
+    every_s = 1.0 if has_terminal() else 10.0
     shown_s, poses, told = time.monotonic(), 0, False
 
     def show(summary: RunSummary) -> None:
@@ -215,14 +209,13 @@ def _progress() -> Callable[[RunSummary], None]:
         now_s = time.monotonic()
         if summary.behind_s > BEHIND_S and not told:
             told = True
-            _say(
-                f"{'' if not terminal else chr(13)}this machine does not keep up: poses are "
+            say(
+                f"this machine does not keep up: poses are "
                 f"{summary.behind_s:.1f} s late; use --model rnn, --online stream, or end other programs"
             )
         if now_s - shown_s >= every_s:
             rate = (summary.poses - poses) / (now_s - shown_s)
             shown_s, poses = now_s, summary.poses
-            text = f"{poses} poses, {rate:.0f} a second, {summary.held} with a held sensor"
-            click.echo(f"\r{text}  " if terminal else text, nl=not terminal, err=True)
+            status(f"{poses} poses, {rate:.0f} a second, {summary.held} with a held sensor")
 
     return show

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterable
 from contextlib import ExitStack
@@ -13,6 +12,7 @@ import click
 
 from edgepose.cli.bodies import BodyFlags, body_options
 from edgepose.cli.outputs import check_files, overwrite_option
+from edgepose.cli.terminal import end_status, has_terminal, say, status
 from edgepose.errors import EdgeposeError
 from edgepose.output_targets import check_output
 
@@ -195,13 +195,13 @@ def solve(
         _write(sinks, solution, measurements, pelvis_path(solution, points.offsets, rate))
         for sink in sinks:
             sink.close()
-    click.echo(report.table(solution, measurements), err=True)
+    say(report.table(solution, measurements))
     for line in report.misfits(solution, measurements):
-        click.echo(f"warning: {line}", err=True)
+        say(f"warning: {line}")
     if plot is not None:
         report.plot(plot, solution, measurements)
     done, frames = len(solution.rotations), len(measurements.time_s)
-    click.echo(f"{done} of {frames} poses, {solution.evaluations} cost evaluations", err=True)
+    say(f"{done} of {frames} poses, {solution.evaluations} cost evaluations")
     if interrupted:
         raise KeyboardInterrupt
     if data.damage:
@@ -217,8 +217,7 @@ def _collect(solutions: Iterable[Solution]) -> tuple[list[Solution], bool]:
     except KeyboardInterrupt:
         return done, True
     finally:
-        if sys.stderr.isatty():
-            click.echo(err=True)
+        end_status()
     return done, False
 
 
@@ -238,7 +237,7 @@ def _write(sinks: list[Sink], solution: Solution, measurements: Measurements, pa
 
 def _progress() -> OnProgress:
     """A line on a terminal with chunk, cost and time left; elsewhere a line now and then."""
-    terminal = sys.stderr.isatty()
+    terminal = has_terminal()
     every_s = 0.2 if terminal else PLAIN_EVERY_S
     started = shown = time.monotonic()
     most = 0  # evaluations of any chunk so far
@@ -253,7 +252,7 @@ def _progress() -> OnProgress:
         share = (chunk - 1 + evaluations / (most + 1)) / count
         left = (now - started) * (1.0 / share - 1.0)
         text = f"chunk {chunk} of {count}, evaluation {evaluations}, cost {cost:.4f}, {left:.0f} s left"
-        bar = f"[{'#' * int(30 * share):30}] "
-        click.echo(f"\r{bar}{text}  " if terminal else text, nl=not terminal, err=True)
+        bar = f"[{'#' * int(20 * share):20}] "
+        status(bar + text if terminal else text)
 
     return show

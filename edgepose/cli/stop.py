@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a question that a loop asks, so that nothing is lost in the middle of a step."""
+"""Signals that end a run as a question that a loop asks, so that nothing is lost in the middle of a step."""
 
 from __future__ import annotations
 
@@ -7,8 +7,14 @@ from types import FrameType, TracebackType
 from typing import Any
 
 
+def endings() -> list[int]:
+    """Signals that ask a program to end, unless they are ignored, as SIGHUP is under nohup."""
+    numbers = [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", None)]
+    return [number for number in numbers if number is not None and signal.getsignal(number) != signal.SIG_IGN]
+
+
 class Stop:
-    """Whether Ctrl-C or SIGTERM has come. A second one interrupts at once, as outside of this."""
+    """Whether one of these signals has come. A second one interrupts at once, as outside of this."""
 
     def __init__(self) -> None:
         """Signals are as before until it is entered."""
@@ -17,7 +23,7 @@ class Stop:
 
     def __enter__(self) -> Stop:
         """Note signals from now on."""
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in endings():
             self._before[number] = signal.signal(number, self._note)
         return self
 

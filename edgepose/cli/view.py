@@ -11,6 +11,7 @@ import click
 
 from edgepose.addresses import resolve
 from edgepose.cli.stop import Stop
+from edgepose.cli.terminal import say
 from edgepose.errors import EdgeposeError
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ def _open(host: str, port: int, body: Body) -> Viewer:
 
     viewer = Viewer(host, port, body)
     name = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
-    click.echo(f"open http://{name}:{port} in a browser; Ctrl-C ends the view", err=True)
+    say(f"open http://{name}:{port} in a browser; Ctrl-C ends the view")
     return viewer
 
 

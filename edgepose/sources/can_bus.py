@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ from edgepose.sources.live import Gone
 # It tells of every maker's library that is not installed, and of every clock that is not.
 logging.getLogger("can").setLevel(logging.CRITICAL)
 
+_LATEST_S = 1e11  # 5000 years of Unix time
+_BLF_OBJECT, _BLF_HEAD = b"LOBJ", struct.Struct("<4sHHII")
 _MOST = 256
 """Messages read at a time."""
 
@@ -135,18 +138,57 @@ def _opening_problem(interface: str, channel: str, error: Exception) -> str:
     return f"cannot open it: {text}; see python-can's page on {interface} for how its channels are named"
 
 
-def read_log(path: Path) -> Iterator[tuple[str, float, list[can.Message]]]:
-    """Channel, time in seconds, and message, of a log, in its order.
+class _BlfReader(can.BLFReader):
+    """Ends where python-can's would turn in a circle: at an object that says it is shorter than its head."""
+
+    def _parse_data(self, data: bytes) -> Iterator[can.Message]:
+        end = _circle(data)
+        yield from super()._parse_data(data if end is None else data[:end])
+        if end is not None:
+            raise ValueError("damaged: an object in it has no length")
+
+
+def _circle(data: bytes) -> int | None:
+    """Where the first object without a length is in a container of a BLF file; None if there is none."""
+    at = data.find(_BLF_OBJECT, 0, 8)
+    while at >= 0 and at + _BLF_HEAD.size <= len(data):
+        size = _BLF_HEAD.unpack_from(data, at)[3]
+        if size < _BLF_HEAD.size:
+            return at
+        at = data.find(_BLF_OBJECT, at + size, at + size + 8)
+    return None
+
+
+def _open_log(path: Path) -> Any:
+    return _BlfReader(path) if path.suffix.lower() == ".blf" else can.LogReader(path)
+
+
+def _is_good(message: can.Message) -> bool:
+    """Whether what a log says of a frame can be: logs are files of anyone, and readers do not look."""
+    return (
+        isinstance(message.timestamp, int | float)
+        and abs(message.timestamp) < _LATEST_S
+        and isinstance(message.arbitration_id, int)
+        and 0 <= message.arbitration_id < 1 << 29
+    )
+
+
+def read_log(path: Path) -> Iterator[tuple[str, float, list[can.Message] | None]]:
+    """Channel, time in seconds, and message, of a log, in its order; None for one whose time or id cannot be.
 
     Raises:
         EdgeposeError: it cannot be read, at once or up to its end.
     """
     try:
-        with can.LogReader(path) as messages:
+        with _open_log(path) as messages:
             for message in messages:
-                if not message.is_error_frame and not message.is_remote_frame:
-                    channel = "" if message.channel is None else str(message.channel)
+                if message.is_error_frame or message.is_remote_frame:
+                    continue
+                channel = "" if message.channel is None else str(message.channel)
+                if _is_good(message):
                     yield channel, message.timestamp, [message]
+                else:
+                    yield channel, 0.0, None
     except OSError as error:
         raise EdgeposeError(f"{path}: cannot read it: {error.strerror or error}") from None
     # The readers of the formats fail in many ways.

@@ -149,7 +149,7 @@ class Detector:
 
 
 def _text_lines(path: Path) -> Protocol:
-    from edgepose.sources.sensor_map import read_toml
+    from edgepose.text_files import read_toml
     from firmware_protocols import text
 
     try:

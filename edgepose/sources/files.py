@@ -25,7 +25,7 @@ CAPTURES = (".bin", ".raw")
 CAN_LOGS = (".asc", ".blf", ".log", ".mf4", ".trc", ".db")
 """Endings of logs that python-can reads, besides .csv."""
 
-Chunks = Callable[[Path], Iterator[tuple[str, float, Chunk]]]
+Chunks = Callable[[Path], Iterator[tuple[str, float, Chunk | None]]]
 
 _SLICE_S = 0.01
 
@@ -104,7 +104,7 @@ class LogSource:
         Args:
             path: the file.
             realtime: deliver it at its own pace.
-            chunks: reads the file: name of a line, time in seconds, and what came over it.
+            chunks: reads the file: name of a line, time in seconds, and what came over it, None if it is bad.
             stream: makes the stream of a line.
             waits: see `open_source`.
         """
@@ -114,11 +114,12 @@ class LogSource:
         self._chunks = chunks
         self._stream = stream
         self._streams: dict[str, Stream] = {}
+        self._bad = 0
 
     @property
     def counters(self) -> Counters:
         """What has come in so far."""
-        return total(stream.counters for stream in self._streams.values())
+        return total([Counters(bad=self._bad), *(stream.counters for stream in self._streams.values())])
 
     @property
     def clocks(self) -> Mapping[int, DeviceClock]:
@@ -127,8 +128,10 @@ class LogSource:
 
     @property
     def damage(self) -> str | None:
-        """Always None: a log may start and end anywhere."""
-        return None
+        """Frames of a log that cannot be; a log may start and end anywhere."""
+        if not self._bad:
+            return None
+        return f"{self._path}: {self._bad} of its frames have no possible time or id; they are left out"
 
     def __enter__(self) -> LogSource:
         """Check that the file can be read.
@@ -161,6 +164,9 @@ class LogSource:
 
     def _samples(self) -> Iterator[ImuSample]:
         for name, time_s, chunk in self._chunks(self._path):
+            if chunk is None:
+                self._bad += 1
+                continue
             stream = self._streams.get(name)
             if stream is None:
                 stream = self._streams[name] = self._stream(name)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Mapping
 from itertools import combinations
 from pathlib import Path
@@ -12,12 +11,8 @@ from typing import Any, NamedTuple
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 from edgepose.sources.stream import Places
+from edgepose.text_files import read_toml
 from firmware_protocols.registry import Protocol
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 _DIRECTION = "(left|right|up|down|forward|back)"
 _MOUNTING = re.compile(f"x {_DIRECTION}, z {_DIRECTION}")
@@ -129,28 +124,6 @@ def default_places(line: str, protocol: Protocol, index: int, count: int) -> Pla
         f"order {', '.join(PLACEMENTS)},\nor --sensors MAP.toml with a row for each, such as  "
         f'{PLACEMENTS[0]} = {{ port = "{line}" }}'
     )
-
-
-def read_toml(path: Path) -> dict[str, Any]:
-    """Content of a TOML file.
-
-    Raises:
-        EdgeposeError: it cannot be read or is none.
-    """
-    text = ""
-    try:
-        text = path.read_text(encoding="utf-8")
-        return tomllib.loads(text)
-    except OSError as error:
-        raise EdgeposeError(f"{path}: cannot read it: {error.strerror}") from None
-    except RecursionError:
-        raise EdgeposeError(f"{path}: not valid TOML: brackets within brackets without end") from None
-    except ValueError as error:  # also not UTF-8
-        # The parser does not name what is there twice.
-        keys = re.findall(r"^\s*(?:\[\s*)?(\w+)\s*[=\]]", text, re.MULTILINE)
-        twice = [key for key in PLACEMENTS if keys.count(key) > 1]
-        why = f"{twice[0]} is there twice" if twice else f"not valid TOML: {error}"
-        raise EdgeposeError(f"{path}: {why}") from None
 
 
 def read_map(path: Path) -> SensorMap:

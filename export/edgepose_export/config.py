@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from edgepose.errors import EdgeposeError
+from edgepose.text_files import read_toml
 from edgepose_export.archive import KINDS
 from edgepose_export.augmentation import Augmentation
 from edgepose_export.networks import NetworkShape
 from edgepose_export.normalisation import SCHEMES
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 
 @dataclass(frozen=True)
@@ -96,12 +91,9 @@ def read_config(path: Path) -> TrainConfig:
 
 
 def _toml(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise EdgeposeError(f"{path}: {error.strerror}") from error
-    except ValueError as error:
-        raise EdgeposeError(f"{path}: {error}") from error
+    if not path.is_file():
+        raise EdgeposeError(f"{path}: No such file; give the name of a shipped config or a TOML file")
+    return read_toml(path)
 
 
 def _over(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:

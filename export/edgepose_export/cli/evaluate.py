@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from edgepose.cli.outputs import overwrite_option
+from edgepose.cli.terminal import say, show
 
 if TYPE_CHECKING:
     import torch
@@ -207,16 +208,16 @@ def _tables(
     columns: dict[str, Columns] = evaluation.columns_of_parts(methods, data, parts, labelled("measuring"))
     tables = {part: evaluation.summarise(rows) for part, rows in columns.items()}
     if table:
-        click.echo(format_paper_table(tables, TABLES[table].positions))
+        show(format_paper_table(tables, TABLES[table].positions))
     else:
         for part, rows in tables.items():
-            click.echo(f"\n{part}\n{format_table(rows)}")
+            show(f"\n{part}\n{format_table(rows)}")
     if histogram:
         errors = {
             part: {name: row["sip_error_deg"] for name, row in rows.items()} for part, rows in columns.items()
         }
         plots.histogram(histogram, errors)
-        click.echo(f"wrote {histogram}", err=True)
+        say(f"wrote {histogram}")
 
 
 def _heat_map(model: _Model, data: Path, parts: tuple[str, ...], every: int, path: Path) -> None:
@@ -233,12 +234,12 @@ def _heat_map(model: _Model, data: Path, parts: tuple[str, ...], every: int, pat
         takes = takes_of(data, part, labelled(f"measuring {part}"))
         means, frames = window_errors(model.module, takes, HEAT_MAP_FRAMES, HEAT_MAP_FRAMES, every)
         maps[part] = means
-        click.echo(f"\n{part}: SIP error, deg, {frames} frames; rows future, columns past frames")
+        show(f"\n{part}: SIP error, deg, {frames} frames; rows future, columns past frames")
         for future, row in zip(HEAT_MAP_FRAMES[::-1], means[::-1], strict=True):
-            click.echo(f"{future:>6}  " + "  ".join(f"{mean:6.2f}" for mean in row))
-        click.echo("        " + "  ".join(f"{past:>6}" for past in HEAT_MAP_FRAMES))
+            show(f"{future:>6}  " + "  ".join(f"{mean:6.2f}" for mean in row))
+        show("        " + "  ".join(f"{past:>6}" for past in HEAT_MAP_FRAMES))
     plots.heat_map(path, maps, HEAT_MAP_FRAMES, HEAT_MAP_FRAMES)
-    click.echo(f"wrote {path}", err=True)
+    say(f"wrote {path}")
 
 
 def _reliability(models: list[_Model], data: Path, parts: tuple[str, ...], path: Path) -> None:
@@ -255,6 +256,6 @@ def _reliability(models: list[_Model], data: Path, parts: tuple[str, ...], path:
                 takes = takes_of(data, part, labelled("measuring deviations"))
                 pair = rel.errors_and_deviations(model.module, model.metadata, takes, mode)
                 result = results.setdefault(part, {})[name] = rel.reliability(*pair)
-                click.echo(f"\n{part}: {name}\n{rel.describe(result)}")
+                show(f"\n{part}: {name}\n{rel.describe(result)}")
     plots.reliability_plot(path, results)
-    click.echo(f"wrote {path}", err=True)
+    say(f"wrote {path}")

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from edgepose.cli.outputs import overwrite_option
+from edgepose.cli.terminal import say
 from edgepose.durable_files import write_whole
 from edgepose.output_targets import check_output
 from edgepose.precision import PRECISIONS
@@ -152,7 +153,7 @@ def export(
         metadata["precisions"] = _precisions(script, metadata, data)
     archive.save(module, out, metadata)
     write_whole(beside_it, card(metadata), "the card")
-    click.echo(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB) and {beside_it}", err=True)
+    say(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB) and {beside_it}")
 
 
 def _precisions(

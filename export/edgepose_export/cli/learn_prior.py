@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from edgepose.cli.outputs import overwrite_option
+from edgepose.cli.terminal import say
 from edgepose.errors import EdgeposeError
 from edgepose.output_targets import check_output
 
@@ -56,7 +57,7 @@ def learn_prior(inputs: tuple[Path, ...], out: Path, about: str, overwrite: bool
         try:
             takes = pieces(read_motion(path))
         except EdgeposeError as error:
-            click.echo(f"left out: {error}", err=True)
+            say(f"left out: {error}")
             continue
         for take in takes:
             rows = take.rotations[:: max(1, round(take.rate / RATE))]
@@ -65,4 +66,4 @@ def learn_prior(inputs: tuple[Path, ...], out: Path, about: str, overwrite: bool
     together = np.concatenate(poses).reshape(-1, 72)
     prior = learn(together, about or " and ".join(sorted(sources)))
     save_prior(out, prior)
-    click.echo(f"wrote {out}: {len(together)} poses of {len(files)} files; {prior.about}", err=True)
+    say(f"wrote {out}: {len(together)} poses of {len(files)} files; {prior.about}")

@@ -9,6 +9,8 @@ from typing import TypeVar
 
 import click
 
+from edgepose.cli.terminal import say
+
 T = TypeVar("T")
 
 PLAIN_EVERY_S = 10.0
@@ -25,7 +27,7 @@ def progress(items: Sequence[T], label: str) -> Iterator[T]:
         yield item
         if time.monotonic() - last > PLAIN_EVERY_S:
             last = time.monotonic()
-            click.echo(f"{label}: {i + 1} of {len(items)}", err=True)
+            say(f"{label}: {i + 1} of {len(items)}")
 
 
 def labelled(label: str):  # type: ignore[no-untyped-def]

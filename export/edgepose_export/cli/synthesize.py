@@ -12,6 +12,7 @@ from typing import NamedTuple
 import click
 
 from edgepose.cli.outputs import overwrite_option
+from edgepose.cli.terminal import say
 from edgepose.durable_files import replace_file
 from edgepose.errors import EdgeposeError
 from edgepose.output_targets import check_free
@@ -134,8 +135,8 @@ def synthesize(
             problem = result()
             if problem:
                 failed.append(path)
-                click.echo(f"left out: {problem}", err=True)
-    click.echo(f"{len(files) - len(failed)} of {len(files)} recordings written to {out}", err=True)
+                say(f"left out: {problem}")
+    say(f"{len(files) - len(failed)} of {len(files)} recordings written to {out}")
     if failed:
         raise EdgeposeError(
             f"{len(failed)} of {len(files)} files could not be converted; they are named above"

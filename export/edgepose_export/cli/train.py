@@ -9,6 +9,7 @@ from pathlib import Path
 
 import click
 
+from edgepose.cli.terminal import clear_bar, say
 from edgepose.errors import EdgeposeError
 
 CONFIGS = Path(__file__).parent.parent / "configs"
@@ -114,15 +115,15 @@ def _train(  # type: ignore[no-untyped-def]
     ]
     about = training.describe_tape(parts[0], processes)
     trainer = training.Trainer(settings, *parts, about, processes)
-    say = click.echo if processes.rank == 0 else lambda *_, **__: None
-    say(f"training on {about['takes']} takes, {about['hours']:.2f} h: {about['summary']}", err=True)
+    tell = say if processes.rank == 0 else lambda text: None
+    tell(f"training on {about['takes']} takes, {about['hours']:.2f} h: {about['summary']}")
     out.mkdir(parents=True, exist_ok=True)
     if resume:
         trainer.load(training.read_checkpoint(out / training.CHECKPOINT))
-        say(f"going on at step {trainer.step}", err=True)
+        tell(f"going on at step {trainer.step}")
     if init:
         trainer.start_from(training.read_checkpoint(init))
-    _fit(trainer, out, say)
+    _fit(trainer, out, tell)
 
 
 def _tape(paths: list[Path], processes, cache: Path | None):  # type: ignore[no-untyped-def]
@@ -138,7 +139,7 @@ def _tape(paths: list[Path], processes, cache: Path | None):  # type: ignore[no-
     return packed_tape(paths, cache / f"{processes.rank + 1}-of-{processes.size}", show)
 
 
-def _fit(trainer, out: Path, say: Callable[..., None]) -> None:  # type: ignore[no-untyped-def]
+def _fit(trainer, out: Path, tell: Callable[[str], None]) -> None:  # type: ignore[no-untyped-def]
     from edgepose_export.training import fit
 
     config = trainer.config
@@ -148,10 +149,10 @@ def _fit(trainer, out: Path, say: Callable[..., None]) -> None:  # type: ignore[
         spent = time.monotonic() - started
         speed = (step - first) * config.sequences * config.window / spent
         left = (config.steps - step) * spent / (step - first) / 60
-        say(
-            f"{chr(13) if sys.stderr.isatty() else ''}step {step} of {config.steps}: loss {loss:.4f}, "
-            f"validation {validation:.4f}, {speed / 1e3:.1f} k frames/s, {left:.0f} min left",
-            err=True,
+        clear_bar()
+        tell(
+            f"step {step} of {config.steps}: loss {loss:.4f}, "
+            f"validation {validation:.4f}, {speed / 1e3:.1f} k frames/s, {left:.0f} min left"
         )
 
     hidden = trainer.processes.rank > 0 or not sys.stderr.isatty()
