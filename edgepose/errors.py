@@ -23,8 +23,8 @@ def as_told(error: Exception) -> EdgeposeError:
         told = EdgeposeError("not enough memory; give it a shorter file")
     else:
         told = EdgeposeError(
-            f"an unexpected fault ({type(error).__name__}: {text}); please report it, with what edgepose --debug "
-            "shows"
+            f"an unexpected fault ({type(error).__name__}: {text}); please report it, with what "
+            "edgepose --debug shows"
         )
     told.__cause__ = error
     return told

@@ -14,6 +14,7 @@ import numpy as np
 
 from edgepose import __version__, calibration
 from edgepose.calibration import Calibration, HeadingReset, HoldSummary
+from edgepose.cli import terminal
 from edgepose.cli.guide import Guide
 from edgepose.cli.measuring import ROUTINE_S, Plan, finds_forward, live, recorded
 from edgepose.cli.options import Orientations, SourceFlags, filter_options, source_options

@@ -22,7 +22,7 @@ _status = False  # a line that shows how far a command is stands on the terminal
 
 
 def printable(text: str) -> str:
-    """Text of anyone as a terminal may get it: line breaks and tabs stay, what else is not seen becomes "?"."""
+    """Text of anyone as a terminal may get it: what is not seen becomes "?", but for line breaks and tabs."""
     return "".join(c if c.isprintable() or c in "\n\t" else "?" for c in text)
 
 
