@@ -17,6 +17,7 @@ import numpy as np
 from edgepose import rotations as rot
 from edgepose.calibration.bones import Calibration
 from edgepose.calibration.checks import GRAVITY, GRAVITY_TILT_LIMIT_DEG, tilt_deg, two_sensors, why_not_up
+from edgepose.calibration.fit import POSE_TILT_DEG, fit_pose, from_median
 from edgepose.calibration.headings import RESET_TILT_LIMIT_DEG, headings_from_pose, turn_about_z
 from edgepose.clock import DeviceClock
 from edgepose.imu import ImuSample
@@ -29,9 +30,6 @@ WINDOW_S = 10.0
 REST_S, REST_ACC, REST_GYR_DEG_S, REST_TURN_DEG = 1.5, 0.5, 2.0, 1.0
 """At rest: for so long, two of acceleration (m/s^2), rate and orientation deviate by less."""
 
-POSE_TILT_DEG = 20.0
-"""Median tilt against the calibration's pose up to which the wearer stands in it."""
-
 _FOLD_S = 2.0  # how often samples become numbers where nobody asks for them
 _MOST_PENDING = 5000
 _MOST_ROWS = 10_240  # of a window
@@ -40,6 +38,7 @@ _GAP = 1.5  # periods
 _SETTLE_S, _LATE_LEAST_S = 2.0, 3.0  # what has waited in the system comes first
 _RESTS = 8  # attitudes that are kept
 _OTHER_ATTITUDE_DEG = 10.0
+_POSE_OFF_DEG = 30.0  # of six sensors together: how well somebody finds the pose again
 _FROZEN_S = 1.0
 _TURN_S, _TURN_LIMIT, _MOST_TURN = 0.1, math.radians(3.0), 1.0  # step, radians in a step
 _TABLE_TURN_DEG, _TABLE_GYR_DEG_S, _TABLE_TILT_DEG = 0.1, 0.5, 5.0  # stiller than any wearer
@@ -145,6 +144,7 @@ class Health:
         self._next_fold_s = -math.inf
         self._headings: tuple[str | None, Array] = (None, np.full(len(PLACEMENTS), np.nan))
         self._pose: tuple[Array, list[str | None]] | None = None
+        self._pose_off_deg = math.inf
 
     def add(self, samples: Iterable[ImuSample], arrival_s: float = math.nan) -> None:
         """Take samples in.
@@ -215,13 +215,25 @@ class Health:
             reset = turn_about_z(quats, quats[-1])
             if reset.error_deg.max() < RESET_TILT_LIMIT_DEG:
                 headings = np.full(len(PLACEMENTS), np.nan)
-                headings[there] = _from_median(-reset.offset)
+                headings[there] = from_median(-reset.offset)
                 self._headings = "table", headings
         elif self._calibration is not None and len(there) == len(PLACEMENTS):
-            reset = headings_from_pose(self._calibration, quats)
-            if np.median(reset.error_deg) < POSE_TILT_DEG:
-                self._headings = "body", _from_median(self._calibration.heading_offset - reset.offset)
-                self._pose = reset.error_deg, _swaps(self._calibration, quats, reset.error_deg)
+            self._compare_pose(self._calibration, quats)
+
+    def _compare_pose(self, calibration: Calibration, quats: Array) -> None:
+        """The sensors of a wearer who stands in the pose, or should."""
+        fit = fit_pose(calibration, quats)
+        if fit.off_deg > self._pose_off_deg + _POSE_OFF_DEG:
+            return  # they stood nearer to it before
+        self._pose_off_deg = min(fit.off_deg, self._pose_off_deg)
+        if fit.in_pose:
+            self._headings = "body", fit.heading_deg
+        swaps: list[str | None] = [None] * len(PLACEMENTS)
+        if fit.sits_at is not None:
+            swaps = [PLACEMENTS[at] if at != i else None for i, at in enumerate(fit.sits_at)]
+        elif fit.in_pose:
+            swaps = _swaps(calibration, quats, fit.tilt_deg)
+        self._pose = fit.tilt_deg, swaps
 
 
 class _Rest(NamedTuple):
@@ -553,13 +565,6 @@ def _is_table(rests: list[_Rest]) -> bool:
         and max(rest.turn_deg for rest in rests) < _TABLE_TURN_DEG
         and max(noise, default=0.0) < _TABLE_GYR_DEG_S
     )
-
-
-def _from_median(angles: Array) -> Array:
-    """Angles (n,) in radians against their median direction, in degrees from -180 to 180."""
-    apart = np.angle(np.exp(1j * (angles[:, None] - angles)))
-    middle = angles[int(np.argmin(np.abs(apart).sum(axis=1)))]
-    return np.degrees(np.angle(np.exp(1j * (angles - middle))))
 
 
 def _swaps(calibration: Calibration, quats: Array, tilt: Array) -> list[str | None]:

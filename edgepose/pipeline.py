@@ -15,6 +15,7 @@ from edgepose.engine import Body, Engine, EngineOutput
 from edgepose.errors import EdgeposeError, as_told
 from edgepose.held import carried
 from edgepose.imu import ImuFrame, ImuSample
+from edgepose.misfit import Misfits
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseFrame
 from edgepose.rezero import Headings
@@ -91,6 +92,8 @@ class Walk:
         orient: Callable[[list[ImuSample]], list[ImuSample]] = lambda samples: samples,
         tell: Callable[[str], None] = lambda text: None,
         on_pose: Callable[[RunSummary], None] = lambda summary: None,
+        misfits: Misfits | None = None,
+        warn: Callable[[str], None] = lambda text: None,
     ) -> None:
         """Nothing has come.
 
@@ -101,11 +104,13 @@ class Walk:
             orient: makes raw samples oriented ones.
             tell: hears of sensors that fall silent and are back.
             on_pose: called after each pose was written.
+            misfits: finds out whether the calibration can be the wearer's.
+            warn: hears that it cannot.
         """
         self.summary, self.clock = RunSummary(), clock
         self.arrived = self._started = time.perf_counter()
         self._headings, self._sinks, self._orient, self._tell = headings, sinks, orient, tell
-        self._on_pose = on_pose
+        self._on_pose, self._misfits, self._warn = on_pose, misfits, warn
         self._silences = Silences()
         self._bones: NDArray[np.float64] | None = None  # of the frame before
 
@@ -119,7 +124,10 @@ class Walk:
 
     def flush(self) -> Iterator[Body]:
         """Bodies of the last frames."""
-        return self._bodies(self.clock.flush())
+        yield from self._bodies(self.clock.flush())
+        if self._misfits is not None:
+            for line in self._misfits.at_end():
+                self._warn(line)
 
     def write(self, outputs: list[EngineOutput], arrived: float) -> None:
         """Writes poses whose newest packet arrived at a time on `time.perf_counter`."""
@@ -159,6 +167,9 @@ class Walk:
             calibration = self._headings.at(frame)
             if calibration is not None:
                 bones, acceleration = apply(calibration, frame.orientation, frame.force)
+                if self._misfits is not None:
+                    for line in self._misfits.of(frame, bones):
+                        self._warn(line)
                 bones, acceleration = carried(bones, acceleration, frame.held, self._bones)
                 self._bones = bones
                 yield Body(frame, bones.astype(np.float32), acceleration.astype(np.float32))

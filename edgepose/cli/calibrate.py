@@ -164,10 +164,14 @@ def calibrate(
         "source": source.name,
         "hold_s": hold,
     }
-    if source.live:
-        summary, reset = live(source, plan, orient, say)
-    else:
-        summary, reset, metadata["from_s"] = recorded(source, plan, orient, say)
+    measured = (live if source.live else recorded)(source, plan, orient, say)
+    summary, reset = measured.summary, measured.reset
+    if measured.from_s is not None:
+        metadata["from_s"] = measured.from_s
+    if measured.devices:
+        metadata["devices"] = {
+            PLACEMENTS[place]: device._asdict() for place, device in sorted(measured.devices.items())
+        }
     warnings = [*summary.warnings, *(() if reset is None else reset.warnings)]
     for warning in warnings:
         terminal.say(f"warning: {warning}")

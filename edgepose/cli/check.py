@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from edgepose.health import Health, SensorHealth
     from edgepose.sources import Counters, Source
 
+_log = logging.getLogger(__name__)
+
 REDRAW_S, LISTEN_S = 0.25, 1.5
 DEFAULT_S = 10.0
 
@@ -85,8 +87,10 @@ def check(
     from edgepose.calibration import load_calibration
     from edgepose.health import Health
     from edgepose.sources import open_source
+    from edgepose.sources.comparison import other_devices
 
-    health = Health(None if calibration is None else load_calibration(calibration))
+    fitting = None if calibration is None else load_calibration(calibration)
+    health = Health(fitting)
     if seconds is None:
         seconds = DEFAULT_S if source.live and not is_terminal() else math.inf
     with ExitStack() as stack:
@@ -104,6 +108,8 @@ def check(
                 page.draw([title[:width], *table, *_wrapped(warnings, width)])
 
         state, error = _listen(opened, health, source.file is None, seconds, lambda: stop.asked, watch)
+        if fitting is not None and (other := other_devices(fitting, opened.devices)) is not None:
+            _log.warning("%s", other.removeprefix("warning: "))
     if page is not None:
         for warning in warnings:
             say(f"warning: {warning}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +13,7 @@ from edgepose.cli.guide import Guide, all_reporting, held, moved, wait_for_enter
 from edgepose.cli.options import Orientations, SourceFlags
 from edgepose.errors import EdgeposeError
 from edgepose.recording import read_recording, samples
+from edgepose.sources import Device
 from edgepose.sources.files import is_recording
 
 ROUTINE_S = 30.0
@@ -41,9 +43,23 @@ class Plan(NamedTuple):
         return None if way is None or way == "live" or finds_forward(way) else Path(way)
 
 
-def live(
-    source: SourceFlags, plan: Plan, orient: Orientations, say: Guide
-) -> tuple[HoldSummary, HeadingReset | None]:
+class Measured(NamedTuple):
+    """What a calibration is made of.
+
+    Attributes:
+        summary: the hold.
+        reset: the heading reset, if there is one.
+        from_s: when the hold begins in a recording, seconds.
+        devices: what sent the samples, by placement.
+    """
+
+    summary: HoldSummary
+    reset: HeadingReset | None
+    from_s: float | None
+    devices: Mapping[int, Device]
+
+
+def live(source: SourceFlags, plan: Plan, orient: Orientations, say: Guide) -> Measured:
     """The hold and the heading reset of a wearer in front of a live source."""
     reset = _side_by_side(source, plan, orient, say)
     with source.open() as opened:
@@ -57,30 +73,28 @@ def live(
         if plan.heading_reset == "motion":
             upright = summary.orientation
             reset = moved(batches, say, lambda moving: calibration.headings_from_motion(moving, upright))
-    return summary, reset or _mounted(plan, summary)
+    return Measured(summary, reset or _mounted(plan, summary), None, opened.devices)
 
 
-def recorded(
-    source: SourceFlags, plan: Plan, orient: Orientations, say: Guide
-) -> tuple[HoldSummary, HeadingReset | None, float]:
-    """The hold and the heading reset in a recording, and when the hold begins, seconds."""
+def recorded(source: SourceFlags, plan: Plan, orient: Orientations, say: Guide) -> Measured:
+    """The hold and the heading reset in a recording."""
     reset = _side_by_side(source, plan, orient, say)
-    everything = _read(source, orient)
+    everything, damage, devices = _read(source, orient)
     _check_north(orient, plan)
-    still, start_s = _window(source.name, everything, plan.from_s, plan.hold_s, say)
+    still, start_s = _window(source.name, (everything, damage), plan.from_s, plan.hold_s, say)
     if plan.from_s is None:
         say("If the wearer stood in the pose at another time, say so with --from.")
     summary = calibration.check_hold(still, "choose a still part with --from, or record again")
     if plan.heading_reset == "motion":
         end_s = start_s + plan.hold_s
-        moving = calibration.cut(everything[0], *(plan.motion or (end_s, end_s + ROUTINE_S)))
+        moving = calibration.cut(everything, *(plan.motion or (end_s, end_s + ROUTINE_S)))
         if not all(len(sensor.time_s) for sensor in moving):
             raise EdgeposeError(
                 f"{source.name}: not all six sensors report where the movements should be; say where "
                 "with --motion FROM:TO, or use another --heading-reset"
             )
         reset = calibration.headings_from_motion(moving, summary.orientation)
-    return summary, reset or _mounted(plan, summary), start_s
+    return Measured(summary, reset or _mounted(plan, summary), start_s, devices)
 
 
 def _side_by_side(source: SourceFlags, plan: Plan, orient: Orientations, say: Guide) -> HeadingReset | None:
@@ -93,13 +107,15 @@ def _side_by_side(source: SourceFlags, plan: Plan, orient: Orientations, say: Gu
         return None
     say(f"Heading reset from {plan.lying}.")
     own = orient.anew()
-    everything = _read(source._replace(file=plan.lying, port=None, can=None), own)
+    everything, damage, _ = _read(source._replace(file=plan.lying, port=None, can=None), own)
     if not own.north:
         raise EdgeposeError(
             "the filter's headings begin anew in each recording, so another one cannot reset them: "
             "use --heading-reset motion, live or mounting"
         )
-    return calibration.heading_offsets(_window(str(plan.lying), everything, None, plan.hold_s, say)[0])
+    return calibration.heading_offsets(
+        _window(str(plan.lying), (everything, damage), None, plan.hold_s, say)[0]
+    )
 
 
 def _mounted(plan: Plan, summary: HoldSummary) -> HeadingReset | None:
@@ -129,8 +145,8 @@ def _check_north(orient: Orientations, plan: Plan) -> None:
 # --- recordings ---------------------------------------------------------------------------------------------
 
 
-def _read(source: SourceFlags, orient: Orientations) -> tuple[Hold, str | None]:
-    """Everything in a recording or a raw capture, and what is wrong with its end."""
+def _read(source: SourceFlags, orient: Orientations) -> tuple[Hold, str | None, Mapping[int, Device]]:
+    """Everything in a recording or a raw capture, what is wrong with its end, and what sent it."""
     path = source.file
     assert path is not None
     if is_recording(path):
@@ -140,11 +156,10 @@ def _read(source: SourceFlags, orient: Orientations) -> tuple[Hold, str | None]:
             if orient.passes
             else calibration.hold_from_samples(orient(list(samples(recording))))
         )
-        return everything, recording.damage
+        return everything, recording.damage, {}
     with source._replace(realtime=False).open() as opened:
-        return calibration.hold_from_samples(
-            chain.from_iterable(orient(came) for _, came in opened)
-        ), opened.damage
+        everything = calibration.hold_from_samples(chain.from_iterable(orient(came) for _, came in opened))
+        return everything, opened.damage, opened.devices
 
 
 def _window(

@@ -12,6 +12,7 @@ from edgepose.cli.terminal import say
 from edgepose.cli.wishes import Wishes
 from edgepose.errors import EdgeposeError, named
 from edgepose.placements import PLACEMENTS
+from edgepose.sources.comparison import other_devices
 
 if TYPE_CHECKING:
     from edgepose.calibration import Calibration
@@ -78,6 +79,7 @@ class OpenRig:
                 full.
             on_pose: called after each pose.
         """
+        from edgepose.misfit import Misfits
         from edgepose.pipeline import Walk
         from edgepose.rezero import Headings
         from edgepose.sync import FrameClock
@@ -96,7 +98,12 @@ class OpenRig:
             self._orient,
             self.say if source.live else lambda text: None,
             on_pose,
+            Misfits(self._calibration, self._other_devices),
+            self.say,
         )
+
+    def _other_devices(self) -> str | None:
+        return other_devices(self._calibration, self.source.devices)
 
     def report(self, walk: Walk, rate: float, future: int) -> EdgeposeError | None:
         """Says the counts of a finished walk; gives what went wrong, if anything did."""

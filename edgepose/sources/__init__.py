@@ -45,6 +45,24 @@ class Counters(NamedTuple):
     unknown: int = 0
 
 
+class Device(NamedTuple):
+    """What the samples of a placement come from.
+
+    Attributes:
+        protocol: name of its wire format.
+        line: its port or bus; None in a file, which does not always say.
+        id: its id on the line.
+    """
+
+    protocol: str
+    line: str | None
+    id: int
+
+    def __str__(self) -> str:
+        """As a message has it."""
+        return f"{self.protocol} id {self.id}{'' if self.line is None else f' on {self.line}'}"
+
+
 class Source(AbstractContextManager["Source"], Protocol):
     """See the module's text.
 
@@ -62,6 +80,10 @@ class Source(AbstractContextManager["Source"], Protocol):
     @property
     def clocks(self) -> Mapping[int, DeviceClock]:
         """Clocks of the sensors on live lines that send a time, by placement."""
+
+    @property
+    def devices(self) -> Mapping[int, Device]:
+        """What has sent samples so far, by placement; of recordings nobody knows."""
 
     @property
     def damage(self) -> str | None:

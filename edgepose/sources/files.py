@@ -13,7 +13,7 @@ from edgepose.clock import CaptureClock, DeviceClock, HostClocks
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.recording import Recording, read_recording, salvage_recording, samples
-from edgepose.sources import Batches, Counters, Source, total
+from edgepose.sources import Batches, Counters, Device, Source, total
 from edgepose.sources.detection import Chunk, candidates, protocol_named
 from edgepose.sources.sensor_map import SensorMap, default_places
 from edgepose.sources.stream import Clock, Places, Stream
@@ -57,6 +57,11 @@ class RecordingSource:
     @property
     def clocks(self) -> Mapping[int, DeviceClock]:
         """Always none: a recording has one clock."""
+        return {}
+
+    @property
+    def devices(self) -> Mapping[int, Device]:
+        """Always none: a recording holds placements."""
         return {}
 
     @property
@@ -125,6 +130,15 @@ class LogSource:
     def clocks(self) -> Mapping[int, DeviceClock]:
         """Always none: most logs do not say when what came."""
         return {}
+
+    @property
+    def devices(self) -> Mapping[int, Device]:
+        """What has sent samples so far, by placement."""
+        return {
+            place: device._replace(line=None)
+            for stream in self._streams.values()
+            for place, device in stream.devices.items()
+        }
 
     @property
     def damage(self) -> str | None:

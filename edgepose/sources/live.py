@@ -17,7 +17,7 @@ from edgepose.clock import DeviceClock, HostClocks
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
-from edgepose.sources import POLL_S, Batches, Counters, total
+from edgepose.sources import POLL_S, Batches, Counters, Device, total
 from edgepose.sources.detection import Chunk
 from edgepose.sources.stream import Clock, Places, Stream
 from firmware_protocols import registry
@@ -254,6 +254,11 @@ class LiveSource:
             if line.clocks is not None
             for place, clock in line.clocks.devices.items()
         }
+
+    @property
+    def devices(self) -> Mapping[int, Device]:
+        """What has sent samples so far, by placement."""
+        return {place: device for line in self._lines for place, device in line.stream.devices.items()}
 
     @property
     def damage(self) -> str | None:

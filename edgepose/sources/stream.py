@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
-from edgepose.sources import Counters
+from edgepose.sources import Counters, Device
 from edgepose.sources.detection import Chunk, Detector, decode
 from firmware_protocols.registry import Decoder, Protocol
 from firmware_protocols.sample import Sample
@@ -80,6 +80,12 @@ class Stream:
         c = self._decoder.counters
         unknown = sum(self._unknown.values())
         return Counters(c.packets - unknown, c.lost, c.bad, unknown)
+
+    @property
+    def devices(self) -> dict[int, Device]:
+        """What has sent samples, by placement."""
+        spoken = "" if self.protocol is None else self.protocol.name
+        return {place: Device(spoken, self.name, sensor) for sensor, place in self._known.items()}
 
     @property
     def unknown_ids(self) -> list[int]:

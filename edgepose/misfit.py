@@ -1,0 +1,144 @@
+"""Tells during a run when its calibration cannot be that of the wearer."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+
+from edgepose import rotations as rot
+from edgepose.calibration import Calibration
+from edgepose.calibration.fit import PoseFit, fit_pose, impossible_bones
+from edgepose.imu import ImuFrame
+from edgepose.placements import PLACEMENTS
+from edgepose.rotations import Array
+
+START_S = 20.0
+"""Time from the start in which a wearer who stands still is looked for in the pose, seconds."""
+
+REST_S, REST_DEG = 1.5, 3.0
+"""Standing: for so long no sensor turns by more."""
+
+STRANGE_DEG = 60.0
+"""Tilt of one sensor against the pose that is no matter of standing loosely."""
+
+IMPOSSIBLE_S = 3.0
+"""How long a bone has to be as none can be before it is told; sensors knock against each other."""
+
+COMPARE_S = 2.0
+"""When the rig is compared with that of the calibration: all sensors have reported by then."""
+
+_EVERY_S = 0.5
+
+
+class Misfits:
+    """Watches frames; each thing is told once."""
+
+    def __init__(self, calibration: Calibration, compare: Callable[[], str | None] = lambda: None) -> None:
+        """Nothing has come.
+
+        Args:
+            calibration: of the run.
+            compare: asked once what else is different from when it was made, one line.
+        """
+        self._calibration, self._compare = calibration, compare
+        self._start_s: float | None = None
+        self._next_s = -np.inf
+        self._frames: deque[ImuFrame] = deque()  # of the last REST_S
+        self._looking = True
+        self._compared = False
+        self._nearest: PoseFit | None = None  # of the rests so far
+        self._told_no_pose = False
+        self._impossible_s = dict.fromkeys(PLACEMENTS, 0.0)
+
+    def of(self, frame: ImuFrame, bones: Array) -> list[str]:
+        """What there is to tell of a frame, one line each.
+
+        Args:
+            frame: as measured.
+            bones: (6, 3, 3) of it, R_TB.
+        """
+        if self._start_s is None:
+            self._start_s = frame.time_s
+        if self._looking:
+            self._frames.append(frame)
+            while self._frames[0].time_s < frame.time_s - REST_S:
+                self._frames.popleft()
+        if frame.time_s < self._next_s:
+            return []
+        self._next_s = frame.time_s + _EVERY_S
+        passed_s = frame.time_s - self._start_s
+        lines = self._bodies(frame, bones)
+        if not self._compared and passed_s >= COMPARE_S:
+            lines += self._comparison()
+        if self._looking:
+            lines += self._pose(passed_s)
+        return lines
+
+    def at_end(self) -> list[str]:
+        """What there is to tell after the last frame."""
+        lines = [] if self._compared or self._start_s is None else self._comparison()
+        return lines + (self._no_pose() if self._looking else [])
+
+    def _comparison(self) -> list[str]:
+        self._compared = True
+        line = self._compare()
+        return [] if line is None else [line]
+
+    def _bodies(self, frame: ImuFrame, bones: Array) -> list[str]:
+        wrong = [name for name in impossible_bones(bones) if not frame.held[PLACEMENTS.index(name)]]
+        told = []
+        for name, since_s in self._impossible_s.items():
+            self._impossible_s[name] = since_s + _EVERY_S if name in wrong else min(since_s, 0.0)
+            if self._impossible_s[name] > IMPOSSIBLE_S:
+                self._impossible_s[name] = -np.inf
+                told.append(name)
+        if not told:
+            return []
+        return [
+            f"warning: {', '.join(told)}: turned against the pelvis as no body can: is the calibration that "
+            "of this wearer and rig, and does each sensor sit where it did? calibrate again"
+        ]
+
+    def _pose(self, passed_s: float) -> list[str]:
+        rest = _rest(self._frames)
+        if rest is not None:
+            fit = fit_pose(self._calibration, rest)
+            self._looking = fit.sits_at is None and not fit.good
+            if fit.sits_at is not None:
+                return [
+                    f"warning: sensors are exchanged since the calibration: {fit.exchanged}; "
+                    "exchange them, or calibrate again"
+                ]
+            if self._nearest is None or fit.off_deg < self._nearest.off_deg:
+                self._nearest = fit
+        return self._no_pose() if self._looking and passed_s > START_S else []
+
+    def _no_pose(self) -> list[str]:
+        nearest, told = self._nearest, self._told_no_pose
+        self._told_no_pose = True
+        if told or nearest is None or (nearest.in_pose and nearest.tilt_deg.max() < STRANGE_DEG):
+            return []
+        tilt = ", ".join(f"{n} {angle:.0f}" for n, angle in zip(PLACEMENTS, nearest.tilt_deg, strict=True))
+        return [
+            f"warning: nobody has stood still in the calibration's pose (tilt off by {tilt} deg): if "
+            "somebody meant to, it is of another wearer or rig; calibrate again"
+        ]
+
+
+def _rest(frames: deque[ImuFrame]) -> Array | None:
+    """Mean orientations (6, 4) of frames in which nothing turned; None if something did."""
+    silent = any(frame.held.any() for frame in frames)
+    if silent or frames[-1].time_s - frames[0].time_s < REST_S - _EVERY_S:
+        return None
+    if _turn_deg(frames[0].orientation, frames[-1].orientation).max() > REST_DEG:  # mostly, and quickly seen
+        return None
+    orientation = np.stack([frame.orientation for frame in frames])
+    mean = np.stack([rot.mean_rotation(own) for own in orientation.swapaxes(0, 1)])
+    return mean if _turn_deg(mean, orientation).max() < REST_DEG else None
+
+
+def _turn_deg(one: Array, other: Array) -> Array:
+    """Angles between unit quaternions (..., 4), degrees."""
+    return np.degrees(2.0 * np.arccos(np.clip(np.abs(np.sum(one * other, axis=-1)), 0.0, 1.0)))
