@@ -49,10 +49,25 @@ class ArchiveInfo(NamedTuple):
     metadata: dict[str, Any]
 
 
+def _settings() -> str:
+    """The folder of the user's settings; with "~" in front where the user has no home."""
+    return os.path.expanduser(os.environ.get("XDG_CONFIG_HOME") or "~/.config")  # noqa: PTH111 - never raises
+
+
+def has_home() -> bool:
+    """Whether the user can have a list of trusted sums; under any number in a container, maybe not."""
+    return not _settings().startswith("~")
+
+
 def trust_file() -> Path:
-    """The user's own list of trusted sums, in the format of `sha256sum`."""
-    config = os.environ.get("XDG_CONFIG_HOME") or "~/.config"
-    return Path(config).expanduser() / "edgepose" / "trusted-archives"
+    """The user's own list of trusted sums, in the format of `sha256sum`.
+
+    Raises:
+        EdgeposeError: the user has no home.
+    """
+    if not has_home():
+        raise EdgeposeError("you have no home folder for a list of trusted archives: set XDG_CONFIG_HOME")
+    return Path(_settings()) / "edgepose" / "trusted-archives"
 
 
 def shipped() -> list[Path]:
@@ -114,7 +129,9 @@ def inspect(path: Path) -> ArchiveInfo:
         raise EdgeposeError(f"{path}: the archive's metadata cannot be read ({error})") from error
     _check(path, metadata)
     sha256 = hashlib.sha256(content).hexdigest()
-    known = _sums(MODELS / "SHA256SUMS") | _sums(trust_file())
+    known = _sums(MODELS / "SHA256SUMS")
+    if has_home():
+        known |= _sums(trust_file())
     return ArchiveInfo(path, sha256, sha256 in known, metadata)
 
 

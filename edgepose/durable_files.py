@@ -57,7 +57,7 @@ def write_whole(
     name: str | Path, content: str | bytes | memoryview, what: str, overwrite: bool = True
 ) -> None:
     """Write a file of a content, text in UTF-8; see `replace_file`."""
-    data = content.encode() if isinstance(content, str) else content
+    data = content.encode(errors="backslashreplace") if isinstance(content, str) else content
 
     def write(part: Path) -> None:
         part.write_bytes(data)

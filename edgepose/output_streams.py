@@ -66,7 +66,7 @@ class OutputStream:
     def _open(self) -> Any:
         name = self._target.name
         if name == "-":
-            if sys.stdout is None:
+            if sys.stdout is None or getattr(sys.stdout, "name", None) == os.devnull:  # see `cli.terminal`
                 raise EdgeposeError(f"cannot write {self._what}: standard output is closed")
             # Below Python's buffers: what they still held would fail at exit without a reader.
             sys.stdout.flush()

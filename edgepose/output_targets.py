@@ -124,7 +124,7 @@ def check_free(paths: Iterable[Path], hint: str) -> None:
     Raises:
         EdgeposeError: some are.
     """
-    there = [path for path in paths if os.path.lexists(path)]
+    there = [path for path in paths if path.exists() and not is_stream(path)]
     if there:
         rest = f" and {len(there) - 1} others" if there[1:] else ""
         raise EdgeposeError(f"{there[0]}{rest}: there already; {hint}")
@@ -138,13 +138,21 @@ def is_stream(name: str | Path) -> bool:
         return False
 
 
+def is_null(name: str | Path) -> bool:
+    """Whether an output is the device in which everything vanishes."""
+    try:
+        return Path(name).samefile(os.devnull)
+    except OSError:  # not there
+        return False
+
+
 def has_reader(name: str | Path) -> bool:
     """Whether somebody reads an output while it is written, who could hold up what writes it."""
     number = sys.stdout.fileno() if str(name) == "-" else descriptor(Path(name))
     try:
         if number is not None:
             return not stat.S_ISREG(os.fstat(number).st_mode)
-        return is_stream(name) and not Path(name).samefile(os.devnull)
+        return is_stream(name) and not is_null(name)
     except OSError:  # told where it is opened
         return False
 

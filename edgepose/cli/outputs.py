@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from edgepose.errors import EdgeposeError
-from edgepose.output_targets import check_output
+from edgepose.output_targets import check_output, is_null
 
 if TYPE_CHECKING:
     from edgepose.sinks import Sink
@@ -132,8 +133,8 @@ def check_files(outputs: Mapping[str, str | Path | None], inputs: Mapping[str, P
         for name, given in inputs.items():
             if given is not None and _is_same_file(Path(output), given):
                 raise click.UsageError(f"{flag} would overwrite {given}, which is {name}; name another file")
-        other = written.setdefault(Path(output).resolve(), flag)
-        if other != flag:
+        other = written.setdefault(Path(os.path.realpath(output)), flag)
+        if other != flag and not is_null(output):
             raise click.UsageError(f"{other} and {flag} name the same file, {output}; name two")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import click
@@ -41,8 +42,10 @@ def report(poses: Path, out: Path | None, height: float, overwrite: bool) -> Non
     from edgepose.report import write_report
     from edgepose.skeleton import default_body
 
+    if poses.is_dir():
+        raise click.UsageError(f"{poses} is a folder: name a file of poses")
     path = poses.with_suffix(".html") if out is None else out
-    if path.resolve() == poses.resolve():
+    if os.path.realpath(path) == os.path.realpath(poses):
         raise click.UsageError(f"--out would overwrite {poses}; name another file")
     check_output(path, "the report", (".html", ".htm"), overwrite)
     body = default_body(height)
