@@ -122,3 +122,77 @@ def test_outputs_are_closed_when_their_wearer_ends(wearer, join, engine, tmp_pat
     assert len(long.notes) == 180
     assert long.notes[-1]
     assert long.closed.is_set()
+
+
+class Broken(Shelf):
+    """An output that fails as nobody has foreseen."""
+
+    def __init__(self, where: str) -> None:
+        super().__init__()
+        self._where = where
+
+    def write(self, pose: PoseFrame) -> None:
+        if self._where == "write" and len(self.notes) == 20:
+            raise KeyError("a fault")
+        super().write(pose)
+
+    def close(self) -> None:
+        super().close()
+        if self._where == "close":
+            raise KeyError("a fault")
+
+
+@pytest.mark.parametrize("where", ["write", "close"])
+def test_what_nobody_has_foreseen_in_an_output_ends_only_its_wearer(wearer, join, engine, where):
+    told: list[str] = []
+    good, bad = Shelf(), Broken(where)
+    sources = [open_source(file=wearer.short, waits=False) for _ in range(2)]
+    with sources[0] as one, sources[1] as other:
+        wearers = [join(one, good), join(other, bad, told.append)]
+        run_together(wearers, engine, 0.0)
+    assert len(good.notes) == 180
+    assert wearers[0].walk.summary.error is None
+    assert "an unexpected fault (KeyError: 'a fault'); please report it" in str(wearers[1].walk.summary.error)
+    assert bad.closed.is_set()
+    if where == "write":
+        assert len(bad.notes) == 20
+        assert told[0].startswith("ended: an unexpected fault")
+
+
+@pytest.mark.parametrize("place", ["clock", "headings", "orient"])
+def test_what_nobody_has_foreseen_on_the_way_ends_only_its_wearer(wearer, join, engine, monkeypatch, place):
+    good, bad = Shelf(), Shelf()
+
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("a fault")
+
+    with (
+        open_source(file=wearer.short, waits=False) as one,
+        open_source(file=wearer.short, waits=False) as other,
+    ):
+        wearers = [join(one, good), join(other, bad)]
+        walk = wearers[1].walk
+        if place == "clock":
+            monkeypatch.setattr(walk.clock, "push", fail)
+        elif place == "headings":
+            monkeypatch.setattr(walk._headings, "at", fail)
+        else:
+            monkeypatch.setattr(walk, "_orient", fail)
+        run_together(wearers, engine, 0.0)
+    assert len(good.notes) == 180
+    assert isinstance(walk.summary.error.__cause__, ZeroDivisionError)
+
+
+def test_the_line_of_a_wearer_who_has_ended_is_free(wearer, join, engine):
+    """While the others go on."""
+    maker = Maker(lambda: (b"", False))
+    free: list[bool] = []
+    others = Shelf(lambda: free.append(maker.closed) or maker.closed)
+    ending = bus(maker)
+    with ending as one, open_source(file=wearer.short, realtime=True, waits=False) as other:
+        ended = join(one, Shelf())
+        going = join(other, others)
+        ended.end()
+        run_together([ended, going], engine, 0.001)
+    assert free[-1]
+    assert len(others.notes) > 100

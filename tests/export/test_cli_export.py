@@ -483,3 +483,84 @@ def test_packed_takes_give_the_same_run(made, tmp_path):
     for name, weights in one["network"].items():
         torch.testing.assert_close(weights, other["network"][name], rtol=0, atol=1e-6)
     assert one["data"] == other["data"]
+
+
+# --- what is there already ----------------------------------------------------------------------------------
+
+OLD = b"what was there before\n"
+
+WRITES = {
+    "export": ("tiny.pt", lambda folder, out: ("export", folder / "run" / "best.pt", "--out", out)),
+    "learn-prior": ("prior.npz", lambda folder, out: ("learn-prior", folder / "amass.npz", "--out", out)),
+    "histogram": (
+        "a.png",
+        lambda folder, out: (
+            *("evaluate", "--data", folder / "recordings", "--model", "rnn", "--part", "cmu-02"),
+            *("--histogram", out),
+        ),
+    ),
+    "synthesize": (
+        WALK.with_suffix(".npz").name,
+        lambda folder, out: ("synthesize", WALK, "--out", out.parent),
+    ),
+}
+
+
+@pytest.fixture(params=WRITES)
+def output(request, made, tmp_path):
+    """The name of an output, and the words of the command that writes it."""
+    folder, _, _ = made
+    if not (folder / "amass.npz").exists():  # two minutes of somebody who hardly moves
+        poses = np.random.default_rng(1).normal(scale=0.1, size=(720, 156))
+        np.savez(folder / "amass.npz", poses=poses, trans=np.zeros((720, 3)), mocap_framerate=6.0)
+    name, words = WRITES[request.param]
+    out = tmp_path / "out" / name
+    out.parent.mkdir()
+    return out, words(folder, out)
+
+
+def test_nothing_is_overwritten_unasked(output):
+    out, words = output
+    out.write_bytes(OLD)
+    assert "there already" in fails(*words)
+    assert out.read_bytes() == OLD
+    edgepose(*words, "--overwrite")
+    assert out.read_bytes()[:4] in (b"PK\x03\x04", b"\x89PNG")
+    assert {path.name for path in out.parent.iterdir()} <= {out.name, f"{out.stem}.md"}
+
+
+def test_links_and_devices_are_written_through(output):
+    out, words = output
+    if out.suffix != ".pt":  # whose card would be elsewhere
+        out.symlink_to("/dev/null")
+        edgepose(*words)
+        assert out.readlink() == Path("/dev/null")
+        assert Path("/dev/null").is_char_device()
+        out.unlink()
+    end = out.parent / f"end{out.suffix}"
+    out.symlink_to(end.name)
+    edgepose(*words)
+    assert out.is_symlink()
+    assert end.read_bytes()[:4] in (b"PK\x03\x04", b"\x89PNG")
+
+
+def test_a_folder_in_the_place_of_an_output(output):
+    out, words = output
+    out.mkdir()
+    result = CliRunner().invoke(cli, [*map(str, words), "--overwrite"])
+    assert result.exit_code in (1, 2)
+    assert list(out.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["export", "learn-prior"])
+def test_a_card_or_a_file_of_another_kind_is_kept(name, made, tmp_path):
+    folder, _, _ = made
+    words = WRITES[name][1]
+    if name == "export":
+        (tmp_path / "tiny.md").write_bytes(OLD)
+        assert "tiny.md is there already" in fails(*words(folder, tmp_path / "tiny.pt"))
+        assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["tiny.md"]
+    else:
+        (tmp_path / "prior.json").write_bytes(OLD)
+        assert "another kind" in fails(*words(folder, tmp_path / "prior.json"), "--overwrite")
+        assert (tmp_path / "prior.json").read_bytes() == OLD

@@ -192,3 +192,29 @@ def test_rounded_weights_are_exact_in_fp16_and_compress(parts):
         )
 
     assert size(again) < 0.45 * size(before)
+
+
+@pytest.fixture
+def raspberry(monkeypatch):
+    """As on a processor whose first fp16 product would end the process."""
+    monkeypatch.setattr("edgepose.precision.platform.machine", lambda: "aarch64")
+    monkeypatch.setattr("edgepose.precision._hwcap", lambda: 0)
+
+
+def test_without_products_of_fp16_auto_is_f32(tmp_path, write_archive, raspberry):
+    info = archive.inspect(write_archive(tmp_path / "a.pt", RNN))
+    told = []
+    assert pack(archive.load(info, trust=True), info, "auto", told.append) == "f32"
+    assert told == []
+    with pytest.raises(
+        EdgeposeError, match=r"a\.pt: this processor has no products of fp16 .*--precision f32"
+    ):
+        pack(archive.load(info, trust=True), info, "fp16", told.append)
+    assert pack(archive.load(info, trust=True), info, "int8", told.append) == "int8"
+    assert told == ["warning: int8 is many times slower than f32 on aarch64; use --precision f32"]
+
+
+def test_without_products_of_fp16_an_archive_of_them_is_refused(tmp_path, write_archive, raspberry):
+    info = archive.inspect(write_archive(tmp_path / "a.pt", RNN, precision="fp16"))
+    with pytest.raises(EdgeposeError, match=r"no products of fp16 numbers.*export it again in f32"):
+        pack(archive.load(info, trust=True), info)
