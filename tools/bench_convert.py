@@ -76,7 +76,20 @@ def spread(path: Path, folder: Path, count: int) -> None:
 
 def convert(inputs: Path, to: str, out: Path, jobs: int) -> tuple[float, list[str]]:
     """Seconds that the command took, and the rows of its table."""
-    command = [sys.executable, "-m", "edgepose", "convert", inputs, "--to", to, "--out", out, "--jobs", jobs]
+    command = [
+        sys.executable,
+        "-m",
+        "edgepose",
+        "convert",
+        inputs,
+        "--to",
+        to,
+        "--out",
+        out,
+        "--overwrite",
+        "--jobs",
+        jobs,
+    ]
     started = time.monotonic()
     result = subprocess.run([*map(str, command)], text=True, capture_output=True, check=False)
     if result.returncode != 1:  # there is the broken one

@@ -117,10 +117,10 @@ def follow(process: subprocess.Popen[str], source: list[str], out: Path) -> tupl
     """
     calibration = out / "calibration.json"
     hold = ("--body-frame", "heading:0", "--hold", 3, "--countdown", 1)
-    subprocess.run(edgepose("calibrate", *source, *hold, "--out", calibration), check=True)
+    subprocess.run(edgepose("calibrate", *source, *hold, "--out", calibration, "--overwrite"), check=True)
     listener = Listener()
     listener.start()
-    outputs = ("--csv", out / "poses.csv", "--udp", f"127.0.0.1:{listener.port}")
+    outputs = ("--csv", out / "poses.csv", "--overwrite", "--udp", f"127.0.0.1:{listener.port}")
     run = subprocess.Popen(edgepose("run", *source, "--calibration", calibration, *outputs))
     try:
         while not listener.first.wait(0.5):
@@ -183,7 +183,7 @@ def main(out: Path, protocol: str) -> None:
     out.mkdir(parents=True, exist_ok=True)
     recording = out / CLIP.with_suffix(".npz").name
     rig = ("--hold", HOLD_S, "--rate", RATE, "--mounting", 7)
-    subprocess.run(edgepose("synthesize", CLIP, "--out", out, *rig), check=True)
+    subprocess.run(edgepose("synthesize", CLIP, "--out", out, "--overwrite", *rig), check=True)
     with np.load(recording) as data:
         truth = Truth(data["t"], rot.rotvec_to_matrix(data["poses"].reshape(-1, 24, 3)))
     with simulator(recording, protocol) as (process, source):
