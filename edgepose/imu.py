@@ -14,6 +14,10 @@ FILTERS = ("none", "kalman", "vqf")
 """What makes orientations of samples: the devices themselves, or a filter here."""
 
 
+GAP_S = 60.0
+"""Where all sensors are silent for longer, frames restart afterwards; a minute of repeats helps nobody."""
+
+
 class ImuSample(NamedTuple):
     """One reading of one sensor, in SI units.
 

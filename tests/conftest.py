@@ -8,8 +8,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from edgepose_export.archive import Statistics, describe, new_network, save, script
-from edgepose_export.networks import NetworkShape
+from edgepose_export.archive.torchscript import Statistics, describe, new_network, save, script
+from edgepose_export.networks.shape import NetworkShape
 
 # Tests send Ctrl-C to programs that they start; a shell that starts the tests in the background leaves it
 # ignored, and what they start inherits that.

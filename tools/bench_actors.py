@@ -17,10 +17,10 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from edgepose import archive
-from edgepose.metrics import joint_angle_error, position_error, sip_error
+from edgepose.analysis.metrics import joint_angle_error, position_error, sip_error
+from edgepose.inference import archive
 from edgepose.skeleton import UNOBSERVED, default_body, forward_kinematics, local_from_global
-from edgepose_export.evaluation import Mode, modes_of, run_archive, takes_of
+from edgepose_export.evaluation.evaluate import Mode, modes_of, run_archive, takes_of
 
 Array = NDArray[np.float64]
 

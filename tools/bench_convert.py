@@ -16,11 +16,11 @@ from pathlib import Path
 import click
 import numpy as np
 
+from edgepose.formats.recordings.csv_npz import Recording, SensorData, write_csv
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseFrame
-from edgepose.recording import Recording, SensorData, write_csv
 from edgepose.rotations import rotvec_to_matrix
-from edgepose.sinks.csv_file import CsvSink
+from edgepose.sinks.csv import CsvSink
 
 RATE, POSE_RATE = 100, 60
 

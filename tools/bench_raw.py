@@ -13,17 +13,18 @@ from typing import NamedTuple
 import click
 import numpy as np
 
-from edgepose import archive, calibration
+from edgepose import calibration
 from edgepose import rotations as rot
-from edgepose.metrics import format_table, summary
+from edgepose.analysis.metrics import format_table, summary
+from edgepose.formats.recordings.csv_npz import Recording, SensorData, samples
+from edgepose.inference import archive
 from edgepose.placements import BONES, PLACEMENTS
-from edgepose.recording import Recording, SensorData, samples
 from edgepose.rotations import Array
 from edgepose.skeleton import default_body, forward_kinematics, local_from_global
-from edgepose_export.chip import BMI270, Chip, raw
-from edgepose_export.exercises import with_exercises
 from edgepose_export.mocap import Motion, read_motion, resample
-from edgepose_export.synthesis import random_mounting, virtual_imus
+from edgepose_export.synthesis.heading_routine import with_exercises
+from edgepose_export.synthesis.imu_errors import BMI270, Chip, raw
+from edgepose_export.synthesis.virtual_imus import random_mounting, virtual_imus
 
 CLIP = Path(__file__).parent / "data" / "09_12.bvh"
 RATE, STAND_S, HOLD = 100.0, 6.0, (1.0, 5.0)
@@ -64,8 +65,8 @@ def ideal(motion: Motion, mounting: Array) -> Recording:
 
 def oriented(recording: Recording, way: Way, seed: int) -> Recording:
     """What is left of it after the chip and the filter."""
+    from edgepose.formats.recordings.csv_npz import from_samples
     from edgepose.orientation import Orienter
-    from edgepose.recording import from_samples
 
     if way.chip is None:
         return recording
@@ -97,8 +98,8 @@ def calibrated(recording: Recording, way: Way, truth: Recording) -> calibration.
 
 def run(recording: Recording, found: calibration.Calibration, model: str) -> tuple[Array, Array, Array]:
     """Times (T,), poses (T, 24, 3, 3) and measured bones (T, 6, 3, 3)."""
-    from edgepose.engine import StreamEngine
-    from edgepose.sync import FrameClock
+    from edgepose.inference.engine import StreamEngine
+    from edgepose.pipeline.frame_synchronizer import FrameClock
 
     info = archive.inspect(archive.find(model))
     engine = StreamEngine(archive.load(info), info.metadata["past"], info.metadata["future"])

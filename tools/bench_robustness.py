@@ -17,14 +17,14 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from edgepose import archive
 from edgepose import rotations as rot
-from edgepose.held import carried
-from edgepose.metrics import joint_angle_error, sip_error
+from edgepose.analysis.metrics import joint_angle_error, sip_error
+from edgepose.inference import archive
+from edgepose.pipeline.dropout import carried
 from edgepose.placements import PLACEMENTS, ROOT
-from edgepose_export.dataset import RATE, Take
-from edgepose_export.evaluation import Mode, groups, modes_of, run_archive, takes_of
-from edgepose_export.splits import HELD_OUT
+from edgepose_export.evaluation.evaluate import Mode, groups, modes_of, run_archive, takes_of
+from edgepose_export.training.dataset import RATE, Take
+from edgepose_export.training.splits import HELD_OUT
 
 Array = NDArray[np.float64]
 

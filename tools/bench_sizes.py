@@ -13,8 +13,8 @@ from pathlib import Path
 import click
 import torch
 
-from edgepose_export.archive import Statistics, describe, new_network, save, script
-from edgepose_export.networks import NetworkShape
+from edgepose_export.archive.torchscript import Statistics, describe, new_network, save, script
+from edgepose_export.networks.shape import NetworkShape
 
 UNTRAINED = {
     "step": 0,

@@ -22,16 +22,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edgepose import metrics
 from edgepose import rotations as rot
+from edgepose.analysis import metrics
 from edgepose.calibration import GRAVITY
-from edgepose.offline.bodies import scaled, sensor_points, shaped_body
-from edgepose.offline.measurements import Measurements
-from edgepose.offline.prior import Prior, load_prior
-from edgepose.offline.rigs import Rig, hinge_rig, smpl_rig
-from edgepose.offline.solve import Settings, solve
-from edgepose.offline.terms import Weights, second_difference
 from edgepose.placements import BONES, PLACEMENTS
+from edgepose.sip.bodies import scaled, sensor_points, shaped_body
+from edgepose.sip.energy import Weights, second_difference
+from edgepose.sip.measurements import Measurements
+from edgepose.sip.parameterisation import Rig, hinge_rig, smpl_rig
+from edgepose.sip.prior import Prior, load_prior
+from edgepose.sip.solve import Settings, solve
 from edgepose.skeleton import Body, default_body, forward_kinematics
 
 Array = NDArray[np.float64]
@@ -105,7 +105,7 @@ def made_up_motion(frames: int) -> tuple[Array, Array]:
 
 def speed(plot: Path | None) -> None:
     """Print seconds of a core and memory by number of frames; every chunk takes all its evaluations."""
-    import edgepose.offline.minimise as minimise
+    import edgepose.sip.levenberg_marquardt as minimise
 
     minimise.ENOUGH = -1.0  # never enough
     prior, rows = load_prior(), []
@@ -149,7 +149,7 @@ class Sample(NamedTuple):
 
 def takes(data: Path, part: str, every: int, body: Body) -> Iterator[Sample]:
     """Every so many takes of a part of the split, on the wearer's body."""
-    from edgepose_export.splits import part_of
+    from edgepose_export.training.splits import part_of
 
     paths = sorted((p for p in data.rglob("*.npz") if part_of(p.stem) == part), key=lambda p: p.stem)
     for number, path in enumerate(paths[::every]):
@@ -161,7 +161,7 @@ def takes(data: Path, part: str, every: int, body: Body) -> Iterator[Sample]:
 
 def published(folder: Path) -> Iterator[Sample]:
     """Takes of DIP-IMU or TotalCapture below a folder."""
-    from edgepose_export.published import read_published
+    from edgepose_export.datasets import read_published
 
     for take in read_published(folder):
         frames = len(take.pose)
@@ -183,9 +183,9 @@ def solver(method: str, rig: Rig, body: Body, weights: Weights) -> Method:
 
 def network(name: str, mode: str) -> Method:
     """Poses of a shipped model, run as `edgepose run` runs it."""
-    from edgepose import archive
-    from edgepose_export.dataset import Take
-    from edgepose_export.evaluation import modes_of, run_archive
+    from edgepose.inference import archive
+    from edgepose_export.evaluation.evaluate import modes_of, run_archive
+    from edgepose_export.training.dataset import Take
 
     info = archive.inspect(archive.find(name))
     module = archive.load(info)

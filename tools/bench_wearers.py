@@ -34,11 +34,11 @@ import numpy as np
 import simulate
 import torch
 
-from edgepose import archive
 from edgepose.calibration import Calibration, save
-from edgepose.engine import BatchEngine, Body
+from edgepose.inference import archive
+from edgepose.inference.engine import BatchEngine, Body
+from edgepose.inference.quantisation import pack
 from edgepose.placements import PLACEMENTS
-from edgepose.precision import pack
 from edgepose.sinks.udp import decode_binary
 from firmware_protocols.registry import PROTOCOLS
 

@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose import rotations as rot
-from edgepose.figures import skeleton_strip
-from edgepose.metrics import format_table, summary
-from edgepose.poses import read_poses
+from edgepose.analysis.figures import skeleton_strip
+from edgepose.analysis.metrics import format_table, summary
+from edgepose.formats.poses.reading import read_poses
 from edgepose.skeleton import default_body
 from firmware_protocols.registry import PROTOCOLS
 

@@ -13,9 +13,10 @@ from pathlib import Path
 import click
 import torch
 
-from edgepose import archive, speed
-from edgepose_export.evaluation import modes_of
-from edgepose_export.precisions import compare
+from edgepose.benchmarks import speed
+from edgepose.inference import archive
+from edgepose_export.evaluation.evaluate import modes_of
+from edgepose_export.evaluation.quantisation import compare
 
 KEY = "sip_error_deg"
 

@@ -8,7 +8,7 @@ import matplotlib
 import numpy as np
 from vqf import VQF
 
-from edgepose.broad import error_angles, errors, read_trial
+from edgepose.benchmarks.broad import error_angles, errors, read_trial
 from edgepose.orientation import OrientationFilter, smooth
 
 ROOT = Path(__file__).parents[1]

@@ -8,9 +8,9 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
+from edgepose.analysis.figures import skeleton_strip
 from edgepose.errors import EdgeposeError
-from edgepose.figures import skeleton_strip
-from edgepose.poses import read_poses
+from edgepose.formats.poses.reading import read_poses
 from edgepose.skeleton import default_body
 
 HEIGHT_M = 1.75

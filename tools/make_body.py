@@ -1,6 +1,6 @@
 """Make the tables of bodies from the open body model Anny.
 
-`edgepose/body.json` is behind `default_body`; `edgepose/offline/shapes.json` says how a body changes with
+`edgepose/body.json` is behind `default_body`; `edgepose/sip/shapes.json` says how a body changes with
 weight and with words such as "long-legged".
 
 Run by a developer, seldom; edgepose itself never needs Anny:
@@ -284,7 +284,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="make edgepose's tables of bodies from Anny")
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "edgepose")
     out = parser.parse_args().out
-    for path, table in ((out / "body.json", make()), (out / "offline" / "shapes.json", make_shapes())):
+    for path, table in ((out / "body.json", make()), (out / "sip" / "shapes.json", make_shapes())):
         path.write_text(json.dumps(table, separators=(",", ":")) + "\n", encoding="utf-8")
         print(f"{path}: {path.stat().st_size} bytes")
 

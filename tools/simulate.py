@@ -33,8 +33,8 @@ import click
 import numpy as np
 
 from edgepose.errors import EdgeposeError
+from edgepose.formats.recordings.csv_npz import Recording, SensorData, read_recording, write_npz
 from edgepose.placements import PLACEMENTS
-from edgepose.recording import Recording, SensorData, read_recording, write_npz
 from edgepose.skeleton import default_body
 from firmware_protocols.registry import PROTOCOLS, Frame
 from firmware_protocols.registry import Protocol as Format
@@ -92,7 +92,7 @@ def read_input(path: Path, rig: Rig = IDEAL) -> Recording:
     recording = of_clip(path, rig) if is_motion(path) else read_recording(path)
     if rig.raw is None:
         return recording
-    from edgepose_export.chip import BMI270, raw
+    from edgepose_export.synthesis.imu_errors import BMI270, raw
 
     sensors = {}
     for i, (name, data) in enumerate(recording.sensors.items()):
@@ -105,9 +105,14 @@ def read_input(path: Path, rig: Rig = IDEAL) -> Recording:
 
 def of_clip(path: Path, rig: Rig) -> Recording:
     """What ideal sensors would have recorded; the wearer stands straight first."""
-    from edgepose_export.exercises import with_exercises
     from edgepose_export.mocap import pieces, read_motion, resample
-    from edgepose_export.synthesis import random_mounting, recording_arrays, virtual_imus, with_hold
+    from edgepose_export.synthesis.heading_routine import with_exercises
+    from edgepose_export.synthesis.virtual_imus import (
+        random_mounting,
+        recording_arrays,
+        virtual_imus,
+        with_hold,
+    )
 
     takes = pieces(read_motion(path))
     if len(takes) != 1:

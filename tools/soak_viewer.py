@@ -21,8 +21,8 @@ from pathlib import Path
 import click
 import numpy as np
 
-from edgepose.poses import read_poses
-from edgepose.recording import Recording, SensorData, read_recording, write_npz
+from edgepose.formats.poses.reading import read_poses
+from edgepose.formats.recordings.csv_npz import Recording, SensorData, read_recording, write_npz
 
 CLIP = Path(__file__).parent / "data" / "09_12.bvh"
 HOLD_S = 6

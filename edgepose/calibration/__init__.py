@@ -5,9 +5,8 @@ are radians, except where a name ends in `_deg`: those are for a person.
 """
 
 from edgepose.calibration.body_frame import body_from_inertial, check_body_frame
-from edgepose.calibration.bones import POSES, Calibration, apply, calibrate
 from edgepose.calibration.checks import GRAVITY, HoldSummary, MovedError, check_hold
-from edgepose.calibration.files import from_json, load_calibration, save, to_json
+from edgepose.calibration.functional import EXERCISE_S, ROUTINE, WeakMotionError, headings_from_motion
 from edgepose.calibration.headings import (
     HeadingReset,
     heading_offsets,
@@ -15,7 +14,10 @@ from edgepose.calibration.headings import (
     headings_from_mounting,
     headings_from_pose,
 )
-from edgepose.calibration.holds import (
+from edgepose.calibration.json_format import from_json, load_calibration, save, to_json
+from edgepose.calibration.mounting import mounting, mounting_warnings
+from edgepose.calibration.sensor_to_segment import POSES, Calibration, apply, calibrate
+from edgepose.calibration.static_pose import (
     Hold,
     SensorHold,
     cut,
@@ -23,8 +25,6 @@ from edgepose.calibration.holds import (
     hold_from_samples,
     stillest_start,
 )
-from edgepose.calibration.motion import EXERCISE_S, ROUTINE, WeakMotionError, headings_from_motion
-from edgepose.calibration.mounting import mounting, mounting_warnings
 
 __all__ = [
     "EXERCISE_S",

@@ -8,7 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from edgepose import rotations as rot
-from edgepose.calibration.holds import MIN_SAMPLES, Hold, SensorHold, check_reported, named, unit_or_zero
+from edgepose.calibration.static_pose import (
+    MIN_SAMPLES,
+    Hold,
+    SensorHold,
+    check_reported,
+    named,
+    unit_or_zero,
+)
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array

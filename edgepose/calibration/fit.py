@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose import rotations as rot
-from edgepose.calibration.bones import POSES, Calibration
+from edgepose.calibration.sensor_to_segment import POSES, Calibration
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 

@@ -13,10 +13,10 @@ import numpy as np
 
 from edgepose import rotations as rot
 from edgepose.calibration.body_frame import body_from_inertial
-from edgepose.calibration.bones import POSES, Calibration
 from edgepose.calibration.checks import check_hold, tilt_deg
-from edgepose.calibration.holds import Hold
 from edgepose.calibration.mounting import rotation_of
+from edgepose.calibration.sensor_to_segment import POSES, Calibration
+from edgepose.calibration.static_pose import Hold
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS, ROOT
 from edgepose.rotations import Array

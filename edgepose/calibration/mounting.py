@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from edgepose import rotations as rot
-from edgepose.calibration.bones import POSES, Calibration
+from edgepose.calibration.sensor_to_segment import POSES, Calibration
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 

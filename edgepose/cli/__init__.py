@@ -14,8 +14,8 @@ from typing import NoReturn
 import click
 
 from edgepose import __version__
-from edgepose.cli.stop import endings
-from edgepose.cli.terminal import prepare, say
+from edgepose.cli.terminal.messages import prepare, say
+from edgepose.cli.terminal.stop_signal import endings
 from edgepose.errors import as_told
 
 COMMANDS = (
@@ -44,7 +44,9 @@ class LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """The command of that name, or None."""
         if cmd_name in COMMANDS:
-            command: click.Command = getattr(importlib.import_module(f"edgepose.cli.{cmd_name}"), cmd_name)
+            command: click.Command = getattr(
+                importlib.import_module(f"edgepose.cli.commands.{cmd_name}"), cmd_name
+            )
             return command
         for point in entry_points(group="edgepose.commands", name=cmd_name):
             return point.load()

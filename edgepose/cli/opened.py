@@ -6,17 +6,17 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
-from edgepose.cli.options import Orientations
-from edgepose.cli.rigs import RigFlags
-from edgepose.cli.terminal import say
-from edgepose.cli.wishes import Wishes
+from edgepose.cli.options.source import Orientations
+from edgepose.cli.options.wearer import RigFlags
+from edgepose.cli.rezero_requests import Wishes
+from edgepose.cli.terminal.messages import say
 from edgepose.errors import EdgeposeError, named
+from edgepose.pipeline.rig_comparison import other_devices
 from edgepose.placements import PLACEMENTS
-from edgepose.sources.comparison import other_devices
 
 if TYPE_CHECKING:
     from edgepose.calibration import Calibration
-    from edgepose.pipeline import RunSummary, Walk
+    from edgepose.pipeline.run import RunSummary, Walk
     from edgepose.sinks import Sink
 
 
@@ -79,10 +79,10 @@ class OpenRig:
                 full.
             on_pose: called after each pose.
         """
-        from edgepose.misfit import Misfits
-        from edgepose.pipeline import Walk
-        from edgepose.rezero import Headings
-        from edgepose.sync import FrameClock
+        from edgepose.calibration.misfit import Misfits
+        from edgepose.calibration.rezero import Headings
+        from edgepose.pipeline.frame_synchronizer import FrameClock
+        from edgepose.pipeline.run import Walk
 
         source = self._flags.source
         headings = Headings(

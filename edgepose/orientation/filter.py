@@ -16,12 +16,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from edgepose import rotations as rot
 from edgepose.orientation import error_model as model
-from edgepose.orientation.columns import NO_FIELD, columns
-from edgepose.orientation.intake import FieldWatch, Intake
-from edgepose.orientation.magnetic import MagneticReference
+from edgepose.orientation.arrays import NO_FIELD, columns
+from edgepose.orientation.magnetic_reference import MagneticReference
 from edgepose.orientation.rest import RestDetector
-from edgepose.orientation.result import Event, Oriented
+from edgepose.orientation.sample_checks import FieldWatch, Intake
 from edgepose.orientation.settings import FilterSettings
+from edgepose.orientation.types import Event, Oriented
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 from edgepose import rotations as rot
 from edgepose.orientation import error_model as model
 from edgepose.orientation.filter import OrientationFilter, Step
-from edgepose.orientation.result import Oriented
 from edgepose.orientation.settings import FilterSettings
+from edgepose.orientation.types import Oriented
 
 Array = NDArray[np.float64]
 

@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from edgepose import rotations as rot
 from edgepose.errors import EdgeposeError
-from edgepose.orientation.columns import columns
-from edgepose.orientation.intake import FieldWatch, Intake
-from edgepose.orientation.result import Event, Oriented
+from edgepose.orientation.arrays import columns
+from edgepose.orientation.sample_checks import FieldWatch, Intake
 from edgepose.orientation.settings import FilterSettings
+from edgepose.orientation.types import Event, Oriented
 
 Array = NDArray[np.float64]
 

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
-from edgepose.growing_files import FLUSH_S, GrowingFile
-from edgepose.output_targets import is_stream
 from edgepose.pose import PoseFrame
 from edgepose.rotations import matrix_to_euler_zxy
 from edgepose.sinks import Sink
 from edgepose.skeleton import JOINTS, PARENTS, Body, default_body, standing_place
+from edgepose.utils.growing_files import FLUSH_S, GrowingFile
+from edgepose.utils.output_targets import is_stream
 
 Array = NDArray[np.float64]
 

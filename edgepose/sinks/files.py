@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from edgepose.output_targets import is_stream
 from edgepose.sinks import Sink
 from edgepose.sinks.bvh import BvhSink
-from edgepose.sinks.csv_file import CsvSink
+from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.npz import NpzSink
 from edgepose.sinks.spooled import SpooledSink
 from edgepose.skeleton import Body
+from edgepose.utils.output_targets import is_stream
 
 
 def csv_sink(

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from edgepose.output_streams import copy_to_stream
 from edgepose.pose import PoseFrame
 from edgepose.sinks import Sink
+from edgepose.utils.output_streams import copy_to_stream
 
 
 class SpooledSink(Sink):

@@ -5,11 +5,11 @@ from __future__ import annotations
 import socket
 from dataclasses import dataclass
 
-from edgepose.addresses import resolve
 from edgepose.errors import EdgeposeError
 from edgepose.pose import PoseFrame
 from edgepose.rotations import matrix_to_rotvec
 from edgepose.sinks import Sink
+from edgepose.utils.sockets import resolve
 
 CLIENTS = 16
 """Viewers at a time; more are turned away."""

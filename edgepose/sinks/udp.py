@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edgepose.addresses import resolve
 from edgepose.errors import EdgeposeError
 from edgepose.pose import PoseFrame, status_bits, status_text
 from edgepose.rotations import matrix_to_quat, matrix_to_rotvec, quat_to_matrix, rotvec_to_matrix
 from edgepose.sinks import Sink
 from edgepose.skeleton import JOINTS
+from edgepose.utils.sockets import resolve
 
 MAGIC = b"EPOS"
 VERSION = 1

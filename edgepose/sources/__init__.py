@@ -16,9 +16,9 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from edgepose.clock import DeviceClock
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
+from edgepose.sources.clock_sync import DeviceClock
 
 Batch = tuple[float, list[ImuSample]]
 
@@ -147,10 +147,10 @@ def open_source(
 
     sensor_map = None if sensors is None else read_map(Path(sensors))
     if file is not None:
-        from edgepose.sources.files import open_file
+        from edgepose.sources.replay import open_file
 
         return open_file(Path(file), realtime, protocol, sensor_map, lenient, waits)
-    from edgepose.sources.links import links
+    from edgepose.sources.line_config import links
     from edgepose.sources.live import LiveSource
 
     return LiveSource(links(port, baud, can, bitrate, fd, protocol, sensor_map), raw, lenient, waits)

@@ -13,13 +13,13 @@ from queue import Empty, SimpleQueue
 from types import TracebackType
 from typing import Any, NamedTuple, Protocol
 
-from edgepose.clock import DeviceClock, HostClocks
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import POLL_S, Batches, Counters, Device, total
-from edgepose.sources.detection import Chunk
-from edgepose.sources.stream import Clock, Places, Stream
+from edgepose.sources.clock_sync import DeviceClock, HostClocks
+from edgepose.sources.line_decoder import Clock, Places, Stream
+from edgepose.sources.protocol_detection import Chunk
 from firmware_protocols import registry
 
 _log = logging.getLogger(__name__)

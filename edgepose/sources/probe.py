@@ -7,10 +7,10 @@ from collections import Counter
 from typing import NamedTuple
 
 from edgepose.errors import EdgeposeError
-from edgepose.sources.detection import Detector
-from edgepose.sources.links import BAUD, can_link, serial_link
+from edgepose.sources.line_config import BAUD, can_link, serial_link
+from edgepose.sources.line_decoder import LISTEN_S
 from edgepose.sources.live import Gone, Link
-from edgepose.sources.stream import LISTEN_S
+from edgepose.sources.protocol_detection import Detector
 
 BAUDS = (BAUD, 921600, 460800, 230400, 57600, 38400, 9600)
 """Speeds that are tried, the most likely first, bit/s."""

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
-from edgepose.sources.stream import Places
-from edgepose.text_files import read_toml
+from edgepose.sources.line_decoder import Places
+from edgepose.utils.text_files import read_toml
 from firmware_protocols.registry import Protocol
 
 _DIRECTION = "(left|right|up|down|forward|back)"

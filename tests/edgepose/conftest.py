@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from edgepose.recording import Recording, SensorData, read_recording, write_npz
+from edgepose.formats.recordings.csv_npz import Recording, SensorData, read_recording, write_npz
 
 CLIP = Path(__file__).parents[2] / "tools" / "data" / "09_12.bvh"
 

@@ -11,10 +11,10 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from edgepose import archive
 from edgepose.cli import cli
-from edgepose.engine import WindowEngine
 from edgepose.errors import EdgeposeError
+from edgepose.inference import archive
+from edgepose.inference.engine import WindowEngine
 
 
 @pytest.fixture(autouse=True)
@@ -259,7 +259,7 @@ def test_code_of_a_stranger_is_not_run(tmp_path, made):
 
 def test_inspection_needs_no_torch(made):
     program = (
-        "import sys; from pathlib import Path; from edgepose import archive; "
+        "import sys; from pathlib import Path; from edgepose.inference import archive; "
         "info = archive.inspect(Path(sys.argv[1])); archive.trust(Path(sys.argv[1])); "
         "print(info.metadata['name'], 'torch' in sys.modules)"
     )

@@ -12,7 +12,7 @@ import pytest
 from scipy.io import savemat
 
 from edgepose import rotations as rot
-from edgepose.broad import Trial, errors, find_trials, read_trial, same_heading, trials
+from edgepose.benchmarks.broad import Trial, errors, find_trials, read_trial, same_heading, trials
 from edgepose.errors import EdgeposeError
 from edgepose.orientation import OrientationFilter, smooth
 

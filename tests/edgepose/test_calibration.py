@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from edgepose import calibration as cal
 from edgepose import rotations as rot
 from edgepose.errors import EdgeposeError
+from edgepose.formats.recordings.csv_npz import read_recording
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS, ROOT
-from edgepose.recording import read_recording
 
 DATA = Path(__file__).parents[1] / "data" / "imu"
 CREATED = "2026-01-02T03:04:05+00:00"

@@ -13,9 +13,9 @@ import can
 import pytest
 
 from edgepose.errors import EdgeposeError
+from edgepose.pipeline.frame_synchronizer import FrameClock
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import open_source
-from edgepose.sync import FrameClock
 from firmware_protocols import native_can
 from firmware_protocols.native import Info, Packet
 from firmware_protocols.registry import PROTOCOLS

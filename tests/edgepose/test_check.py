@@ -19,8 +19,8 @@ from pathlib import Path
 
 import pytest
 
+from edgepose.formats.recordings.csv_npz import read_recording, write_csv, write_npz
 from edgepose.placements import PLACEMENTS
-from edgepose.recording import read_recording, write_csv, write_npz
 from edgepose.sources import open_source
 
 REAL = Path(__file__).parents[1] / "data" / "imu" / "six-sites-3s.npz"

@@ -12,10 +12,10 @@ import click
 import pytest
 import serial
 
-from edgepose import archive
 from edgepose.cli import cli
+from edgepose.formats.recordings.csv_npz import read_recording, write_csv, write_npz
+from edgepose.inference import archive
 from edgepose.placements import PLACEMENTS
-from edgepose.recording import read_recording, write_csv, write_npz
 
 COMMANDS = cli.list_commands(click.Context(cli))
 

@@ -19,13 +19,13 @@ import pytest
 from click.testing import CliRunner, Result
 
 from edgepose import calibration as cal
-from edgepose import recording as rec
 from edgepose import rotations as rot
-from edgepose.cli.calibrate import calibrate
+from edgepose.cli.commands.calibrate import calibrate
 from edgepose.errors import EdgeposeError
+from edgepose.formats.recordings import csv_npz as rec
 from edgepose.imu import ImuSample
 from edgepose.placements import BONES, PLACEMENTS
-from edgepose_export.exercises import ASIDE_DEG, exercises
+from edgepose_export.synthesis.heading_routine import ASIDE_DEG, exercises
 from firmware_protocols import native
 
 REAL = Path(__file__).parents[1] / "data" / "imu" / "six-sites-3s.npz"
@@ -205,7 +205,9 @@ def test_wrong_use(arguments: list[object], message: str) -> None:
 
 
 def test_errors_are_one_line_and_torch_is_not_imported(tmp_path: Path) -> None:
-    code = "import sys, edgepose.cli.calibrate; assert 'torch' not in sys.modules; edgepose.cli.main()"
+    code = (
+        "import sys, edgepose.cli.commands.calibrate; assert 'torch' not in sys.modules; edgepose.cli.main()"
+    )
     done = subprocess.run(
         [sys.executable, "-c", code, "calibrate", "--file", str(REAL), "--from", "99"],
         capture_output=True,
@@ -323,7 +325,7 @@ def test_after_three_repeats_it_gives_up(wearer: Wearer, tmp_path: Path) -> None
 def test_missing_sensors_are_waited_for_and_then_named(
     wearer: Wearer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("edgepose.cli.guide.ALL_REPORT_S", 1.1)
+    monkeypatch.setattr("edgepose.cli.prompts.ALL_REPORT_S", 1.1)
     wearer.silent = {1, 4}
     result = run("--port", wearer.port, "--out", tmp_path / "calib.json")
     assert "Waiting for right_forearm, head." in result.output

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edgepose.clock import ArrivalClock, CaptureClock, DeviceClock
+from edgepose.sources.clock_sync import ArrivalClock, CaptureClock, DeviceClock
 
 WRAP = 1 << 32
 

@@ -23,12 +23,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edgepose.cli import cli
-from edgepose.converter import Job, convert, plan
+from edgepose.convert import Job, convert, plan
 from edgepose.errors import EdgeposeError
+from edgepose.formats.recordings.csv_npz import (
+    from_samples,
+    read_recording,
+    salvage_recording,
+    samples,
+    write_csv,
+    write_npz,
+)
+from edgepose.formats.recordings.xio_session import placement_of
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
-from edgepose.recording import from_samples, read_recording, salvage_recording, samples, write_csv, write_npz
-from edgepose.xio import placement_of
 from firmware_protocols import native_can
 from firmware_protocols.native import Packet, encode
 from firmware_protocols.sample import GRAVITY

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from edgepose.bvh import read_bvh
 from edgepose.errors import EdgeposeError
-from edgepose.joint_tree import forward
+from edgepose.formats.bvh import read_bvh
+from edgepose.formats.joint_tree import forward
+from edgepose.formats.poses.reading import is_poses, read_poses, salvage_poses
+from edgepose.formats.recordings.csv_npz import read_recording
 from edgepose.pose import PoseFrame
-from edgepose.poses import is_poses, read_poses, salvage_poses
-from edgepose.recording import read_recording
 from edgepose.sinks.bvh import BvhSink
-from edgepose.sinks.csv_file import CsvSink
+from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.npz import NpzSink
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics
 

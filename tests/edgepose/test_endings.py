@@ -22,9 +22,9 @@ import numpy as np
 import pytest
 
 from edgepose.errors import EdgeposeError
-from edgepose.pickles import read_pickle
-from edgepose.poses import read_poses
-from edgepose.recording import read_recording, samples
+from edgepose.formats.poses.reading import read_poses
+from edgepose.formats.recordings.csv_npz import read_recording, samples
+from edgepose.utils.safe_pickle import read_pickle
 from firmware_protocols import native_can
 from firmware_protocols.native import Packet
 
@@ -81,7 +81,7 @@ def test_pickles_that_ask_for_everything(tmp_path, name):
     path = tmp_path / "a.pkl"
     path.write_bytes(BOMBS[name])
     code = (
-        "import sys; from pathlib import Path; from edgepose.pickles import read_pickle\n"
+        "import sys; from pathlib import Path; from edgepose.utils.safe_pickle import read_pickle\n"
         "import resource; resource.setrlimit(resource.RLIMIT_CPU, (20, 20))\n"
         "resource.setrlimit(resource.RLIMIT_AS, (1 << 30, 1 << 30))\n"
         "try: read_pickle(Path(sys.argv[1]), 'pickle', 'no')\n"
@@ -102,7 +102,7 @@ def test_a_list_in_a_pickle_that_holds_itself_many_times(tmp_path):
     for _ in range(30):
         value = [value, value]
     (tmp_path / "a.pkl").write_bytes(pickle.dumps({"poses": value}))
-    from edgepose.pickles import numbers
+    from edgepose.utils.safe_pickle import numbers
 
     content = read_pickle(tmp_path / "a.pkl", "pickle", "no")
     with pytest.raises(EdgeposeError, match="poses is not an array"):

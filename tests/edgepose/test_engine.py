@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from edgepose.engine import BatchEngine, Body, EngineOutput, StreamEngine, WindowEngine
-from edgepose_export.networks import NetworkShape
+from edgepose.inference.engine import BatchEngine, Body, EngineOutput, StreamEngine, WindowEngine
+from edgepose_export.networks.shape import NetworkShape
 
 BIRNN = NetworkShape("birnn", 8, "global-6d", "passed")
 RNN = BIRNN._replace(kind="rnn")

@@ -8,11 +8,11 @@ import pytest
 from click.testing import CliRunner
 from matplotlib.colors import to_rgb
 
+from edgepose.analysis.figures import PREDICTION, REFERENCE, project, skeleton_strip
 from edgepose.errors import EdgeposeError
-from edgepose.figures import PREDICTION, REFERENCE, project, skeleton_strip
 from edgepose.pose import PoseFrame
 from edgepose.rotations import about_axis
-from edgepose.sinks.csv_file import CsvSink
+from edgepose.sinks.csv import CsvSink
 from edgepose.skeleton import forward_kinematics
 
 TOOL = Path(__file__).parents[2] / "tools" / "draw_poses.py"

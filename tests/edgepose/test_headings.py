@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from edgepose import calibration as cal
 from edgepose import rotations as rot
 from edgepose.errors import EdgeposeError
+from edgepose.formats.recordings.csv_npz import read_recording
 from edgepose.placements import BONES, PLACEMENTS
-from edgepose.recording import read_recording
-from edgepose_export.exercises import ASIDE_DEG, exercises
-from edgepose_export.synthesis import INERTIAL_FROM_BODY, random_mounting, straight_pose
+from edgepose_export.synthesis.heading_routine import ASIDE_DEG, exercises
+from edgepose_export.synthesis.virtual_imus import INERTIAL_FROM_BODY, random_mounting, straight_pose
 
 WALK = Path(__file__).parents[1] / "data" / "imu" / "six-sites-walk.npz"
 RATE = 50.0

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from edgepose import rotations as rot
-from edgepose.advice import Finding, judge
 from edgepose.calibration import GRAVITY, load_calibration
-from edgepose.clock import DeviceClock
-from edgepose.health import Health, SensorHealth
+from edgepose.diagnostics.rules import Finding, judge
+from edgepose.diagnostics.sensor_health import Health, SensorHealth
+from edgepose.formats.recordings.csv_npz import SensorData, read_recording, samples
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
-from edgepose.recording import SensorData, read_recording, samples
+from edgepose.sources.clock_sync import DeviceClock
 
 REAL = Path(__file__).parents[1] / "data" / "imu" / "six-sites-3s.npz"
 HEAD = PLACEMENTS.index("head")

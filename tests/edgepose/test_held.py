@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from edgepose import rotations as rot
-from edgepose.held import carried
+from edgepose.pipeline.dropout import carried
 from edgepose.placements import PLACEMENTS, ROOT
 
 

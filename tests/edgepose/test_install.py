@@ -14,7 +14,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-from edgepose.precision import has_fp16_products, is_int8_fast
+from edgepose.inference.quantisation import has_fp16_products, is_int8_fast
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]

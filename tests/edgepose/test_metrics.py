@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from edgepose import metrics
+from edgepose.analysis import metrics
 from edgepose.skeleton import PARENTS, PREDICTED, UNOBSERVED
 
 OFFSETS = np.random.default_rng(1).normal(size=(24, 3)) * 0.2

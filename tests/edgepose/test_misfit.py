@@ -14,12 +14,12 @@ import pytest
 from edgepose import rotations as rot
 from edgepose.calibration import POSES, load_calibration
 from edgepose.calibration.fit import fit_pose, impossible_bones
+from edgepose.calibration.misfit import Misfits
+from edgepose.formats.recordings.csv_npz import Recording, read_recording, write_npz
 from edgepose.imu import ImuFrame
-from edgepose.misfit import Misfits
+from edgepose.pipeline.rig_comparison import other_devices
 from edgepose.placements import PLACEMENTS
-from edgepose.recording import Recording, read_recording, write_npz
 from edgepose.sources import Device
-from edgepose.sources.comparison import other_devices
 
 REAL = Path(__file__).parents[1] / "data" / "imu" / "six-sites-walk.npz"
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from edgepose.errors import EdgeposeError
+from edgepose.formats.recordings.csv_npz import from_samples, read_recording, samples
+from edgepose.formats.recordings.mt_manager import is_session, read_session
 from edgepose.imu import ImuSample
-from edgepose.mtmanager import is_session, read_session
 from edgepose.placements import PLACEMENTS
-from edgepose.recording import from_samples, read_recording, samples
 
 REAL = Path(__file__).parents[1] / "data" / "imu" / "six-sites-3s.npz"
 HEAD = (

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from edgepose.calibration import GRAVITY
 from edgepose.errors import EdgeposeError
-from edgepose.mvnx import LABELS, read_mvnx
+from edgepose.formats.recordings.csv_npz import Recording, read_recording
+from edgepose.formats.recordings.mvnx import LABELS, read_mvnx
 from edgepose.placements import PLACEMENTS
-from edgepose.recording import Recording, read_recording
 from edgepose.rotations import quat_rotate
 
 REAL = Path(__file__).parents[1] / "data" / "imu" / "six-sites-3s.npz"

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from edgepose.errors import EdgeposeError
-from edgepose.offline.prior import load_prior
-from edgepose.poses import read_poses
-from edgepose.recording import read_recording
-from edgepose_export.dataset import read_take
+from edgepose.formats.poses.reading import read_poses
+from edgepose.formats.recordings.csv_npz import read_recording
+from edgepose.sip.prior import load_prior
 from edgepose_export.mocap import read_motion
+from edgepose_export.training.dataset import read_take
 
 READERS = [read_recording, read_poses, read_motion, read_take, load_prior]
 # Headers of arrays are Python text: cut short, of odd characters, wrongly indented, of no known keys.

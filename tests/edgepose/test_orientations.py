@@ -1,6 +1,6 @@
 """What --filter does to the samples of a run, and what it tells."""
 
-from edgepose.cli.options import Orientations
+from edgepose.cli.options.source import Orientations
 from edgepose.imu import ImuSample
 
 LEVEL = (0.0, 0.0, 9.81)

@@ -19,17 +19,17 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from edgepose.bvh import read_bvh
 from edgepose.cli import cli
-from edgepose.durable_files import replace_file, write_whole
 from edgepose.errors import EdgeposeError
-from edgepose.growing_files import GrowingFile
-from edgepose.output_targets import descriptor, find_target, has_reader
+from edgepose.formats.bvh import read_bvh
+from edgepose.formats.poses.reading import read_poses
+from edgepose.formats.recordings.csv_npz import Recording, SensorData, read_recording, write_npz
 from edgepose.pose import PoseFrame
-from edgepose.poses import read_poses
-from edgepose.recording import Recording, SensorData, read_recording, write_npz
-from edgepose.sinks.csv_file import CsvSink
+from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.npz import NpzSink
+from edgepose.utils.durable_files import replace_file, write_whole
+from edgepose.utils.growing_files import GrowingFile
+from edgepose.utils.output_targets import descriptor, find_target, has_reader
 
 OLD = b"what was there before\n"
 

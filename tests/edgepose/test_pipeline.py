@@ -8,19 +8,19 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from edgepose import archive
 from edgepose.calibration import load_calibration
-from edgepose.engine import StreamEngine
+from edgepose.calibration.rezero import Headings
 from edgepose.errors import EdgeposeError
+from edgepose.formats.poses.reading import read_poses
 from edgepose.imu import ImuFrame
-from edgepose.pipeline import LATENCIES, RunSummary, Walk, run, status
+from edgepose.inference import archive
+from edgepose.inference.engine import StreamEngine
+from edgepose.pipeline.frame_synchronizer import FrameClock
+from edgepose.pipeline.run import LATENCIES, RunSummary, Walk, run, status
 from edgepose.placements import PLACEMENTS
-from edgepose.poses import read_poses
-from edgepose.rezero import Headings
 from edgepose.sinks import Sink
-from edgepose.sinks.csv_file import CsvSink
+from edgepose.sinks.csv import CsvSink
 from edgepose.sources import open_source
-from edgepose.sync import FrameClock
 
 
 class Shelf(Sink):

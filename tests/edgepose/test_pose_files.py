@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from edgepose.bvh import read_bvh
 from edgepose.errors import EdgeposeError
-from edgepose.joint_tree import forward
+from edgepose.formats.bvh import read_bvh
+from edgepose.formats.joint_tree import forward
+from edgepose.formats.poses.reading import BLOCK, Poses, is_poses, read_blocks, read_poses, salvage_poses
+from edgepose.formats.recordings.csv_npz import read_recording, write_csv
 from edgepose.pose import PoseFrame
-from edgepose.poses import BLOCK, Poses, is_poses, read_blocks, read_poses, salvage_poses
-from edgepose.recording import read_recording, write_csv
 from edgepose.sinks.bvh import BvhSink, depth_first
-from edgepose.sinks.csv_file import CsvSink
+from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.npz import NpzSink
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics
 from edgepose_export.mocap import read_motion
@@ -322,7 +322,7 @@ def test_an_interrupted_run_leaves_a_whole_file(tmp_path, name):
 @pytest.mark.parametrize("name", ["a.npz", "a.bvh"])
 def test_a_killed_run_leaves_what_was_on_the_disk(tmp_path, name):
     code = (
-        "import edgepose.sinks.bvh as b, edgepose.sinks.csv_file as c\n"
+        "import edgepose.sinks.bvh as b, edgepose.sinks.csv as c\n"
         "b.FLUSH_S = c.FLUSH_S = 0.05\n"
         "sink = kind(sys.argv[1])\n"
         "for i in range(100):\n"

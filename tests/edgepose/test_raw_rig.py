@@ -20,16 +20,16 @@ import pytest
 from click.testing import CliRunner, Result
 
 from edgepose import rotations as rot
+from edgepose.analysis.metrics import joint_angle_error
 from edgepose.calibration import EXERCISE_S, ROUTINE, load_calibration
-from edgepose.cli.calibrate import calibrate
+from edgepose.cli.commands.calibrate import calibrate
 from edgepose.errors import EdgeposeError
-from edgepose.metrics import joint_angle_error
+from edgepose.formats.poses.reading import read_poses
+from edgepose.formats.recordings.csv_npz import Recording, SensorData, read_recording, write_npz
 from edgepose.placements import PLACEMENTS
-from edgepose.poses import read_poses
-from edgepose.recording import Recording, SensorData, read_recording, write_npz
 from edgepose.skeleton import local_from_global
-from edgepose_export.exercises import with_exercises
 from edgepose_export.mocap import read_motion, resample
+from edgepose_export.synthesis.heading_routine import with_exercises
 
 SIMULATOR = Path(__file__).parents[2] / "tools" / "simulate.py"
 CLIP = SIMULATOR.parent / "data" / "09_12.bvh"
@@ -284,7 +284,7 @@ def own_terminal() -> None:
 def test_keys_come_at_once_and_the_terminal_is_as_before(ending):
     code = (
         "import os, time\n"
-        "from edgepose.cli.keys import Keys\n"
+        "from edgepose.cli.terminal.keys import Keys\n"
         "with Keys() as keys:\n"
         "    print('ready', keys.listening, flush=True)\n"
         "    found = ''\n"
@@ -317,7 +317,10 @@ def test_keys_come_at_once_and_the_terminal_is_as_before(ending):
 
 
 def test_keys_without_a_terminal():
-    code = "from edgepose.cli.keys import Keys\nwith Keys() as keys: print(keys.listening, [keys.pressed()])"
+    code = (
+        "from edgepose.cli.terminal.keys import Keys\n"
+        "with Keys() as keys: print(keys.listening, [keys.pressed()])"
+    )
     result = subprocess.run(
         [sys.executable, "-c", code], stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60
     )

@@ -19,13 +19,13 @@ import can
 import numpy as np
 import pytest
 
-from edgepose.capture import read_capture, times_path
 from edgepose.errors import EdgeposeError
+from edgepose.formats.recordings.csv_npz import from_samples, read_recording, salvage_recording, samples
+from edgepose.formats.recordings.raw_capture import read_capture, times_path
 from edgepose.imu import ImuSample
-from edgepose.recorder import CAN_LOGS, Output, open_output, record
-from edgepose.recording import from_samples, read_recording, salvage_recording, samples
+from edgepose.pipeline.frame_synchronizer import FrameClock
+from edgepose.record import CAN_LOGS, Output, open_output, record
 from edgepose.sources import open_source
-from edgepose.sync import FrameClock
 from firmware_protocols import native_can
 from firmware_protocols.native import Packet, encode
 

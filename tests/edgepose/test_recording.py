@@ -11,9 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edgepose.errors import EdgeposeError
-from edgepose.imu import ImuSample
-from edgepose.placements import PLACEMENTS
-from edgepose.recording import (
+from edgepose.formats.recordings.csv_npz import (
     COLUMNS,
     csv_header,
     csv_row,
@@ -25,6 +23,8 @@ from edgepose.recording import (
     write_csv,
     write_npz,
 )
+from edgepose.imu import ImuSample
+from edgepose.placements import PLACEMENTS
 
 REAL = Path(__file__).parents[1] / "data" / "imu" / "six-sites-3s.npz"
 

@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from edgepose.angles import ANGLES, LIMBS, joint_angles, walks
+from edgepose.analysis.joint_angles import ANGLES, LIMBS, joint_angles, walks
+from edgepose.analysis.report import POINTS, extremes, write_report
 from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
+from edgepose.formats.poses.reading import read_poses
 from edgepose.pose import PoseFrame, longest_holds
-from edgepose.poses import read_poses
-from edgepose.report import POINTS, extremes, write_report
 from edgepose.sinks.bvh import BvhSink
-from edgepose.sinks.csv_file import CsvSink
+from edgepose.sinks.csv import CsvSink
 from edgepose.skeleton import JOINTS, default_body, local_from_global
 from edgepose_export.mocap import read_motion
 

@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 
 from edgepose import calibration as cal
 from edgepose import rotations as rot
-from edgepose.control import Control, parse
+from edgepose.calibration.rezero import BLEND_S, HOLD_S, START_HOLD_S, Headings
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuFrame
+from edgepose.pipeline.dropout_monitor import QUIET_S, SILENT_S, Silences
+from edgepose.pipeline.remote_control import Control, parse
 from edgepose.placements import PLACEMENTS
-from edgepose.rezero import BLEND_S, HOLD_S, START_HOLD_S, Headings
-from edgepose.silence import QUIET_S, SILENT_S, Silences
 
 RNG = np.random.default_rng(11)
 R_BS = rot.rotvec_to_matrix(RNG.normal(0.0, 1.0, (6, 3)))

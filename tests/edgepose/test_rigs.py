@@ -19,18 +19,18 @@ import numpy as np
 import pytest
 
 from edgepose.calibration import load_calibration
-from edgepose.cli.rigs import read_rigs
-from edgepose.engine import StreamEngine
+from edgepose.calibration.rezero import Headings
+from edgepose.cli.options.wearer import read_rigs
 from edgepose.errors import EdgeposeError
-from edgepose.pipeline import Walk, run
+from edgepose.formats.poses.reading import read_poses
+from edgepose.formats.recordings.csv_npz import SensorData, read_recording, write_csv, write_npz
+from edgepose.inference.engine import StreamEngine
+from edgepose.pipeline.frame_synchronizer import FrameClock
+from edgepose.pipeline.run import Walk, run
 from edgepose.placements import PLACEMENTS
-from edgepose.poses import read_poses
-from edgepose.recording import SensorData, read_recording, write_csv, write_npz
-from edgepose.rezero import Headings
-from edgepose.sinks.csv_file import CsvSink
+from edgepose.sinks.csv import CsvSink
 from edgepose.sources import open_source
-from edgepose.sync import FrameClock
-from edgepose_export.networks import NetworkShape
+from edgepose_export.networks.shape import NetworkShape
 
 PAGE = (Path(__file__).parents[2] / "docs" / "sensors.md").read_text(encoding="utf-8")
 SIMULATOR = Path(__file__).parents[2] / "tools" / "simulate.py"
@@ -427,8 +427,8 @@ def test_a_key_is_for_all_wearers():
     """Both hear of it, each once, whoever asks first."""
     code = """
 import time
-from edgepose.cli.keys import Keys
-from edgepose.cli.wishes import heard_by
+from edgepose.cli.terminal.keys import Keys
+from edgepose.cli.rezero_requests import heard_by
 with Keys() as keys:
     print('ready', keys.listening, flush=True)
     anna, ben = heard_by(2, keys)

@@ -23,15 +23,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edgepose import archive
 from edgepose import rotations as rot
 from edgepose.calibration import apply, load_calibration
+from edgepose.formats.poses.reading import read_poses
+from edgepose.formats.recordings.csv_npz import read_recording, samples, write_csv
+from edgepose.inference import archive
+from edgepose.pipeline.frame_synchronizer import FrameClock
 from edgepose.placements import PLACEMENTS
-from edgepose.poses import read_poses
-from edgepose.recording import read_recording, samples, write_csv
 from edgepose.sinks.udp import decode_binary
 from edgepose.skeleton import JOINTS, PARENTS
-from edgepose.sync import FrameClock
 from firmware_protocols import native_can
 from firmware_protocols.native import Packet, encode
 

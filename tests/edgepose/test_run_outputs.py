@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from pythonosc.osc_bundle import OscBundle
 
-from edgepose.bvh import read_bvh
-from edgepose.joint_tree import forward
-from edgepose.poses import read_poses
+from edgepose.formats.bvh import read_bvh
+from edgepose.formats.joint_tree import forward
+from edgepose.formats.poses.reading import read_poses
 from edgepose.skeleton import default_body, forward_kinematics
 from edgepose_export.mocap import read_motion
 

@@ -11,7 +11,7 @@ from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import open_source
-from edgepose.sources.links import links
+from edgepose.sources.line_config import links
 from edgepose.sources.sensor_map import default_places, read_map
 from firmware_protocols.native import Packet, encode
 from firmware_protocols.registry import PROTOCOLS

@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from edgepose.addresses import resolve
 from edgepose.errors import EdgeposeError
+from edgepose.formats.poses.reading import read_poses
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseFrame
-from edgepose.poses import read_poses
 from edgepose.rotations import matrix_to_euler_zxy
-from edgepose.sinks import csv_file
-from edgepose.sinks.csv_file import CsvSink, pose_columns
+from edgepose.sinks import csv as csv_file
+from edgepose.sinks.csv import CsvSink, pose_columns
 from edgepose.sinks.udp import UdpSink, decode_binary, encode_binary, encode_json, parse_destination
 from edgepose.skeleton import JOINTS
+from edgepose.utils.sockets import resolve
 
 DOCS = Path(__file__).parents[2] / "docs" / "outputs.md"
 STATUSES = ("ok", "held head", "held left_forearm pelvis; filling window", "filling window")
@@ -39,7 +39,7 @@ def run_python(code: str, *args: str, **options) -> subprocess.Popen:
         "import sys, time, numpy as np\n"
         "from edgepose.pose import PoseFrame\n"
         "from edgepose.errors import EdgeposeError\n"
-        "from edgepose.sinks.csv_file import CsvSink\n"
+        "from edgepose.sinks.csv import CsvSink\n"
         "def pose(i): return PoseFrame(i, i / 60, 'ok', np.tile(np.eye(3), (24, 1, 1)), np.zeros(24))\n"
     )
     return subprocess.Popen([sys.executable, "-c", prelude + code, *args], text=True, **options)
@@ -142,7 +142,7 @@ def test_csv_ends_at_a_whole_row_when_the_disk_fills(tmp_path):
 def test_csv_killed_run_keeps_its_rows(tmp_path):
     path = tmp_path / "a.csv"
     code = (
-        "import edgepose.sinks.csv_file as c\n"
+        "import edgepose.sinks.csv as c\n"
         "c.FLUSH_S = 0.05\n"
         "sink = CsvSink(sys.argv[1])\n"
         "for i in range(100):\n"

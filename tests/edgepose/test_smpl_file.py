@@ -8,8 +8,8 @@ import pytest
 import scipy.sparse
 
 from edgepose.errors import EdgeposeError
+from edgepose.formats.smpl_model import read_smpl
 from edgepose.skeleton import PARENTS, default_body, forward_kinematics
-from edgepose.smpl_file import read_smpl
 
 
 def made_up(height=1.8):

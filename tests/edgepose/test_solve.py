@@ -11,9 +11,9 @@ import time
 import numpy as np
 import pytest
 
-from edgepose import metrics
-from edgepose.poses import read_poses
-from edgepose.recording import Recording, SensorData, read_recording, write_csv, write_npz
+from edgepose.analysis import metrics
+from edgepose.formats.poses.reading import read_poses
+from edgepose.formats.recordings.csv_npz import Recording, SensorData, read_recording, write_csv, write_npz
 from edgepose.rotations import rotvec_to_matrix
 from edgepose.skeleton import default_body, forward_kinematics
 

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 import serial
 
-from edgepose.capture import times_header, times_path, times_row
 from edgepose.errors import EdgeposeError
+from edgepose.formats.recordings.csv_npz import csv_header, csv_row, read_recording, samples, write_csv
+from edgepose.formats.recordings.raw_capture import times_header, times_path, times_row
+from edgepose.pipeline.frame_synchronizer import FrameClock
 from edgepose.placements import PLACEMENTS
-from edgepose.recording import csv_header, csv_row, read_recording, samples, write_csv
 from edgepose.sources import open_source
-from edgepose.sources.detection import protocol_named
-from edgepose.sync import FrameClock
+from edgepose.sources.protocol_detection import protocol_named
 from firmware_protocols.native import Info, Packet, encode, encode_info
 from firmware_protocols.registry import PROTOCOLS
 from firmware_protocols.sample import Sample

@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 
 from edgepose import rotations
 from edgepose.errors import EdgeposeError
+from edgepose.formats.recordings.csv_npz import read_recording, samples
 from edgepose.imu import ImuSample
+from edgepose.pipeline.frame_synchronizer import STALE_S, FrameClock
 from edgepose.placements import PLACEMENTS
-from edgepose.recording import read_recording, samples
-from edgepose.sync import STALE_S, FrameClock
 
 REAL = Path(__file__).parents[1] / "data" / "imu" / "six-sites-3s.npz"
 TURN = np.array([0.3, -1.0, 2.0])  # rad/s

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from edgepose.errors import EdgeposeError
+from edgepose.formats.recordings.csv_npz import read_recording as read_npz
+from edgepose.formats.recordings.totalcapture import NAMES, read_recording
 from edgepose.placements import PLACEMENTS
-from edgepose.recording import read_recording as read_npz
-from edgepose.totalcapture import NAMES, read_recording
 
 REAL = Path(__file__).parents[1] / "data" / "imu" / "six-sites-3s.npz"
 SENSORS = ("Head", "Sternum", "Pelvis", "L_UpArm", "R_UpArm", "L_LowArm", "R_LowArm", "L_LowLeg", "R_LowLeg")

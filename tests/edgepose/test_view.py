@@ -28,14 +28,14 @@ from websockets.sync.client import connect
 
 from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
-from edgepose.mannequin import TIPS, build, ground
+from edgepose.formats.poses.reading import read_poses
 from edgepose.pose import PoseFrame, held_sensors
-from edgepose.poses import read_poses
 from edgepose.sinks.bvh import BvhSink
-from edgepose.sinks.csv_file import CsvSink
+from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.udp import UdpSink, decode, encode_binary, encode_json
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics
-from edgepose.viewer import Stream, Viewer, plain, sensor_table
+from edgepose.viewer.body_mesh import TIPS, build, ground
+from edgepose.viewer.viewer import Stream, Viewer, plain, sensor_table
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "chrome"))), None)
 needs_browser = pytest.mark.skipif(
@@ -443,7 +443,7 @@ def test_wrong_use(command, tmp_path, words, code, says):
 SHORT_OF_MEMORY = """
 import re, resource, sys
 from pathlib import Path
-import edgepose.cli.view, edgepose.poses
+import edgepose.cli.commands.view, edgepose.formats.poses.reading
 held = int(re.search(r"VmSize:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) << 10
 resource.setrlimit(resource.RLIMIT_AS, (held + (60 << 20),) * 2)
 edgepose.cli.main()

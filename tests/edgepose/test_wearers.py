@@ -8,16 +8,16 @@ from collections.abc import Callable
 import pytest
 
 from edgepose.calibration import load_calibration
-from edgepose.engine import BatchEngine
-from edgepose.pipeline import Walk
+from edgepose.calibration.rezero import Headings
+from edgepose.inference.engine import BatchEngine
+from edgepose.pipeline.frame_synchronizer import FrameClock
+from edgepose.pipeline.multi_wearer import Wearer, run_together
+from edgepose.pipeline.run import Walk
 from edgepose.pose import PoseFrame
-from edgepose.rezero import Headings
 from edgepose.sinks import Sink
 from edgepose.sources import Source, open_source
 from edgepose.sources.live import Link, LiveSource
-from edgepose.sync import FrameClock
-from edgepose.wearers import Wearer, run_together
-from edgepose_export.networks import NetworkShape
+from edgepose_export.networks.shape import NetworkShape
 from firmware_protocols.registry import PROTOCOLS
 
 

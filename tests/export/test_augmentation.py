@@ -5,11 +5,12 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from edgepose.features import network_input
-from edgepose.held import carried
+from edgepose.inference.features import network_input
+from edgepose.pipeline.dropout import carried
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import JOINTS, default_body
-from edgepose_export.augmentation import (
+from edgepose_export.mocap import read_motion, resample
+from edgepose_export.synthesis.augmentation import (
     JOINT_MIRROR,
     SENSOR_MIRROR,
     Augmentation,
@@ -18,9 +19,8 @@ from edgepose_export.augmentation import (
     rotations_of,
     silenced,
 )
-from edgepose_export.dataset import read_take, root_relative_pose
-from edgepose_export.mocap import read_motion, resample
-from edgepose_export.synthesis import recording_arrays, virtual_imus
+from edgepose_export.synthesis.virtual_imus import recording_arrays, virtual_imus
+from edgepose_export.training.dataset import read_take, root_relative_pose
 
 WALK = Path(__file__).parents[1] / "data" / "mocap" / "dataset-2_walk_normal_001.bvh"
 FLIP = np.diag([-1.0, 1.0, 1.0])

@@ -7,11 +7,11 @@ import pytest
 
 from edgepose import rotations as rot
 from edgepose.calibration import EXERCISE_S, GRAVITY, ROUTINE
+from edgepose.formats.recordings.csv_npz import SensorData
 from edgepose.placements import BONES, PLACEMENTS
-from edgepose.recording import SensorData
-from edgepose_export.chip import BMI270, FIELD_UT, raw
-from edgepose_export.exercises import exercises
-from edgepose_export.synthesis import straight_pose
+from edgepose_export.synthesis.heading_routine import exercises
+from edgepose_export.synthesis.imu_errors import BMI270, FIELD_UT, raw
+from edgepose_export.synthesis.virtual_imus import straight_pose
 
 RATE, N = 100.0, 20_000
 REST = SensorData(

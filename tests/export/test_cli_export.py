@@ -10,16 +10,16 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from edgepose import archive
 from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
+from edgepose.formats.recordings.csv_npz import read_recording
+from edgepose.inference import archive
 from edgepose.placements import PLACEMENTS
-from edgepose.recording import read_recording
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics
-from edgepose_export.archive import Statistics, new_network, script
-from edgepose_export.config import config_from
-from edgepose_export.dataset import read_take
-from edgepose_export.training import mean_of, read_checkpoint
+from edgepose_export.archive.torchscript import Statistics, new_network, script
+from edgepose_export.training.config import config_from
+from edgepose_export.training.dataset import read_take
+from edgepose_export.training.trainer import mean_of, read_checkpoint
 
 DATA = Path(__file__).parents[1] / "data" / "mocap"
 WALK = DATA / "dataset-2_walk_normal_001.bvh"

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from edgepose.errors import EdgeposeError
-from edgepose_export import config as configs
-from edgepose_export.config import config_from, config_values, read_config
-from edgepose_export.networks import NetworkShape
+from edgepose_export.networks.shape import NetworkShape
+from edgepose_export.training import config as configs
+from edgepose_export.training.config import config_from, config_values, read_config
 
 CONFIGS = Path(configs.__file__).parent / "configs"
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from edgepose import archive
+from edgepose.inference import archive
 
 SOURCE = Path(__file__).with_name("archive.cpp")
 

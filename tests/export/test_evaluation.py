@@ -5,18 +5,19 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from edgepose import metrics
-from edgepose.engine import StreamEngine, WindowEngine
+from edgepose.analysis import metrics
 from edgepose.errors import EdgeposeError
+from edgepose.inference.engine import StreamEngine, WindowEngine
 from edgepose.placements import BONES
 from edgepose.skeleton import PREDICTED, UNOBSERVED, default_body, forward_kinematics
-from edgepose_export import baselines, evaluation
-from edgepose_export.dataset import Take, describe, read_take, take_paths, training_paths
-from edgepose_export.evaluation import Mode, run_archive
+from edgepose_export.evaluation import baselines
+from edgepose_export.evaluation import evaluate as evaluation
+from edgepose_export.evaluation.evaluate import Mode, run_archive
 from edgepose_export.mocap import read_motion, resample
-from edgepose_export.networks import NetworkShape
-from edgepose_export.splits import HELD_OUT, part_of
-from edgepose_export.synthesis import recording_arrays, virtual_imus
+from edgepose_export.networks.shape import NetworkShape
+from edgepose_export.synthesis.virtual_imus import recording_arrays, virtual_imus
+from edgepose_export.training.dataset import Take, describe, read_take, take_paths, training_paths
+from edgepose_export.training.splits import HELD_OUT, part_of
 
 WALK = Path(__file__).parents[1] / "data" / "mocap" / "dataset-2_walk_normal_001.bvh"
 BIRNN = NetworkShape("birnn", 8, "global-6d", "passed")

@@ -3,8 +3,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from edgepose import features
 from edgepose import rotations as rot
+from edgepose.inference import features
 from edgepose.placements import PLACEMENTS
 from edgepose.skeleton import PARENTS, forward_kinematics
 

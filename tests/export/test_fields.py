@@ -5,16 +5,16 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from edgepose import archive as archives
-from edgepose.engine import StreamEngine
-from edgepose_export import evaluation
-from edgepose_export.archive import build, describe, new_network, save, script
-from edgepose_export.card import card
-from edgepose_export.dataset import Take
-from edgepose_export.evaluation import Mode
-from edgepose_export.fields import DILATIONS, KERNEL, padded
-from edgepose_export.networks import NetworkShape
-from edgepose_export.normalisation import network_inputs
+from edgepose.inference import archive as archives
+from edgepose.inference.engine import StreamEngine
+from edgepose_export.archive.model_card import card
+from edgepose_export.archive.torchscript import build, describe, new_network, save, script
+from edgepose_export.evaluation import evaluate as evaluation
+from edgepose_export.evaluation.evaluate import Mode
+from edgepose_export.networks.normalisation import network_inputs
+from edgepose_export.networks.receptive_field import DILATIONS, KERNEL, padded
+from edgepose_export.networks.shape import NetworkShape
+from edgepose_export.training.dataset import Take
 
 SHAPES = [NetworkShape(kind, 8, "local-matrix") for kind in ("feed-forward", "wavenet")]
 CHECKPOINT = {

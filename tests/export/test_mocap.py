@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edgepose.bvh import read_bvh
 from edgepose.errors import EdgeposeError
-from edgepose.joint_tree import forward
+from edgepose.formats.bvh import read_bvh
+from edgepose.formats.joint_tree import forward
 from edgepose.rotations import about_axis, angle_between, matrix_to_rotvec, rotvec_to_matrix
 from edgepose.skeleton import local_from_global
 from edgepose_export.mocap import Motion, pieces, read_motion, resample
 from edgepose_export.mocap.amc import find_asf, read_amc, read_asf
-from edgepose_export.mocap.transfer import BANDAI, CMU_AMC, CMU_BVH, LIMBS
+from edgepose_export.mocap.retargeting import BANDAI, CMU_AMC, CMU_BVH, LIMBS
 
 DATA = Path(__file__).parents[1] / "data" / "mocap"
 CMU = DATA / "07_01.bvh"

@@ -9,12 +9,12 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import nn
 
-from edgepose.features import network_input, rotation_to_6d
+from edgepose.inference.features import network_input, rotation_to_6d
 from edgepose.placements import BONES
 from edgepose.skeleton import PREDICTED, UNOBSERVED, forward_kinematics
-from edgepose_export.archive import build
-from edgepose_export.augmentation import rotations_of
-from edgepose_export.networks import NetworkShape, PoseDecoder, smoothed
+from edgepose_export.archive.torchscript import build
+from edgepose_export.networks.shape import NetworkShape, PoseDecoder, smoothed
+from edgepose_export.synthesis.augmentation import rotations_of
 
 BIRNN = NetworkShape("birnn", 8, "global-6d", "passed")
 RNN = BIRNN._replace(kind="rnn")

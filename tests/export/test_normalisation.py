@@ -1,9 +1,9 @@
 import torch
 from scipy.spatial.transform import Rotation
 
-from edgepose_export.archive import Statistics, build
-from edgepose_export.networks import NetworkShape, PoseNetwork
-from edgepose_export.normalisation import network_inputs
+from edgepose_export.archive.torchscript import Statistics, build
+from edgepose_export.networks.normalisation import network_inputs
+from edgepose_export.networks.shape import NetworkShape, PoseNetwork
 
 TILT = NetworkShape("rnn", 8, "global-6d", "passed", "tilt")
 

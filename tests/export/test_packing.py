@@ -10,11 +10,11 @@ import torch
 from edgepose.errors import EdgeposeError
 from edgepose.skeleton import default_body
 from edgepose_export.cli.synthesize import LICENSES
-from edgepose_export.dataset import read_take, tape
 from edgepose_export.mocap import read_motion, resample
-from edgepose_export.packing import FRAME, packed_tape
-from edgepose_export.synthesis import recording_arrays, virtual_imus
-from edgepose_export.training import windows
+from edgepose_export.synthesis.virtual_imus import recording_arrays, virtual_imus
+from edgepose_export.training.dataset import read_take, tape
+from edgepose_export.training.memory_map import FRAME, packed_tape
+from edgepose_export.training.trainer import windows
 
 DATA = Path(__file__).parents[1] / "data" / "mocap"
 

@@ -2,15 +2,15 @@ import matplotlib.image
 import numpy as np
 import pytest
 
+from edgepose.analysis.figures import check_picture
+from edgepose.analysis.metrics import Measure, sip_error
 from edgepose.errors import EdgeposeError
-from edgepose.figures import check_picture
-from edgepose.metrics import Measure, sip_error
-from edgepose_export import plots
-from edgepose_export.dataset import Take
-from edgepose_export.evaluation import Mode, run_archive, run_windows, window_errors
-from edgepose_export.networks import NetworkShape
-from edgepose_export.paper_tables import TABLES, format_paper_table
-from edgepose_export.reliability import reliability
+from edgepose_export.evaluation import plots
+from edgepose_export.evaluation.evaluate import Mode, run_archive, run_windows, window_errors
+from edgepose_export.evaluation.paper_tables import TABLES, format_paper_table
+from edgepose_export.evaluation.uncertainty import reliability
+from edgepose_export.networks.shape import NetworkShape
+from edgepose_export.training.dataset import Take
 
 BIRNN = {"kind": "birnn", "past": 20, "future": 5}
 WAVENET = {"kind": "wavenet", "past": 62, "future": 0}

@@ -7,10 +7,10 @@ from scipy.spatial.transform import Rotation
 
 from edgepose.placements import BONES, ROOT
 from edgepose.skeleton import JOINTS, PARENTS, default_body
-from edgepose_export.dataset import read_take, root_relative_pose
 from edgepose_export.mocap import read_motion, resample
-from edgepose_export.postures import AFTER, BEFORE, DEVIATION, SWAY_HZ, other_postures
-from edgepose_export.synthesis import recording_arrays, virtual_imus
+from edgepose_export.synthesis.posture_variation import AFTER, BEFORE, DEVIATION, SWAY_HZ, other_postures
+from edgepose_export.synthesis.virtual_imus import recording_arrays, virtual_imus
+from edgepose_export.training.dataset import read_take, root_relative_pose
 
 WALK = Path(__file__).parents[1] / "data" / "mocap" / "dataset-2_walk_normal_001.bvh"
 

@@ -10,19 +10,19 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from edgepose import archive
+from edgepose.analysis.metrics import joint_angle_error
 from edgepose.cli import cli
-from edgepose.engine import StreamEngine
 from edgepose.errors import EdgeposeError
-from edgepose.metrics import joint_angle_error
-from edgepose.poses import read_poses
-from edgepose.precision import pack, pack_weights
+from edgepose.formats.poses.reading import read_poses
+from edgepose.inference import archive
+from edgepose.inference.engine import StreamEngine
+from edgepose.inference.quantisation import pack, pack_weights
 from edgepose.skeleton import UNOBSERVED
-from edgepose_export.archive import save, script
-from edgepose_export.dataset import take_paths
-from edgepose_export.evaluation import Mode, run_archive, takes_of
-from edgepose_export.networks import NetworkShape
-from edgepose_export.precisions import compare, round_weights
+from edgepose_export.archive.torchscript import save, script
+from edgepose_export.evaluation.evaluate import Mode, run_archive, takes_of
+from edgepose_export.evaluation.quantisation import compare, round_weights
+from edgepose_export.networks.shape import NetworkShape
+from edgepose_export.training.dataset import take_paths
 
 BIRNN = NetworkShape("birnn", 32, "global-6d", "passed", "tilt")
 RNN = BIRNN._replace(kind="rnn")
@@ -197,8 +197,8 @@ def test_rounded_weights_are_exact_in_fp16_and_compress(parts):
 @pytest.fixture
 def raspberry(monkeypatch):
     """As on a processor whose first fp16 product would end the process."""
-    monkeypatch.setattr("edgepose.precision.platform.machine", lambda: "aarch64")
-    monkeypatch.setattr("edgepose.precision._hwcap", lambda: 0)
+    monkeypatch.setattr("edgepose.inference.quantisation.platform.machine", lambda: "aarch64")
+    monkeypatch.setattr("edgepose.inference.quantisation._hwcap", lambda: 0)
 
 
 def test_without_products_of_fp16_auto_is_f32(tmp_path, write_archive, raspberry):

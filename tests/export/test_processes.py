@@ -16,13 +16,13 @@ from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
 from edgepose.skeleton import default_body
 from edgepose_export.cli.synthesize import LICENSES
-from edgepose_export.config import TrainConfig
-from edgepose_export.dataset import read_take, tape
 from edgepose_export.mocap import read_motion, resample
-from edgepose_export.networks import NetworkShape
-from edgepose_export.processes import ALONE, Processes
-from edgepose_export.synthesis import recording_arrays, virtual_imus
-from edgepose_export.training import Trainer, read_checkpoint, statistics_of
+from edgepose_export.networks.shape import NetworkShape
+from edgepose_export.synthesis.virtual_imus import recording_arrays, virtual_imus
+from edgepose_export.training.config import TrainConfig
+from edgepose_export.training.dataset import read_take, tape
+from edgepose_export.training.distributed import ALONE, Processes
+from edgepose_export.training.trainer import Trainer, read_checkpoint, statistics_of
 
 DATA = Path(__file__).parents[1] / "data" / "mocap"
 CONFIG = """
@@ -38,9 +38,9 @@ hidden = 8
 PROGRAM = """
 import sys, torch
 from pathlib import Path
-from edgepose_export.archive import new_network
-from edgepose_export.networks import NetworkShape
-from edgepose_export.processes import joined
+from edgepose_export.archive.torchscript import new_network
+from edgepose_export.networks.shape import NetworkShape
+from edgepose_export.training.distributed import joined
 
 torch.set_num_threads(1)
 

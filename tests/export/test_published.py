@@ -13,8 +13,8 @@ from edgepose.errors import EdgeposeError
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import forward_kinematics
 from edgepose_export.cli.evaluate import evaluate
-from edgepose_export.evaluation import takes_of
-from edgepose_export.published import read_dip, read_published, read_totalcapture, read_vicon
+from edgepose_export.datasets import read_dip, read_published, read_totalcapture, read_vicon
+from edgepose_export.evaluation.evaluate import takes_of
 
 FRAMES = 12
 DIP_PLACES = (7, 8, 11, 12, 0, 2)

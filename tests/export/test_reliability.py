@@ -4,11 +4,11 @@ import torch
 from scipy.stats import chi2
 
 from edgepose.skeleton import JOINTS
-from edgepose_export import reliability as rel
-from edgepose_export.archive import describe, script
-from edgepose_export.dataset import Take
-from edgepose_export.evaluation import Mode, run_with_std
-from edgepose_export.networks import NetworkShape
+from edgepose_export.archive.torchscript import describe, script
+from edgepose_export.evaluation import uncertainty as rel
+from edgepose_export.evaluation.evaluate import Mode, run_with_std
+from edgepose_export.networks.shape import NetworkShape
+from edgepose_export.training.dataset import Take
 
 CHECKPOINT = {"step": 7, "data": {}, "config": '{"steps": 7}'}
 

@@ -8,8 +8,8 @@ import pytest
 from edgepose import rotations as rot
 from edgepose.skeleton import default_body, forward_kinematics, local_from_global
 from edgepose_export.mocap import Motion, read_motion, resample
-from edgepose_export.seating import seated
-from edgepose_export.synthesis import virtual_imus
+from edgepose_export.synthesis.sitting import seated
+from edgepose_export.synthesis.virtual_imus import virtual_imus
 
 CLIP = Path(__file__).parents[2] / "tools" / "data" / "09_12.bvh"
 BODY = default_body(1.8)

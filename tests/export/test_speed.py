@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from edgepose_export.networks import NetworkShape
+from edgepose_export.networks.shape import NetworkShape
 
 RNN = NetworkShape("rnn", 8, "global-6d", "passed", "tilt")
 

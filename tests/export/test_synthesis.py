@@ -8,13 +8,12 @@ from scipy.spatial.transform import Rotation
 from edgepose import calibration
 from edgepose import rotations as rot
 from edgepose.errors import EdgeposeError
+from edgepose.formats.recordings.csv_npz import read_recording
 from edgepose.placements import BONES, PLACEMENTS
-from edgepose.recording import read_recording
 from edgepose.skeleton import PARENTS, Body, default_body, local_from_global
 from edgepose_export.cli.synthesize import synthesize
-from edgepose_export.dataset import read_take
 from edgepose_export.mocap import Motion, read_motion, resample
-from edgepose_export.synthesis import (
+from edgepose_export.synthesis.virtual_imus import (
     BLEND_S,
     INERTIAL_FROM_BODY,
     recording_arrays,
@@ -22,6 +21,7 @@ from edgepose_export.synthesis import (
     virtual_imus,
     with_hold,
 )
+from edgepose_export.training.dataset import read_take
 
 DATA = Path(__file__).parents[1] / "data" / "mocap"
 WALK = DATA / "dataset-2_walk_normal_001.bvh"

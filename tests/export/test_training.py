@@ -10,19 +10,19 @@ import pytest
 import torch
 
 from edgepose.errors import EdgeposeError
-from edgepose.features import network_input
+from edgepose.inference.features import network_input
 from edgepose.placements import BONES, ROOT
 from edgepose.skeleton import PARENTS, PREDICTED, default_body
-from edgepose_export import training
-from edgepose_export.archive import Statistics
-from edgepose_export.augmentation import Augmentation, augment
+from edgepose_export.archive.torchscript import Statistics
 from edgepose_export.cli.synthesize import LICENSES
-from edgepose_export.config import TrainConfig, config_from
-from edgepose_export.dataset import read_take, tape, training_paths
 from edgepose_export.mocap import read_motion, resample
-from edgepose_export.networks import NetworkShape, PoseDecoder, smoothed
-from edgepose_export.synthesis import recording_arrays, virtual_imus
-from edgepose_export.training import Trainer, read_checkpoint, save_checkpoint
+from edgepose_export.networks.shape import NetworkShape, PoseDecoder, smoothed
+from edgepose_export.synthesis.augmentation import Augmentation, augment
+from edgepose_export.synthesis.virtual_imus import recording_arrays, virtual_imus
+from edgepose_export.training import trainer as training
+from edgepose_export.training.config import TrainConfig, config_from
+from edgepose_export.training.dataset import read_take, tape, training_paths
+from edgepose_export.training.trainer import Trainer, read_checkpoint, save_checkpoint
 
 DATA = Path(__file__).parents[1] / "data" / "mocap"
 SMALL = TrainConfig(

@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edgepose import archive
-from edgepose.metrics import joint_angle_error
+from edgepose.analysis.metrics import joint_angle_error
+from edgepose.inference import archive
 from edgepose.rotations import about_axis
 from edgepose.skeleton import default_body
-from edgepose_export.dataset import RATE, read_take
-from edgepose_export.evaluation import modes_of, run_archive
+from edgepose_export.evaluation.evaluate import modes_of, run_archive
 from edgepose_export.mocap import read_motion, resample
-from edgepose_export.synthesis import recording_arrays, virtual_imus
+from edgepose_export.synthesis.virtual_imus import recording_arrays, virtual_imus
+from edgepose_export.training.dataset import RATE, read_take
 
 WALK = Path(__file__).parents[1] / "data" / "mocap" / "dataset-2_walk_normal_001.bvh"
 

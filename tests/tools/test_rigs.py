@@ -20,9 +20,9 @@ import pytest
 import serial
 
 from edgepose import rotations as rot
-from edgepose.metrics import summary
-from edgepose.poses import read_poses
-from edgepose.recording import Recording, SensorData, read_recording, write_npz
+from edgepose.analysis.metrics import summary
+from edgepose.formats.poses.reading import read_poses
+from edgepose.formats.recordings.csv_npz import Recording, SensorData, read_recording, write_npz
 from edgepose.skeleton import JOINTS, default_body
 from edgepose.sources.can_bus import Buffered
 

@@ -19,9 +19,9 @@ import can
 import numpy as np
 import pytest
 
+from edgepose.formats.recordings.csv_npz import from_samples, read_recording, write_csv, write_npz
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
-from edgepose.recording import from_samples, read_recording, write_csv, write_npz
 from firmware_protocols.native import cobs_decode, decode_body
 from firmware_protocols.registry import PROTOCOLS
 from firmware_protocols.rotation import rotate

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from edgepose.cli.outputs import overwrite_option
-from edgepose.cli.terminal import say, show
+from edgepose.cli.options.outputs import overwrite_option
+from edgepose.cli.terminal.messages import say, show
 
 if TYPE_CHECKING:
     import torch
 
-    from edgepose_export.evaluation import Columns, Mode
+    from edgepose_export.evaluation.evaluate import Columns, Mode
 
 MODES = click.Choice(["window", "stream", "offline"])
 PICTURE = click.Path(path_type=Path, dir_okay=False)
@@ -135,8 +135,8 @@ def evaluate(
         )
     if heat_map and len(names) > 1:
         raise click.UsageError("--heat-map is of one model")
-    from edgepose.figures import check_picture
-    from edgepose_export.splits import HELD_OUT
+    from edgepose.analysis.figures import check_picture
+    from edgepose_export.training.splits import HELD_OUT
 
     for picture in (histogram, heat_map, reliability):
         if picture:
@@ -156,9 +156,9 @@ def evaluate(
 def _model(
     name: str, trust: bool, modes: tuple[str, ...], past: int | None, future: int | None, table: str | None
 ) -> _Model:
-    from edgepose import archive
-    from edgepose_export.evaluation import modes_of
-    from edgepose_export.paper_tables import TABLES
+    from edgepose.inference import archive
+    from edgepose_export.evaluation.evaluate import modes_of
+    from edgepose_export.evaluation.paper_tables import TABLES
 
     path = archive.find(name)
     info = archive.inspect(path)
@@ -191,11 +191,12 @@ def _tables(
     table: str | None,
     histogram: Path | None,
 ) -> None:
-    from edgepose.metrics import format_table
-    from edgepose_export import evaluation, plots
-    from edgepose_export.baselines import learn
+    from edgepose.analysis.metrics import format_table
     from edgepose_export.cli.progress import labelled
-    from edgepose_export.paper_tables import TABLES, format_paper_table
+    from edgepose_export.evaluation import evaluate as evaluation
+    from edgepose_export.evaluation import plots
+    from edgepose_export.evaluation.baselines import learn
+    from edgepose_export.evaluation.paper_tables import TABLES, format_paper_table
 
     methods: dict[str, evaluation.Method] = {}
     for model in models:
@@ -225,9 +226,9 @@ def _heat_map(model: _Model, data: Path, parts: tuple[str, ...], every: int, pat
         raise click.UsageError(
             f"{model.name} {NO_WINDOW[model.metadata['kind']]}: it has no window to draw a heat map of"
         )
-    from edgepose_export import plots
     from edgepose_export.cli.progress import labelled
-    from edgepose_export.evaluation import takes_of, window_errors
+    from edgepose_export.evaluation import plots
+    from edgepose_export.evaluation.evaluate import takes_of, window_errors
 
     maps = {}
     for part in parts:
@@ -243,10 +244,10 @@ def _heat_map(model: _Model, data: Path, parts: tuple[str, ...], every: int, pat
 
 
 def _reliability(models: list[_Model], data: Path, parts: tuple[str, ...], path: Path) -> None:
-    from edgepose_export import plots
-    from edgepose_export import reliability as rel
     from edgepose_export.cli.progress import labelled
-    from edgepose_export.evaluation import takes_of
+    from edgepose_export.evaluation import plots
+    from edgepose_export.evaluation import uncertainty as rel
+    from edgepose_export.evaluation.evaluate import takes_of
 
     results: dict[str, dict[str, rel.Reliability]] = {}
     for part in parts:

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from edgepose.cli.outputs import overwrite_option
-from edgepose.cli.terminal import say
-from edgepose.durable_files import write_whole
-from edgepose.output_targets import check_output
-from edgepose.precision import PRECISIONS
+from edgepose.cli.options.outputs import overwrite_option
+from edgepose.cli.terminal.messages import say
+from edgepose.inference.quantisation import PRECISIONS
 from edgepose.skeleton import JOINTS
+from edgepose.utils.durable_files import write_whole
+from edgepose.utils.output_targets import check_output
 
 if TYPE_CHECKING:
     import numpy as np
@@ -112,12 +112,13 @@ def export(
         check_output(beside_it, "the card", (".md",), overwrite)
     import torch
 
-    from edgepose.archive import find, inspect, load
-    from edgepose.precision import pack_weights
-    from edgepose_export import archive, training
-    from edgepose_export.card import card
-    from edgepose_export.config import config_from
-    from edgepose_export.precisions import round_weights
+    from edgepose.inference.archive import find, inspect, load
+    from edgepose.inference.quantisation import pack_weights
+    from edgepose_export.archive import torchscript as archive
+    from edgepose_export.archive.model_card import card
+    from edgepose_export.evaluation.quantisation import round_weights
+    from edgepose_export.training import trainer as training
+    from edgepose_export.training.config import config_from
 
     others = {}
     if beside:
@@ -161,9 +162,9 @@ def _precisions(
 ) -> dict[str, Any]:
     """What each precision does to the poses on the held-out takes."""
     from edgepose_export.cli.progress import labelled
-    from edgepose_export.evaluation import modes_of
-    from edgepose_export.precisions import compare
-    from edgepose_export.splits import HELD_OUT
+    from edgepose_export.evaluation.evaluate import modes_of
+    from edgepose_export.evaluation.quantisation import compare
+    from edgepose_export.training.splits import HELD_OUT
 
     (mode,) = (mode for mode in modes_of(metadata) if mode.name == "stream")
     return compare(script, data, HELD_OUT, mode, labelled("measuring precisions"))
@@ -174,8 +175,8 @@ def _std_scale(module: torch.jit.ScriptModule, metadata: dict[str, Any], data: P
     import numpy as np
 
     from edgepose_export.cli.progress import labelled
-    from edgepose_export.evaluation import modes_of, takes_of
-    from edgepose_export.reliability import errors_and_deviations, scales
+    from edgepose_export.evaluation.evaluate import modes_of, takes_of
+    from edgepose_export.evaluation.uncertainty import errors_and_deviations, scales
 
     takes = takes_of(data, "validation", labelled("fitting deviations"))
     (mode,) = (mode for mode in modes_of(metadata) if mode.name == "stream")
@@ -187,12 +188,12 @@ def _std_scale(module: torch.jit.ScriptModule, metadata: dict[str, Any], data: P
 
 def _measures(path: Path, data: Path, others: Mapping[str, Archive]) -> dict[str, Any]:
     """Measures and reliability of the archive as a run loads it, with one thread, and measures of others."""
-    from edgepose.archive import inspect, load
-    from edgepose_export import evaluation
-    from edgepose_export.baselines import learn
+    from edgepose.inference.archive import inspect, load
     from edgepose_export.cli.progress import labelled
-    from edgepose_export.reliability import errors_and_deviations, reliability
-    from edgepose_export.splits import HELD_OUT
+    from edgepose_export.evaluation import evaluate as evaluation
+    from edgepose_export.evaluation.baselines import learn
+    from edgepose_export.evaluation.uncertainty import errors_and_deviations, reliability
+    from edgepose_export.training.splits import HELD_OUT
 
     info = inspect(path)
     module, modes = load(info, trust=True), evaluation.modes_of(info.metadata)

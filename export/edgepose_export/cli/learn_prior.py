@@ -6,10 +6,10 @@ from pathlib import Path
 
 import click
 
-from edgepose.cli.outputs import overwrite_option
-from edgepose.cli.terminal import say
+from edgepose.cli.options.outputs import overwrite_option
+from edgepose.cli.terminal.messages import say
 from edgepose.errors import EdgeposeError
-from edgepose.output_targets import check_output
+from edgepose.utils.output_targets import check_output
 
 RATE = 6.0
 """Poses a second that are taken; neighbours say the same."""
@@ -41,14 +41,14 @@ def learn_prior(inputs: tuple[Path, ...], out: Path, about: str, overwrite: bool
     """
     import numpy as np
 
-    from edgepose.offline.prior import learn_prior as learn
-    from edgepose.offline.prior import save_prior
     from edgepose.rotations import matrix_to_rotvec
+    from edgepose.sip.prior import learn_prior as learn
+    from edgepose.sip.prior import save_prior
     from edgepose.skeleton import local_from_global
     from edgepose_export.cli.progress import progress
     from edgepose_export.cli.synthesize import LICENSES, motion_files
     from edgepose_export.mocap import pieces, read_motion
-    from edgepose_export.splits import part_of
+    from edgepose_export.training.splits import part_of
 
     check_output(out, "the prior", (".npz",), overwrite)
     files = [path for root in inputs for path in motion_files(root) if part_of(path.stem) == "train"]

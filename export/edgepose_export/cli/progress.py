@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import click
 
-from edgepose.cli.terminal import say
+from edgepose.cli.terminal.messages import say
 
 T = TypeVar("T")
 

@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 import click
 
-from edgepose.cli.outputs import overwrite_option
-from edgepose.cli.terminal import say
-from edgepose.durable_files import replace_file
+from edgepose.cli.options.outputs import overwrite_option
+from edgepose.cli.terminal.messages import say
 from edgepose.errors import EdgeposeError
-from edgepose.output_targets import check_free
 from edgepose.skeleton import Body
+from edgepose.utils.durable_files import replace_file
+from edgepose.utils.output_targets import check_free
 
 KINDS = (".bvh", ".amc", ".npz")
 
@@ -110,8 +110,8 @@ def synthesize(
       edgepose synthesize walk.bvh --out . --hold 6 --mounting 1 --rate 100
       edgepose synthesize mocap/ --out recordings/seated --seated 1
     """
+    from edgepose.formats.smpl_model import read_smpl
     from edgepose.skeleton import default_body
-    from edgepose.smpl_file import read_smpl
     from edgepose_export.cli.progress import progress
 
     if body_path and height:
@@ -161,7 +161,7 @@ def _check_targets(tasks: list[tuple[Path, Job]], overwrite: bool) -> None:
 
 def _target(path: Path, job: Job, part: str) -> Path:
     """The recording of a motion file, or of a part of it."""
-    from edgepose_export.dataset import SEATED
+    from edgepose_export.training.dataset import SEATED
 
     kind = "" if job.seated_seed is None else SEATED
     return job.out / path.relative_to(job.root).with_name(f"{path.stem}{part}{kind}.npz")
@@ -179,8 +179,13 @@ def convert(path: Path, job: Job) -> str | None:
     import numpy as np
 
     from edgepose_export.mocap import pieces, read_motion, resample
-    from edgepose_export.seating import seated
-    from edgepose_export.synthesis import random_mounting, recording_arrays, virtual_imus, with_hold
+    from edgepose_export.synthesis.sitting import seated
+    from edgepose_export.synthesis.virtual_imus import (
+        random_mounting,
+        recording_arrays,
+        virtual_imus,
+        with_hold,
+    )
 
     try:
         mounting = None if job.mounting_seed is None else random_mounting(job.mounting_seed)

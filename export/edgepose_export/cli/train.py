@@ -9,10 +9,10 @@ from pathlib import Path
 
 import click
 
-from edgepose.cli.terminal import clear_bar, say
+from edgepose.cli.terminal.messages import clear_bar, say
 from edgepose.errors import EdgeposeError
 
-CONFIGS = Path(__file__).parent.parent / "configs"
+CONFIGS = Path(__file__).parent.parent / "training" / "configs"
 
 
 def _config_path(name: str) -> Path:
@@ -86,9 +86,9 @@ def train(
 
     import torch
 
-    from edgepose_export import training
-    from edgepose_export.config import read_config
-    from edgepose_export.processes import joined
+    from edgepose_export.training import trainer as training
+    from edgepose_export.training.config import read_config
+    from edgepose_export.training.distributed import joined
 
     settings = read_config(_config_path(config))
     if steps:
@@ -106,8 +106,8 @@ def train(
 def _train(  # type: ignore[no-untyped-def]
     settings, data: Path, out: Path, processes, resume: bool, init: Path | None, cache: Path | None
 ) -> None:
-    from edgepose_export import training
-    from edgepose_export.dataset import training_paths
+    from edgepose_export.training import trainer as training
+    from edgepose_export.training.dataset import training_paths
 
     parts = [
         _tape(processes.share(paths), processes, cache and cache / part)
@@ -129,8 +129,8 @@ def _train(  # type: ignore[no-untyped-def]
 def _tape(paths: list[Path], processes, cache: Path | None):  # type: ignore[no-untyped-def]
     """A process's takes, in memory or packed into a folder of the process's own."""
     from edgepose_export.cli.progress import labelled
-    from edgepose_export.dataset import read_take, tape
-    from edgepose_export.packing import packed_tape
+    from edgepose_export.training.dataset import read_take, tape
+    from edgepose_export.training.memory_map import packed_tape
 
     if cache is None:
         show = labelled("reading takes") if processes.rank == 0 else iter
@@ -140,7 +140,7 @@ def _tape(paths: list[Path], processes, cache: Path | None):  # type: ignore[no-
 
 
 def _fit(trainer, out: Path, tell: Callable[[str], None]) -> None:  # type: ignore[no-untyped-def]
-    from edgepose_export.training import fit
+    from edgepose_export.training.trainer import fit
 
     config = trainer.config
     started, first = time.monotonic(), trainer.step

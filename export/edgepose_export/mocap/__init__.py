@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from edgepose.bvh import read_bvh
 from edgepose.errors import EdgeposeError
+from edgepose.formats.bvh import read_bvh
 
 from .amass import read_amass
 from .amc import read_amc
 from .motion import Motion, pieces, resample
-from .transfer import BANDAI, CMU_AMC, CMU_BVH, from_bandai, from_cmu_amc, from_cmu_bvh, has_names
+from .retargeting import BANDAI, CMU_AMC, CMU_BVH, from_bandai, from_cmu_amc, from_cmu_bvh, has_names
 
 __all__ = ["Motion", "pieces", "read_motion", "resample"]
 

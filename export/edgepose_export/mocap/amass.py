@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
-from edgepose.joint_tree import LARGEST
-from edgepose.npz import BROKEN, open_npz
+from edgepose.formats.joint_tree import LARGEST
 from edgepose.rotations import Z_UP_TO_T, rotvec_to_matrix
 from edgepose.skeleton import PARENTS
+from edgepose.utils.safe_npz import BROKEN, open_npz
 
 from .motion import Motion
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
-from edgepose.joint_tree import JointTree, fail, numbers
+from edgepose.formats.joint_tree import JointTree, fail, numbers
 from edgepose.rotations import euler_to_matrix, transpose
 
 Array = NDArray[np.float64]

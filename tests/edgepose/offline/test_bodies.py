@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from edgepose.errors import EdgeposeError
-from edgepose.offline.bodies import WORDS, scaled, sensor_points, shaped_body
 from edgepose.placements import PLACEMENTS, SITES
+from edgepose.sip.bodies import WORDS, scaled, sensor_points, shaped_body
 from edgepose.skeleton import default_body
 
 

@@ -8,10 +8,10 @@ import pytest
 from edgepose import rotations as rot
 from edgepose.calibration import load_calibration
 from edgepose.errors import EdgeposeError
-from edgepose.offline import reading
-from edgepose.offline.measurements import Mount, measure, mounts_from_hold
+from edgepose.formats.recordings.csv_npz import Recording, SensorData, read_recording, read_sensors, write_npz
 from edgepose.placements import SITES
-from edgepose.recording import Recording, SensorData, read_recording, read_sensors, write_npz
+from edgepose.sip import inputs as reading
+from edgepose.sip.measurements import Mount, measure, mounts_from_hold
 
 NAMES = ("left_forearm", "head", "pelvis")
 PLAIN = {name: Mount(np.eye(3), np.eye(3)) for name in NAMES}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edgepose.errors import EdgeposeError
-from edgepose.offline.prior import SIZE, learn_prior, load_prior, save_prior
+from edgepose.sip.prior import SIZE, learn_prior, load_prior, save_prior
 from edgepose.skeleton import JOINTS
 
 CLIP = Path(__file__).parents[3] / "tools" / "data" / "09_12.bvh"

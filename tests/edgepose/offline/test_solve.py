@@ -6,19 +6,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edgepose import metrics
 from edgepose import rotations as rot
+from edgepose.analysis import metrics
 from edgepose.errors import EdgeposeError
-from edgepose.offline import report
-from edgepose.offline import solve as module
-from edgepose.offline.bodies import sensor_points
-from edgepose.offline.measurements import Measurements
-from edgepose.offline.prior import load_prior
-from edgepose.offline.rigs import hinge_rig, smpl_rig
-from edgepose.offline.solve import Settings, chunks, solve
-from edgepose.offline.terms import Weights, second_difference
-from edgepose.offline.translation import pelvis_path
 from edgepose.placements import PLACEMENTS, SITES
+from edgepose.sip import residuals as report
+from edgepose.sip import solve as module
+from edgepose.sip.bodies import sensor_points
+from edgepose.sip.energy import Weights, second_difference
+from edgepose.sip.measurements import Measurements
+from edgepose.sip.parameterisation import hinge_rig, smpl_rig
+from edgepose.sip.prior import load_prior
+from edgepose.sip.solve import Settings, chunks, solve
+from edgepose.sip.translation import pelvis_path
 from edgepose.skeleton import default_body, forward_kinematics, local_from_global
 from edgepose_export.mocap import read_motion, resample
 

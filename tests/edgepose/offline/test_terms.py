@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from edgepose import rotations as rot
-from edgepose.offline import minimise, terms
-from edgepose.offline.bodies import sensor_points
-from edgepose.offline.kinematics import orientation_jacobian
-from edgepose.offline.prior import load_prior
-from edgepose.offline.rigs import hinge_rig, smpl_rig
-from edgepose.offline.terms import Problem, Weights
 from edgepose.placements import PLACEMENTS, SITES
+from edgepose.sip import energy as terms
+from edgepose.sip import levenberg_marquardt as minimise
+from edgepose.sip.bodies import sensor_points
+from edgepose.sip.energy import Problem, Weights
+from edgepose.sip.kinematics import orientation_jacobian
+from edgepose.sip.parameterisation import hinge_rig, smpl_rig
+from edgepose.sip.prior import load_prior
 from edgepose.skeleton import default_body
 
 FRAMES = 6
@@ -126,7 +127,7 @@ def test_unseen_joints_have_what_the_prior_expects():
     rig = smpl_rig(prior, [18, 19, 4, 5, 15, 0])
     rng = np.random.default_rng(2)
     parameters = np.concatenate([np.zeros((1, 3)), rig.mean + 0.2 * rng.normal(size=(1, len(rig.mean)))], 1)
-    from edgepose.offline.rigs import coordinates
+    from edgepose.sip.parameterisation import coordinates
 
     whole = coordinates(rig, parameters).reshape(72)[3:]
     inverse = np.linalg.inv(prior.covariance)

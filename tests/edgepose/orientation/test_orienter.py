@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from edgepose import rotations as rot
-from edgepose import xio
 from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
+from edgepose.formats.recordings import xio_session as xio
+from edgepose.formats.recordings.csv_npz import Recording, SensorData, read_recording, samples
 from edgepose.imu import ImuSample
 from edgepose.orientation import Event, OrientationFilter, Orienter, smooth
-from edgepose.orientation.recorded import orient_recording
+from edgepose.orientation.offline import orient_recording
 from edgepose.orientation.vqf_filter import VqfFilter
-from edgepose.recording import Recording, SensorData, read_recording, samples
 
 REAL = Path(__file__).parents[2] / "data" / "imu" / "six-sites-3s.npz"
 XIO = REAL.parent / "xio-lower-body"

@@ -1,0 +1,1 @@
+"""Poses measured, described and drawn."""

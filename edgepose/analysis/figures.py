@@ -1,0 +1,262 @@
+"""Pictures of poses for people; needs matplotlib, which is imported only when one is drawn."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from edgepose.errors import EdgeposeError
+from edgepose.skeleton import forward_kinematics
+from edgepose.utils.durable_files import replace_file
+from edgepose.utils.output_targets import check_output, is_stream
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+PICTURES = (".png", ".pdf", ".svg")
+
+AZIMUTH = np.deg2rad(25.0)
+"""The viewer stands this far round from the figure's front towards its left side."""
+
+# Limbs as chains of joints with their thickness in metres; "left" and "right" are the figure's own.
+LIMBS = (
+    ("left", (1, 4, 7, 10), 0.075),
+    ("right", (2, 5, 8, 11), 0.075),
+    ("left", (16, 18, 20, 22), 0.06),
+    ("right", (17, 19, 21, 23), 0.06),
+)
+TORSO_THICKNESS = 0.065
+NECK_THICKNESS = 0.07
+RIM = 0.025
+
+# Points that are no joints: joint, place in its bone frame, metres.
+LEFT_WAIST, RIGHT_WAIST, HEAD_CENTRE, NOSE = range(24, 28)
+EXTRA_POINTS = (
+    (3, (0.075, 0.02, 0.0)),
+    (3, (-0.075, 0.02, 0.0)),
+    (15, (0.0, 0.085, 0.02)),
+    (15, (0.0, 0.075, 0.1)),
+)
+TORSO = (16, LEFT_WAIST, 1, 2, RIGHT_WAIST, 17, 12)
+HEAD_RADIUS = 0.105
+
+# One hue for the prediction and none for the reference; the sides differ in lightness, which every eye sees.
+PREDICTION = {"left": "#56B4E9", "trunk": "#2A6F9E", "right": "#0B3C5D"}
+REFERENCE = {"left": "#C9C9C9", "trunk": "#969696", "right": "#6A6A6A"}
+INK = "#333333"
+
+WIDTH_IN, DPI = 8.0, 200
+"""A strip is 1600 pixels wide."""
+
+
+class _Figure(NamedTuple):
+    """A figure on the picture plane, metres.
+
+    Attributes:
+        points: (28, 2) joints and `EXTRA_POINTS`, right and up.
+        depths: (28,) how far each is towards the viewer.
+    """
+
+    points: Array
+    depths: Array
+
+
+def project(points: ArrayLike) -> tuple[Array, Array]:
+    """Points (..., 3) in the body frame T as (..., 2), right and up, and depths (...) towards the viewer.
+
+    The figure faces the viewer, so its left (+X) is at the viewer's right.
+    """
+    x, y, z = np.moveaxis(np.asarray(points, float), -1, 0)
+    c, s = np.cos(AZIMUTH), np.sin(AZIMUTH)
+    return np.stack([c * x - s * z, y], axis=-1), s * x + c * z
+
+
+def require_matplotlib(what: str) -> None:
+    """Raises EdgeposeError, naming what needs it, unless matplotlib is there; it is an extra."""
+    try:
+        import matplotlib.figure  # noqa: F401
+    except ImportError as error:
+        raise EdgeposeError(
+            f"{what} needs matplotlib: install it with pip install 'edgepose[plot]'"
+        ) from error
+
+
+def check_picture(path: Path, what: str, overwrite: bool = False) -> None:
+    """Before long work: raises EdgeposeError unless this kind of picture can be drawn in this folder without
+    loss."""
+    require_matplotlib(what)
+    if is_stream(path):
+        return
+    if path.suffix.lower() not in PICTURES:
+        raise EdgeposeError(f"{path}: pictures are written as {', '.join(PICTURES)}")
+    if not path.resolve().parent.is_dir():
+        raise EdgeposeError(f"{path}: no folder {path.parent}; make it first or choose another name")
+    check_output(path, "the picture", PICTURES, overwrite)
+
+
+def save_picture(figure: Figure, path: str | Path, **options: Any) -> None:
+    """Write a figure; the file is whole or as it was before.
+
+    Args:
+        figure: to draw.
+        path: of the picture; the ending says the kind (png, svg, pdf), a device or pipe without one gets png.
+        options: of matplotlib's `savefig`.
+
+    Raises:
+        EdgeposeError: it cannot be written.
+    """
+    kind = Path(path).suffix[1:] or "png"
+    try:
+        replace_file(path, lambda part: figure.savefig(part, format=kind, **options), "the picture")
+    except ValueError as error:  # an ending that matplotlib does not know
+        raise EdgeposeError(f"cannot write the picture {path}: {error}") from error
+
+
+def skeleton_strip(
+    path: str | Path,
+    poses: ArrayLike,
+    times: ArrayLike,
+    offsets: ArrayLike,
+    reference: ArrayLike | None = None,
+    title: str | None = None,
+) -> None:
+    """Draw stick figures at K instants side by side, with reference figures in a second row.
+
+    Args:
+        path: picture to write; the ending says the kind (png, svg, pdf).
+        poses: (K, 24, 3, 3) local rotations.
+        times: (K,) seconds, written below the figures.
+        offsets: (24, 3) joint position minus its parent's in the zero pose, metres.
+        reference: (K, 24, 3, 3) local rotations of the reference at the same instants.
+        title: line above the figures.
+
+    Raises:
+        EdgeposeError: matplotlib is not installed, or the file cannot be written.
+    """
+    require_matplotlib("drawing poses")
+    from matplotlib.figure import Figure
+
+    times = np.asarray(times, float)
+    rows = [(_figures(poses, offsets), PREDICTION)]
+    if reference is not None:
+        rows.append((_figures(reference, offsets), REFERENCE))
+    if any(len(figures) != len(times) for figures, _ in rows) or not len(times):
+        raise ValueError("poses, times and reference must be for the same instants, at least one")
+
+    centres, width = _columns([figures for figures, _ in rows])
+    height = max(_top(f) for figures, _ in rows for f in figures) + 0.12
+    label = 0.24  # metres below the last ground line
+    title_in, legend_in = 0.3 if title else 0.0, 0.36  # inches above the figures
+    head_in = title_in + legend_in
+    total = len(rows) * height + label
+    # Few figures would make a picture of giants: leave room at their sides instead.
+    canvas = max(width, total * WIDTH_IN / (1.8 * len(rows) + 1.2))
+    scale = WIDTH_IN / canvas  # inches per metre
+    body_in = total * scale
+    figure = Figure(figsize=(WIDTH_IN, body_in + head_in), dpi=DPI, facecolor="white")
+    axes = figure.add_axes((0.0, 0.0, 1.0, body_in / (body_in + head_in)))
+    axes.set_axis_off()
+    axes.set_xlim((width - canvas) / 2, (width + canvas) / 2)
+    axes.set_ylim(-label - (len(rows) - 1) * height, height)
+
+    for i, (figures, colours) in enumerate(rows):
+        ground = -i * height
+        axes.plot([0.1, width - 0.1], [ground, ground], color="#DDDDDD", linewidth=1.0, zorder=0)
+        for figure_2d, centre in zip(figures, centres, strict=True):
+            _draw(axes, figure_2d, np.array([centre, ground]), colours, 72.0 * scale)
+    for centre, time in zip(centres, times, strict=True):
+        y = -(len(rows) - 1) * height - 0.05
+        axes.text(centre, y, f"{time:.2f} s", ha="center", va="top", fontsize=8, color=INK)
+
+    inch = 1.0 / (body_in + head_in)  # of the figure's height
+    if title:
+        figure.text(0.02, 1.0 - 0.6 * title_in * inch, title, ha="left", va="center", fontsize=10, color=INK)
+    _legend(figure, 1.0 - (title_in + 0.5 * legend_in) * inch, reference is not None)
+    save_picture(figure, path, dpi=DPI)
+
+
+def _figures(poses: ArrayLike, offsets: ArrayLike) -> list[_Figure]:
+    """Poses (K, 24, 3, 3) on the picture plane, pelvis at x = 0, lowest point on the ground line y = 0."""
+    offsets = np.array(offsets, float)
+    offsets[0] = 0.0
+    rotations, joints = forward_kinematics(poses, offsets)
+    extra = [joints[:, j] + rotations[:, j] @ np.array(place) for j, place in EXTRA_POINTS]
+    points, depths = project(np.concatenate([joints, np.stack(extra, axis=1)], axis=1))
+    lowest = np.minimum(points[:, :24, 1].min(axis=1) - 0.03, points[:, HEAD_CENTRE, 1] - HEAD_RADIUS)
+    points[..., 1] -= lowest[:, None]
+    return [_Figure(*figure) for figure in zip(points, depths, strict=True)]
+
+
+def _top(figure: _Figure) -> float:
+    return float(max(figure.points[:24, 1].max(), figure.points[HEAD_CENTRE, 1] + HEAD_RADIUS))
+
+
+def _columns(rows: list[list[_Figure]]) -> tuple[list[float], float]:
+    """Where the pelvis of each column stands, so that no figure touches the next, and the width; metres."""
+    gap, centres, edge = 0.22, [], 0.0
+    for column in zip(*rows, strict=True):
+        left = max(0.3, *(-f.points[:, 0].min() for f in column))
+        right = max(0.3, *(f.points[:, 0].max() for f in column))
+        centres.append(edge + gap / 2 + left)
+        edge = centres[-1] + right + gap / 2
+    return centres, edge
+
+
+def _draw(axes: Any, figure: _Figure, at: Array, colours: dict[str, str], points_per_metre: float) -> None:
+    """One figure, what is nearer to the viewer over what is further, each part with a white rim."""
+    from matplotlib.patches import Circle, Polygon
+
+    points = figure.points + at
+    for side, limb, thickness in LIMBS:
+        chain = list(limb)
+        # Without the shoulder or hip, so that a forearm before the chest is drawn before the chest.
+        depth = 10.0 + figure.depths[chain[1:]].mean()
+        for extra, colour, order in ((RIM, "white", depth), (0.0, colours[side], depth + 1e-3)):
+            axes.plot(
+                *points[chain].T,
+                color=colour,
+                linewidth=(thickness + extra) * points_per_metre,
+                zorder=order,
+                solid_capstyle="round",
+                solid_joinstyle="round",
+            )
+
+    torso = list(TORSO)
+    depth = 10.0 + figure.depths[torso].mean()
+    for extra, colour, order in ((RIM, "white", depth), (0.0, colours["trunk"], depth + 1e-3)):
+        width = (TORSO_THICKNESS + extra) * points_per_metre
+        axes.add_patch(Polygon(points[torso], color=colour, linewidth=width, joinstyle="round", zorder=order))
+    neck = [12, 15]
+    axes.plot(
+        *points[neck].T,
+        color=colours["trunk"],
+        linewidth=NECK_THICKNESS * points_per_metre,
+        zorder=depth + 2e-3,
+        solid_capstyle="round",
+    )
+
+    depth = 10.0 + figure.depths[HEAD_CENTRE]
+    centre = tuple(points[HEAD_CENTRE])
+    axes.add_patch(Circle(centre, HEAD_RADIUS + RIM / 2, color="white", linewidth=0, zorder=depth))
+    axes.add_patch(Circle(centre, HEAD_RADIUS, color=colours["trunk"], linewidth=0, zorder=depth + 1e-3))
+    if figure.depths[NOSE] > figure.depths[HEAD_CENTRE]:  # Else the figure looks away from the viewer.
+        axes.add_patch(Circle(tuple(points[NOSE]), 0.022, color="white", linewidth=0, zorder=depth + 2e-3))
+
+
+def _legend(figure: Any, y: float, with_reference: bool) -> None:
+    from matplotlib.lines import Line2D
+
+    entries = [("left limbs", PREDICTION["left"]), ("right limbs", PREDICTION["right"])]
+    if with_reference:
+        entries = [("predicted: left limbs", PREDICTION["left"]), ("right limbs", PREDICTION["right"])]
+        entries += [("reference: left limbs", REFERENCE["left"]), ("right limbs", REFERENCE["right"])]
+    handles = [Line2D([], [], color=c, linewidth=4, solid_capstyle="round", label=t) for t, c in entries]
+    figure.legend(
+        handles=handles, loc="center right", bbox_to_anchor=(0.99, y), ncols=len(handles), frameon=False,
+        fontsize=8, labelcolor=INK, handlelength=1.2, columnspacing=1.4,
+    )  # fmt: skip

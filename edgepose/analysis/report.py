@@ -1,0 +1,179 @@
+"""One page about the poses of a file: angles over time, ranges of motion, steps, sensors, figures.
+
+The page is HTML with everything inside it. Needs matplotlib, which is imported only when a page is made.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import tempfile
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgepose.analysis.figures import INK, PREDICTION, require_matplotlib, skeleton_strip
+from edgepose.analysis.joint_angles import ANGLES, LIMBS, Walk, joint_angles, walks
+from edgepose.formats.poses.reading import Poses
+from edgepose.placements import PLACEMENTS
+from edgepose.pose import FILLING_WINDOW, held_sensors, longest_holds, status_bits
+from edgepose.skeleton import Body
+from edgepose.utils.durable_files import write_whole
+
+Array = NDArray[np.float64]
+
+FIGURES = 8
+"""Instants that are drawn."""
+
+POINTS = 3000
+"""Of a line in a plot; more would not be seen."""
+
+STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 60rem; margin: 2rem auto; }
+h1 { font-size: 1.5rem; } h2 { font-size: 1.1rem; margin-top: 2rem; }
+table { border-collapse: collapse; } th, td { padding: .15rem .8rem .15rem 0; text-align: right; }
+th:first-child, td:first-child, td:nth-child(6), th:nth-child(6) { text-align: left; }
+th { border-bottom: 1px solid #999; }
+img { max-width: 100%; } .note { color: #666; }
+"""
+
+
+def write_report(path: Path, poses: Poses, body: Body, name: str) -> None:
+    """Write the page.
+
+    Args:
+        path: file to write, replaced if it is there.
+        poses: at least one.
+        body: for the figures, and for the steps, which are told by the feet.
+        name: of the poses, for the heading.
+
+    Raises:
+        EdgeposeError: matplotlib is not installed, or the file cannot be written.
+    """
+    require_matplotlib("a report")
+    angles = joint_angles(poses.rotations)
+    found = walks(poses.rotations, body.offsets, poses.rate)
+    times = poses.time_s - poses.time_s[0]
+    parts = [
+        f"<h1>{html.escape(name)}</h1>",
+        f"<p>{len(times)} poses, {times[-1]:.1f} s, {poses.rate:g} a second</p>",
+        _image(_strip(poses, times, body), "Figures at instants of the recording"),
+        "<h2>Steps</h2>",
+        *_steps(found, times, poses.rate),
+        "<h2>Angles over time</h2>",
+        _image(_plots(times, angles, found), "Joint angles over time"),
+        "<p class='note'>Light: left, dark: right. Grey: walking.</p>",
+        "<h2>Range of motion</h2>",
+        _ranges(angles),
+        "<h2>Sensors</h2>",
+        *_sensors(poses.status, poses.rate),
+    ]
+    page = (
+        f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{html.escape(name)}</title>"
+        f"<style>{STYLE}</style></head><body>{chr(10).join(parts)}</body></html>\n"
+    )
+    write_whole(path, page, "the report")
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [f"<tr>{''.join(f'<th>{cell}</th>' for cell in head)}</tr>"]
+    lines += [f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows]
+    return f"<table>{''.join(lines)}</table>"
+
+
+def _image(png: bytes, about: str) -> str:
+    return f"<img alt='{about}' src='data:image/png;base64,{base64.b64encode(png).decode()}'>"
+
+
+def _strip(poses: Poses, times: Array, body: Body) -> bytes:
+    chosen = np.unique(np.linspace(0, len(times) - 1, FIGURES).round().astype(int))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "strip.png"
+        skeleton_strip(path, poses.rotations[chosen], times[chosen], body.offsets)
+        return path.read_bytes()
+
+
+def extremes(values: Array) -> NDArray[np.int64]:
+    """Rows of values (T,) that a plot needs, rising: the least and the largest of every so many."""
+    if len(values) <= POINTS:
+        return np.arange(len(values))
+    step = -(-len(values) // (POINTS // 2))
+    starts = np.arange(0, len(values), step)
+    # The last few are filled up with the last one.
+    bins = np.pad(values, (0, -len(values) % step), mode="edge").reshape(-1, step)
+    rows = np.concatenate([starts + bins.argmin(axis=1), starts + bins.argmax(axis=1)])
+    return np.unique(np.minimum(rows, len(values) - 1))
+
+
+def _plots(times: Array, angles: dict[str, Array], found: Sequence[Walk]) -> bytes:
+    """A panel an angle, left and right in one."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 1.35 * len(ANGLES)), dpi=110, facecolor="white", layout="constrained")
+    panels: Any = figure.subplots(len(ANGLES), 1, sharex=True)
+    for panel, name in zip(panels, ANGLES, strict=True):
+        for walk in found:
+            panel.axvspan(times[walk.frames[0]], times[walk.frames[-1]], color="#EEEEEE", linewidth=0)
+        sides = ("left", "right") if name in LIMBS else ("trunk",)
+        for side in sides:
+            values = angles[f"{side} {name}" if name in LIMBS else name]
+            shown = extremes(values)
+            panel.plot(times[shown], values[shown], color=PREDICTION[side], linewidth=1.0)
+        panel.set_title(f"{name}, deg", loc="left", fontsize=9, color=INK)
+        panel.tick_params(labelsize=8)
+        panel.grid(color="#E5E5E5", linewidth=0.6)
+        panel.spines[["top", "right"]].set_visible(False)
+    panels[-1].set_xlabel("time, s", fontsize=9)
+    panels[-1].set_xlim(0.0, max(float(times[-1]), 1e-3))
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png")
+    return picture.getvalue()
+
+
+def _ranges(angles: dict[str, Array]) -> str:
+    """Smallest, largest, range and mean; single odd poses do not count."""
+    rows = []
+    for name, about in ANGLES.items():
+        for key in (f"left {name}", f"right {name}") if name in LIMBS else (name,):
+            low, high = np.percentile(angles[key], [0.5, 99.5])
+            mean = angles[key].mean()
+            rows.append((key, *(f"{round(value):d}" for value in (low, high, high - low, mean)), about))
+    table = _table(("angle, deg", "least", "most", "range", "mean", "what it is"), rows)
+    note = "The lowest and the highest 0.5 % of the poses are left out. All are 0 when standing straight."
+    return f"{table}<p class='note'>{note}</p>"
+
+
+def _steps(found: Sequence[Walk], times: Array, rate: float) -> list[str]:
+    """Counts, cadence and evenness of all walks."""
+    if not found:
+        return ["<p>No walking was found.</p>"]
+    step_s = np.concatenate([np.diff(walk.frames) for walk in found]) / rate
+    # A step of the left foot ends with the left foot in front.
+    left = np.concatenate([walk.left[1:] for walk in found])
+    seconds = sum(times[walk.frames[-1]] - times[walk.frames[0]] for walk in found)
+    cadence = 60.0 / step_s
+    rows = [
+        ("steps", f"{sum(len(walk.frames) for walk in found)} in {seconds:.0f} s of walking"),
+        ("cadence", f"{60.0 / step_s.mean():.0f} steps a minute (deviation {cadence.std():.0f})"),
+        ("time of a left step", f"{step_s[left].mean():.2f} s"),
+        ("time of a right step", f"{step_s[~left].mean():.2f} s"),
+    ]
+    return [_table(("walking", ""), rows)]
+
+
+def _sensors(status: Sequence[str], rate: float) -> list[str]:
+    """How often each sensor's last values were repeated."""
+    held = held_sensors(status)
+    rows = [
+        (name.replace("_", " "), str(column.sum()), f"{100 * column.mean():.1f} %", f"{longest / rate:.2f} s")
+        for name, column, longest in zip(PLACEMENTS, held.T, longest_holds(held), strict=True)
+    ]
+    filling = sum(status_bits(text)[0] & FILLING_WINDOW for text in status)
+    result = [_table(("sensor", "poses with repeated values", "of all", "longest"), rows)]
+    if filling:
+        result.append(f"<p class='note'>In {filling} poses the window was filling.</p>")
+    return result

@@ -1,0 +1,1 @@
+"""How fast and how accurate the parts are, on data with known truth."""

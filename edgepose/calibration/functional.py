@@ -1,0 +1,135 @@
+"""Heading reset from motion: segments that are flexed show which way their wearer faces.
+
+What was the vertical of a segment in the straight pose leans forward when a trunk bows or a heel is lifted
+behind, and back when a forearm is lifted forward. Turns of a limb about that axis, which would spoil the
+direction of its angular rate, do not show in where it points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from edgepose import rotations as rot
+from edgepose.calibration.headings import HeadingReset
+from edgepose.calibration.static_pose import Hold, check_reported
+from edgepose.errors import EdgeposeError
+from edgepose.placements import PLACEMENTS
+from edgepose.rotations import Array
+
+MIN_LEAN_DEG = 6.0
+"""Less than this is swaying; walkers' pelves lean by 8 to 10."""
+
+SPREAD_WARNING_DEG, SPREAD_LIMIT_DEG = 30.0, 40.0
+ONE_WAY = 0.4
+"""Least surplus of lean to one side, as a share: without it forward cannot be told from back."""
+
+
+class WeakMotionError(EdgeposeError):
+    """Motion that shows no heading: moving once more, more clearly, helps."""
+
+
+class Exercise(NamedTuple):
+    """One part of the motion that `ROUTINE` asks for: what to do, and the sensors that it moves."""
+
+    text: str
+    sensors: tuple[str, ...]
+
+
+ROUTINE = (
+    Exercise("Bow forward and straighten up, twice", ("head", "pelvis")),
+    Exercise("Lift the LEFT forearm forward and lower it, twice", ("left_forearm",)),
+    Exercise("Lift the RIGHT forearm forward and lower it, twice", ("right_forearm",)),
+    Exercise("Lift the LEFT heel up behind you and put it down, twice", ("left_lower_leg",)),
+    Exercise("Lift the RIGHT heel up behind you and put it down, twice", ("right_lower_leg",)),
+)
+EXERCISE_S = 4.0
+"""Time for each of them, seconds."""
+
+_BACK = ("left_forearm", "right_forearm")
+_STEP_S = 0.1
+
+
+def headings_from_motion(moving: Hold, upright: Array) -> HeadingReset:
+    """Heading reset from movements of a wearer who faces one way; the common frame's X axis is forward.
+
+    Args:
+        moving: what the sensors said meanwhile; `ROUTINE` is best, walking does.
+        upright: (6, 4) mean quaternions of the straight pose, held shortly before or after.
+
+    Raises:
+        WeakMotionError: a sensor was moved too little, in all directions, or forward as much as back.
+    """
+    check_reported(moving)
+    leans = [_leans(s.quat, own) for s, own in zip(moving, upright, strict=True)]
+    forward, spread, wrong = [], [], []
+    for name, lean in zip(PLACEMENTS, leans, strict=True):
+        direction, spread_deg, one_way = _direction(lean)
+        reach = np.degrees(np.arcsin(min(1.0, np.percentile(np.linalg.norm(lean, axis=-1), 98))))
+        if reach < MIN_LEAN_DEG:
+            wrong.append(f"{name} leant by {reach:.0f} deg only")
+        elif spread_deg > SPREAD_LIMIT_DEG:
+            wrong.append(f"{name} leant in all directions ({spread_deg:.0f} deg)")
+        elif one_way < ONE_WAY:
+            wrong.append(f"{name} leant forward as much as back")
+        forward.append(-direction if name in _BACK else direction)
+        spread.append(spread_deg)
+    if wrong:
+        raise WeakMotionError(
+            f"no heading from this motion: {', '.join(wrong)}; face one way, and bow, lift each forearm "
+            "forward and each heel behind, all clearly"
+        )
+    ahead = np.array(forward)
+    warnings = [
+        f"the heading of {name} is only known to {spread_deg:.0f} deg: its movements went different ways"
+        for name, spread_deg in zip(PLACEMENTS, spread, strict=True)
+        if spread_deg > SPREAD_WARNING_DEG
+    ]
+    warnings += _wrong_order([s.time_s for s in moving], leans)
+    return HeadingReset(-np.arctan2(ahead[:, 1], ahead[:, 0]), np.array(spread), warnings)
+
+
+def _leans(quat: Array, upright: Array) -> Array:
+    """Level part (n, 2), in I, of the axis that was vertical in the straight pose."""
+    vertical = rot.quat_rotate(rot.quat_conjugate(upright), [0.0, 0.0, 1.0])
+    return rot.quat_rotate(quat, vertical)[:, :2]
+
+
+def _direction(lean: Array) -> tuple[Array, float, float]:
+    """Direction (2,) to which it leant most, spread about that line in degrees, surplus over the other way.
+
+    Weighted with the square of the speed, and of the lean where it is about the side.
+    """
+    # How it leans on average is posture, of which little is straight ahead; how that changes is movement.
+    change = np.diff(lean, axis=0)
+    squares, axes = np.linalg.eigh(change.T @ change)
+    direction = axes[:, 1]
+    size = np.linalg.norm(lean, axis=-1)
+    along = float(size @ (lean @ direction) / max(size @ size, 1e-12))
+    spread = np.degrees(np.arctan2(np.sqrt(max(squares[0], 0.0)), np.sqrt(max(squares[1], 1e-12))))
+    return (-direction if along < 0 else direction), float(spread), abs(along)
+
+
+def _wrong_order(times: Sequence[Array], leans: Sequence[Array]) -> list[str]:
+    """Warnings about sensors that moved when `ROUTINE` asked for another one's movement.
+
+    Only if the limbs moved one after the other: in walking they move together, and nothing can be told.
+    """
+    active = {}
+    for name, time_s, lean in zip(PLACEMENTS, times, leans, strict=True):
+        size = np.linalg.norm(lean, axis=-1)
+        active[name] = np.unique(np.floor(time_s[size > 0.5 * size.max()] / _STEP_S))
+    limbs = [exercise.sensors[0] for exercise in ROUTINE if len(exercise.sensors) == 1]
+    for i, name in enumerate(limbs):
+        for other in limbs[:i]:
+            both = np.intersect1d(active[name], active[other]).size
+            if both > 0.1 * min(active[name].size, active[other].size):
+                return []
+    found = sorted(limbs, key=lambda name: float(np.median(active[name])))
+    return [
+        f"the sensor said to be at {name} moved when {place} should: are sensors swapped?"
+        for name, place in zip(found, limbs, strict=True)
+        if name != place
+    ]

@@ -1,0 +1,175 @@
+"""Calibrations on disk: JSON that people can read, every value checked when it is read."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edgepose.calibration.body_frame import check_body_frame
+from edgepose.calibration.mounting import mounting
+from edgepose.calibration.sensor_to_segment import POSES, Calibration
+from edgepose.errors import EdgeposeError
+from edgepose.imu import FILTERS
+from edgepose.placements import PLACEMENTS
+from edgepose.rotations import Array
+from edgepose.utils.durable_files import write_whole
+from edgepose.utils.text_files import read_text
+
+_FORMAT, _VERSION = "edgepose-calibration", 1
+
+
+def to_json(calibration: Calibration) -> str:
+    """The calibration as JSON for `from_json` and for people: sensors by name, degrees, w, x, y, z."""
+    sensors = {
+        name: {
+            "heading_offset_deg": math.degrees(calibration.heading_offset[i]),
+            "bone_from_sensor": calibration.bone_from_sensor[i].tolist(),
+            "residual_deg": float(calibration.residual_deg[i]),
+            "mounting": mounted,
+        }
+        for i, (name, mounted) in enumerate(zip(PLACEMENTS, mounting(calibration), strict=True))
+    }
+    document = {
+        "format": _FORMAT,
+        "version": _VERSION,
+        "created": calibration.created,
+        "pose": calibration.pose,
+        "body_frame": calibration.body_frame,
+        "body_from_inertial": calibration.body_from_inertial.tolist(),
+        "orientation": {"filter": calibration.filter, "north": calibration.north},
+        "sensors": sensors,
+        "metadata": dict(calibration.metadata),
+    }
+    text = json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    # Quaternions on one line each; a line break inside of a text is escaped and so never matches.
+    return re.sub(r"\[\n[-+.\de,\s]+\]", lambda numbers: " ".join(numbers[0].split()), text)
+
+
+def from_json(text: str, where: str = "calibration") -> Calibration:
+    """The calibration of a JSON text, every value checked; `where` names the text in messages.
+
+    Raises:
+        EdgeposeError: not a calibration of this version, or a sensor or value is missing or impossible.
+    """
+
+    def fail(what: str) -> EdgeposeError:
+        return EdgeposeError(f"{where}: {what}")
+
+    try:
+        document = json.loads(text, object_pairs_hook=_no_duplicates, parse_constant=_no_constant)
+    except (ValueError, RecursionError) as error:
+        raise fail(
+            f"not valid JSON ({str(error).splitlines()[0]}); make it anew with `edgepose calibrate`"
+        ) from None
+    if not isinstance(document, dict) or document.get("format") != _FORMAT:
+        raise fail("not an edgepose calibration; make one with `edgepose calibrate`")
+    if document.get("version") != _VERSION or isinstance(document.get("version"), bool):
+        raise fail(
+            f"format version {document.get('version')!r}; this program reads {_VERSION}, calibrate anew"
+        )
+    sensors = _member(document, "sensors", dict, fail)
+    if missing := [name for name in PLACEMENTS if name not in sensors]:
+        raise fail(f"no sensor {', '.join(missing)}; calibrate anew with all six")
+    if unknown := [name for name in sensors if name not in PLACEMENTS]:
+        raise fail(f"unknown sensor {', '.join(map(repr, unknown))}; the sensors are {', '.join(PLACEMENTS)}")
+    if bare := [name for name in PLACEMENTS if not isinstance(sensors[name], dict)]:
+        raise fail(f"sensor {', '.join(bare)} is not an object")
+    pose = _member(document, "pose", str, fail)
+    if pose not in POSES:
+        raise fail(f"pose {pose!r} is none of: {', '.join(POSES)}")
+    try:
+        body_frame = check_body_frame(_member(document, "body_frame", str, fail))
+    except EdgeposeError as error:
+        raise fail(str(error).removeprefix(f"{where}: ")) from None
+    # Files of versions without filters say nothing about them.
+    made = _member({"orientation": {"filter": "none", "north": True}} | document, "orientation", dict, fail)
+    if made.get("filter") not in FILTERS or not isinstance(made.get("north"), bool):
+        raise fail(f"'orientation' must say filter ({', '.join(FILTERS)}) and north (true or false)")
+    own = {name: _numbers_of(name, sensors[name], fail) for name in PLACEMENTS}
+    return Calibration(
+        body_from_inertial=_unit_quaternion(document, "body_from_inertial", "", fail),
+        heading_offset=np.radians([own[name][0] for name in PLACEMENTS]),
+        bone_from_sensor=np.stack([own[name][1] for name in PLACEMENTS]),
+        residual_deg=np.array([own[name][2] for name in PLACEMENTS]),
+        pose=pose,
+        body_frame=body_frame,
+        created=_member(document, "created", str, fail),
+        metadata=_member(document, "metadata", dict, fail),
+        filter=made["filter"],
+        north=made["north"],
+    )
+
+
+def save(calibration: Calibration, path: str | Path, overwrite: bool = True) -> None:
+    """Writes the calibration as JSON; the file is whole or as it was before.
+
+    Raises:
+        EdgeposeError: it cannot be written, or is there already and not to be overwritten.
+    """
+    write_whole(path, to_json(calibration), "the calibration", overwrite)
+
+
+def load_calibration(path: str | Path) -> Calibration:
+    """The calibration in a JSON file; see `from_json` for errors, which name the file."""
+    try:
+        text = read_text(Path(path))
+    except OSError as error:
+        raise EdgeposeError(f"{path}: cannot read the calibration ({error.strerror or error})") from error
+    except UnicodeDecodeError as error:
+        raise EdgeposeError(
+            f"{path}: not valid JSON (not UTF-8 text); make it anew with `edgepose calibrate`"
+        ) from error
+    return from_json(text, str(path))
+
+
+_Fail = Callable[[str], EdgeposeError]
+
+
+def _no_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result = dict(pairs)
+    if len(result) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"{next(n for n in names if names.count(n) > 1)!r} appears twice")
+    return result
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"{name} is not a number")
+
+
+def _member(owner: dict[str, Any], key: str, kind: type, fail: _Fail) -> Any:
+    if not isinstance(owner.get(key), kind):
+        raise fail(f"{key!r} is missing or not {'text' if kind is str else 'an object'}")
+    return owner[key]
+
+
+def _number(value: object) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    # An integer with hundreds of digits and 1e999 are valid JSON.
+    return float(value) if abs(value) < 1e9 else None
+
+
+def _unit_quaternion(owner: dict[str, Any], key: str, of: str, fail: _Fail) -> Array:
+    values = owner.get(key)
+    numbers = [_number(v) for v in values] if isinstance(values, list) else []
+    quat = np.array([math.nan if n is None else n for n in numbers])
+    if len(quat) != 4 or not abs(np.linalg.norm(quat) - 1.0) < 1e-3:
+        raise fail(f"{of}{key!r} is not a unit quaternion w, x, y, z")
+    return quat / np.linalg.norm(quat)
+
+
+def _numbers_of(name: str, sensor: dict[str, Any], fail: _Fail) -> tuple[float, Array, float]:
+    """Heading offset (deg), R_BS (4,) and residual (deg) of one sensor's entry."""
+    offset, residual = _number(sensor.get("heading_offset_deg")), _number(sensor.get("residual_deg"))
+    if offset is None:
+        raise fail(f"sensor {name}: 'heading_offset_deg' is not a number")
+    if residual is None or residual < 0:
+        raise fail(f"sensor {name}: 'residual_deg' is not a number from 0 up")
+    return offset, _unit_quaternion(sensor, "bone_from_sensor", f"sensor {name}: ", fail), residual

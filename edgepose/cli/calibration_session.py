@@ -1,0 +1,183 @@
+"""The hold and the heading reset of a calibration, from a live source or from a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import chain
+from pathlib import Path
+from typing import NamedTuple
+
+from edgepose import calibration
+from edgepose.calibration import HeadingReset, Hold, HoldSummary
+from edgepose.cli.options.source import Orientations, SourceFlags
+from edgepose.cli.prompts import Guide, all_reporting, held, moved, wait_for_enter
+from edgepose.errors import EdgeposeError
+from edgepose.formats.recordings.csv_npz import read_recording, samples
+from edgepose.sources import Device
+from edgepose.sources.replay import is_recording
+
+ROUTINE_S = 30.0
+"""Longest motion that is taken from a recording unless --motion says from where to where."""
+
+
+def finds_forward(heading_reset: str | None) -> bool:
+    """Whether that way of heading reset also finds out where the wearer faces."""
+    return heading_reset is not None and heading_reset.partition(":")[0] in ("motion", "mounting")
+
+
+class Plan(NamedTuple):
+    """What the wearer will do: the command's flags, and how the sensors sit if the heading reset needs it."""
+
+    pose: str
+    heading_reset: str | None
+    mounting: list[str]
+    motion: tuple[float, float] | None
+    hold_s: float
+    from_s: float | None
+    countdown_s: float
+
+    @property
+    def lying(self) -> Path | None:
+        """The recording of sensors that lie side by side."""
+        way = self.heading_reset
+        return None if way is None or way == "live" or finds_forward(way) else Path(way)
+
+
+class Measured(NamedTuple):
+    """What a calibration is made of.
+
+    Attributes:
+        summary: the hold.
+        reset: the heading reset, if there is one.
+        from_s: when the hold begins in a recording, seconds.
+        devices: what sent the samples, by placement.
+    """
+
+    summary: HoldSummary
+    reset: HeadingReset | None
+    from_s: float | None
+    devices: Mapping[int, Device]
+
+
+def live(source: SourceFlags, plan: Plan, orient: Orientations, say: Guide) -> Measured:
+    """The hold and the heading reset of a wearer in front of a live source."""
+    reset = _side_by_side(source, plan, orient, say)
+    with source.open() as opened:
+        batches = all_reporting(((now_s, orient(came)) for now_s, came in opened), say)
+        if plan.heading_reset == "live":
+            reset = held(batches, "lying", plan.countdown_s, plan.hold_s, say, calibration.heading_offsets)
+            wait_for_enter(batches, say)
+        summary = held(batches, plan.pose, plan.countdown_s, plan.hold_s, say, calibration.check_hold)
+        # Not before: magnetometers may be slower than the rest.
+        _check_north(orient, plan)
+        if plan.heading_reset == "motion":
+            upright = summary.orientation
+            reset = moved(batches, say, lambda moving: calibration.headings_from_motion(moving, upright))
+    return Measured(summary, reset or _mounted(plan, summary), None, opened.devices)
+
+
+def recorded(source: SourceFlags, plan: Plan, orient: Orientations, say: Guide) -> Measured:
+    """The hold and the heading reset in a recording."""
+    reset = _side_by_side(source, plan, orient, say)
+    everything, damage, devices = _read(source, orient)
+    _check_north(orient, plan)
+    still, start_s = _window(source.name, (everything, damage), plan.from_s, plan.hold_s, say)
+    if plan.from_s is None:
+        say("If the wearer stood in the pose at another time, say so with --from.")
+    summary = calibration.check_hold(still, "choose a still part with --from, or record again")
+    if plan.heading_reset == "motion":
+        end_s = start_s + plan.hold_s
+        moving = calibration.cut(everything, *(plan.motion or (end_s, end_s + ROUTINE_S)))
+        if not all(len(sensor.time_s) for sensor in moving):
+            raise EdgeposeError(
+                f"{source.name}: not all six sensors report where the movements should be; say where "
+                "with --motion FROM:TO, or use another --heading-reset"
+            )
+        reset = calibration.headings_from_motion(moving, summary.orientation)
+    return Measured(summary, reset or _mounted(plan, summary), start_s, devices)
+
+
+def _side_by_side(source: SourceFlags, plan: Plan, orient: Orientations, say: Guide) -> HeadingReset | None:
+    """Heading reset from a recording of the sensors lying side by side, if there is one.
+
+    Raises:
+        EdgeposeError: they do not lie so, or their headings mean nothing in another recording.
+    """
+    if plan.lying is None:
+        return None
+    say(f"Heading reset from {plan.lying}.")
+    own = orient.anew()
+    everything, damage, _ = _read(source._replace(file=plan.lying, port=None, can=None), own)
+    if not own.north:
+        raise EdgeposeError(
+            "the filter's headings begin anew in each recording, so another one cannot reset them: "
+            "use --heading-reset motion, live or mounting"
+        )
+    return calibration.heading_offsets(
+        _window(str(plan.lying), (everything, damage), None, plan.hold_s, say)[0]
+    )
+
+
+def _mounted(plan: Plan, summary: HoldSummary) -> HeadingReset | None:
+    """Heading reset from how the sensors sit, if that is wanted."""
+    way, _, axis = (plan.heading_reset or "").partition(":")
+    if way != "mounting":
+        return None
+    if plan.mounting:
+        return calibration.headings_from_mounting(summary.orientation, plan.mounting)
+    return calibration.headings_from_axis(summary.orientation, axis)
+
+
+def _check_north(orient: Orientations, plan: Plan) -> None:
+    """Raises EdgeposeError if a filter has begun with any headings and nothing will bring them together."""
+    if orient.mixed:
+        raise EdgeposeError(
+            "some sensors have a magnetometer and others none: their headings would differ; add --no-mag"
+        )
+    # Sensors that lay side by side in another recording had a north there.
+    if (plan.heading_reset is None or plan.lying is not None) and not orient.north:
+        raise EdgeposeError(
+            "without a magnetometer in each sensor the filter's headings are arbitrary: "
+            "add --heading-reset motion, live or mounting"
+        )
+
+
+# --- recordings ---------------------------------------------------------------------------------------------
+
+
+def _read(source: SourceFlags, orient: Orientations) -> tuple[Hold, str | None, Mapping[int, Device]]:
+    """Everything in a recording or a raw capture, what is wrong with its end, and what sent it."""
+    path = source.file
+    assert path is not None
+    if is_recording(path):
+        recording = read_recording(path)
+        everything = (
+            calibration.hold_from_recording(recording)
+            if orient.passes
+            else calibration.hold_from_samples(orient(list(samples(recording))))
+        )
+        return everything, recording.damage, {}
+    with source._replace(realtime=False).open() as opened:
+        everything = calibration.hold_from_samples(chain.from_iterable(orient(came) for _, came in opened))
+        return everything, opened.damage, opened.devices
+
+
+def _window(
+    name: str, read: tuple[Hold, str | None], from_s: float | None, seconds: float, say: Guide
+) -> tuple[Hold, float]:
+    """The part of a recording that is a hold, and its start on the recording's clock, seconds."""
+    everything, damage = read
+    if damage:
+        say(f"warning: {damage}")
+    start = calibration.stillest_start(everything, seconds) if from_s is None else from_s
+    first = min((s.time_s[0] for s in everything if len(s.time_s)), default=0.0)
+    last = max((s.time_s[-1] for s in everything if len(s.time_s)), default=0.0)
+    # The last sample comes a little before the end.
+    if from_s is not None and not first - 1e-6 <= start <= last - seconds + 0.1:
+        raise EdgeposeError(
+            f"{name}: it has no {seconds:g} s from {start:g} s; it lasts from {first:.2f} to {last:.2f} s, "
+            "choose --from and --hold within that"
+        )
+    why = "" if from_s is not None else ", the first as still as the stillest"
+    say(f"{name}: hold from {start:.2f} to {start + seconds:.2f} s{why}.")
+    return calibration.cut(everything, start, start + seconds), start

@@ -1,0 +1,193 @@
+"""`edgepose bench`: how well and how fast parts of the program do their work, on data with known truth."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from edgepose.cli.terminal.messages import say, show
+
+if TYPE_CHECKING:
+    from edgepose.benchmarks.filter_comparison import Score
+
+
+@click.group(short_help="Measure accuracy and speed.", invoke_without_command=True)
+@click.option(
+    "--model",
+    "models",
+    multiple=True,
+    help="Shipped model or an archive's path; several times for several  [default: all shipped ones]",
+)
+@click.option("--trust", is_flag=True, help="Load models although their sums are not known.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON in the place of tables.")
+@click.pass_context
+def bench(ctx: click.Context, models: tuple[str, ...], trust: bool, as_json: bool) -> None:
+    """Measure how well and how fast parts of the program do their work.
+
+    Without a command: the speed of every step from packets to poses on one core of this machine, of the
+    models in all their modes and precisions, and of torch.nn.LSTM of the same size beside them.
+
+    \b
+    Examples:
+      edgepose bench
+      edgepose bench --model my-birnn.pt --trust --json
+      edgepose bench orientation --data broad/data_mat
+    """
+    if ctx.invoked_subcommand is None:
+        _speed(models, trust, as_json)
+
+
+def _speed(models: tuple[str, ...], trust: bool, as_json: bool) -> None:
+    from edgepose.inference import archive
+
+    infos = [archive.inspect(archive.find(name)) for name in models]
+    infos = infos or [archive.inspect(path) for path in archive.shipped()]
+    if not infos:
+        raise click.UsageError("no model is shipped; name one with --model")
+
+    from tempfile import TemporaryDirectory
+
+    from edgepose.benchmarks import speed
+
+    report: dict[str, Any] = {"machine": speed.machine(), "models": []}
+    for info in infos:
+        say(f"measuring {info.path.stem}")
+        start = speed.start_up(info, trust)
+        with TemporaryDirectory() as folder:
+            engine = speed.load_engine(info, trust, "auto")
+            steps = speed.step_costs(engine, Path(folder))
+        walks = {
+            name: speed.whole_walk(speed.load_engine(info, trust, "auto"), paced)._asdict()
+            for name, paced in (("full_speed", False), ("paced", True))
+        }
+        ways = [row._asdict() for row in speed.model_speeds(info, trust)]
+        report["models"].append(
+            {"name": info.path.stem, "start": start._asdict(), "steps_us": steps, **walks, "ways": ways}
+        )
+    show(json.dumps(report, indent=1) if as_json else _speed_tables(report, speed.BUDGET_US))
+
+
+def _speed_tables(report: dict[str, Any], budget_us: float) -> str:
+    """Markdown, to read and to put on a page."""
+    about = report["machine"]
+    lines = [f"{about['processor']}, one core; Python {about['python']}, torch {about['torch']}"]
+    models = report["models"]
+    names = [model["name"] for model in models]
+    lines += ["", *_head(["us a frame", *names])]
+    for step in models[0]["steps_us"]:
+        lines.append(_row([step, *(f"{model['steps_us'][step]:.0f}" for model in models)]))
+    lines += ["", *_head(["packets to UDP, all steps", "frames a second", "p50 ms", "p99 ms", "max ms"])]
+    for model in models:
+        for key, words in (("full_speed", "at full speed"), ("paced", "at 60 Hz")):
+            walk = model[key]
+            times = (f"{walk[name]:.2f}" for name in ("p50_ms", "p99_ms", "max_ms"))
+            lines.append(_row([f"{model['name']}, {words}", f"{walk['per_s']:.0f}", *times]))
+    heads = ["model", "way", "weights", "us", "p50", "p99", "max", "frames a second", "of 1/60 s", "times"]
+    lines += ["", *_head(heads)]
+    for way in (way for model in models for way in model["ways"]):
+        name = "torch.nn.LSTM, defaults" if way["mode"] == "reference" else way["mode"]
+        times = (f"{way[key]:.0f}" for key in ("us", "p50_us", "p99_us", "max_us"))
+        share = f"{100 * way['us'] / budget_us:.1f} %"
+        speed = f"{1e6 / way['us']:.0f}"
+        lines.append(
+            _row([way["model"], name, way["precision"], *times, speed, share, f"{way['times']:.1f}"])
+        )
+    lines += ["", *_head(["a fresh process", "imports s", "model s", "memory MB"])]
+    for model in models:
+        start = model["start"]
+        memory = "-" if start["memory_mb"] is None else f"{start['memory_mb']:.0f}"
+        lines.append(_row([model["name"], f"{start['imports_s']:.2f}", f"{start['load_s']:.2f}", memory]))
+    return "\n".join(lines)
+
+
+def _row(cells: list[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _head(cells: list[str]) -> list[str]:
+    return [_row(cells), "|" + "---|" * len(cells)]
+
+
+@bench.command(short_help="Orientation filters on BROAD.")
+@click.option(
+    "--data",
+    required=True,
+    type=click.Path(path_type=Path),
+    help="Folder of trials: data_mat of the BROAD download, or .npz files with the same arrays.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print JSON in the place of tables.")
+def orientation(data: Path, as_json: bool) -> None:
+    """Compare orientation filters on BROAD: ours, and of vqf, imufusion and ahrs what is installed.
+
+    Errors are means over trials of root mean squares over their movement, in degrees; the time is that of one
+    core for each sample.
+
+    \b
+    Example:
+      edgepose bench orientation --data broad/data_mat
+    """
+    from edgepose.benchmarks.broad import find_trials, read_trial
+    from edgepose.benchmarks.filter_comparison import compare, cost_us
+
+    files = find_trials(data)
+    scores = [score for of_trial in _with_progress(compare(files), len(files)) for score in of_trial]
+    cost = cost_us(read_trial(files[0]))
+    if as_json:
+        rows = [score._asdict() for score in scores]
+        show(json.dumps({"scores": rows, "us_a_sample_at_286_hz": cost}, indent=1))
+        return
+    show(f"{len(files)} trials; RMSE over movement in deg, mean over trials; us a sample on one core\n")
+    show("with magnetometer")
+    show(_table(scores, magnetometer=True))
+    show("\nwithout; heading set to the truth's in the first second of motion")
+    show(_table(scores, magnetometer=False))
+    show(f"\nedgepose, online, at 286 Hz: {cost:.1f} us a sample of a sensor on one core")
+
+
+def _with_progress(trials: Iterable[list[Score]], count: int) -> Iterator[list[Score]]:
+    """The scores, with a bar on a terminal and a line for each trial elsewhere."""
+    if sys.stderr.isatty():
+        with click.progressbar(
+            trials, length=count, label="Filtering", file=sys.stderr, show_pos=True
+        ) as bar:
+            yield from bar
+        return
+    for number, scores in enumerate(trials, start=1):
+        yield scores
+        say(f"{number} of {count}  {scores[0].trial}")
+
+
+def _table(scores: list[Score], magnetometer: bool) -> str:
+    """A line for each filter."""
+    rows = [("filter", "", "total", "heading", "inclination", "undisturbed", "disturbed", "us")]
+    for name in dict.fromkeys(score.filter for score in scores):
+        own = [score for score in scores if score.filter == name and score.magnetometer == magnetometer]
+        rows.append(
+            (
+                name,
+                "offline" if own[0].offline else "online",
+                _mean([score.total for score in own]),
+                _mean([score.heading for score in own]),
+                _mean([score.inclination for score in own]),
+                _mean([score.total for score in own if not score.disturbed]),
+                _mean([score.total for score in own if score.disturbed]),
+                f"{sum(score.us for score in own) / len(own):.1f}",
+            )
+        )
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join(
+        "  ".join(
+            cell.ljust(width) if place < 2 else cell.rjust(width)
+            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in rows
+    )
+
+
+def _mean(values: list[float]) -> str:
+    return f"{sum(values) / len(values):.2f}" if values else "-"

@@ -1,0 +1,290 @@
+"""`edgepose check`: how each sensor of a rig does, live, and what to do about it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import math
+import shutil
+import textwrap
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import click
+
+from edgepose.cli.options.source import SourceFlags, source_options
+from edgepose.cli.terminal.live_page import Page, is_coloured, is_terminal
+from edgepose.cli.terminal.messages import printable, say, show
+from edgepose.cli.terminal.stop_signal import Stop
+from edgepose.errors import EdgeposeError
+
+if TYPE_CHECKING:
+    from edgepose.diagnostics.rules import Finding
+    from edgepose.diagnostics.sensor_health import Health, SensorHealth
+    from edgepose.sources import Counters, Source
+
+_log = logging.getLogger(__name__)
+
+REDRAW_S, LISTEN_S = 0.25, 1.5
+DEFAULT_S = 10.0
+
+
+class State(NamedTuple):
+    """What there is to say at a time.
+
+    Attributes:
+        seconds: since the beginning, on the source's clock.
+        counters: of the source.
+        sensors: health of each sensor, and what to say about it.
+    """
+
+    seconds: float
+    counters: Counters
+    sensors: list[tuple[SensorHealth, Finding]]
+
+    @property
+    def problems(self) -> int:
+        """Number of sensors with which something is wrong."""
+        return sum(finding.problem for _, finding in self.sensors)
+
+
+@click.command(short_help="Find out what is wrong with a rig.")
+@source_options
+@click.option(
+    "--seconds",
+    type=click.FloatRange(0, min_open=True),
+    help=f"How long to listen.  [default: until Ctrl-C on a terminal, {DEFAULT_S:g} elsewhere; to the end of "
+    "--file]",
+)
+@click.option(
+    "--calibration",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Calibration of the wearer, who stands in its pose: headings and places are compared with it.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Write the result as JSON.")
+@click.pass_context
+def check(
+    ctx: click.Context, source: SourceFlags, seconds: float | None, calibration: Path | None, as_json: bool
+) -> None:
+    """Show how each sensor does, and what to do where something is wrong: docs/check.md has the words.
+
+    The rig may lie on a table or be worn. Hold it still for some seconds: gravity, noise and bias are only
+    seen at rest. Turn it to and fro: only then gyroscope and orientation can be compared.
+
+    The exit code is 0 if all six sensors are fine, and 1 if something is wrong with one.
+
+    \b
+    Examples:
+      edgepose check --port /dev/ttyUSB0
+      edgepose check --can socketcan:can0 --seconds 20 --json
+      edgepose check --port /dev/ttyUSB0 --calibration calib.json
+      edgepose check --file walk.npz
+    """
+    from edgepose.calibration import load_calibration
+    from edgepose.diagnostics.sensor_health import Health
+    from edgepose.pipeline.rig_comparison import other_devices
+    from edgepose.sources import open_source
+
+    fitting = None if calibration is None else load_calibration(calibration)
+    health = Health(fitting)
+    if seconds is None:
+        seconds = DEFAULT_S if source.live and not is_terminal() else math.inf
+    with ExitStack() as stack:
+        page = stack.enter_context(Page()) if is_terminal() and source.live and not as_json else None
+        warnings = stack.enter_context(_warnings(hidden=page is not None))
+        opened = stack.enter_context(open_source(**source._asdict(), lenient=True))
+        stop = stack.enter_context(Stop())
+
+        def watch(now: Callable[[], State]) -> None:
+            if page is not None:
+                width = shutil.get_terminal_size().columns
+                title = printable(f"edgepose check  {source.name}; Ctrl-C ends")
+                state = now()
+                table = ["listening ..."] if state.seconds < LISTEN_S else _lines(state, width)
+                page.draw([title[:width], *table, *_wrapped(warnings, width)])
+
+        state, error = _listen(opened, health, source.file is None, seconds, lambda: stop.asked, watch)
+        if fitting is not None and (other := other_devices(fitting, opened.devices)) is not None:
+            _log.warning("%s", other.removeprefix("warning: "))
+    if page is not None:
+        for warning in warnings:
+            say(f"warning: {warning}")
+    if opened.damage:
+        say(f"warning: {opened.damage}")
+        warnings.append(opened.damage)
+    if as_json:
+        show(_json(source.name, state, warnings))
+    else:
+        # With styles; what is in it is clean.
+        click.echo("\n".join(_lines(state, shutil.get_terminal_size().columns if is_terminal() else None)))
+    if error is not None:
+        raise error
+    ctx.exit(1 if state.problems else 0)
+
+
+def _listen(
+    source: Source,
+    health: Health,
+    live: bool,
+    seconds: float,
+    stopped: Callable[[], bool],
+    watch: Callable[[Callable[[], State]], None],
+) -> tuple[State, EdgeposeError | None]:
+    """The state at the end, and the error that was it; `watch` is called a few times a second."""
+    from edgepose.diagnostics.rules import judge
+
+    start_s: float | None = None
+    now_s = shown_s = 0.0
+
+    def state() -> State:
+        sensors = [(sensor, judge(sensor)) for sensor in health.report(now_s, source.clocks)]
+        return State(0.0 if start_s is None else now_s - start_s, source.counters, sensors)
+
+    try:
+        for now_s, samples in source:
+            start_s = now_s if start_s is None else start_s
+            health.add(samples, now_s if live else math.nan)
+            if time.monotonic() - shown_s >= REDRAW_S:
+                watch(state)
+                shown_s = time.monotonic()
+            if now_s - start_s >= seconds or stopped():
+                break
+    except EdgeposeError as error:
+        return state(), error
+    return state(), None
+
+
+@contextmanager
+def _warnings(hidden: bool) -> Iterator[list[str]]:
+    """What the program warns of meanwhile; hidden, it is not written elsewhere."""
+    result: list[str] = []
+    handler = logging.Handler()
+    handler.emit = lambda record: result.append(printable(record.getMessage()))  # type: ignore[method-assign]
+    logger = logging.getLogger("edgepose")
+    logger.addHandler(handler)
+    logger.propagate = not hidden
+    try:
+        yield result
+    finally:
+        logger.removeHandler(handler)
+        logger.propagate = True
+
+
+# --- the table ----------------------------------------------------------------------------------------------
+
+
+class _Column(NamedTuple):
+    """A column: its head, the unit of its numbers, the text of a cell, and how soon it may be left out."""
+
+    head: str
+    unit: str
+    text: Callable[[SensorHealth], str]
+    rank: int
+
+
+def _number(field: str, decimals: int, sign: str = "") -> Callable[[SensorHealth], str]:
+    def text(sensor: SensorHealth) -> str:
+        value = getattr(sensor, field)
+        return "-" if math.isnan(value) else f"{value:{sign}.{decimals}f}"
+
+    return text
+
+
+_COLUMNS = (
+    _Column("rate", "Hz", _number("rate_hz", 1), 0),
+    _Column("jitter", "ms", _number("jitter_ms", 1), 9),
+    _Column("lost", "%", _number("lost_percent", 1), 1),
+    _Column("late", "ms", _number("late_ms", 0), 7),
+    _Column("age", "s", _number("age_s", 1), 6),
+    _Column("clock", "ppm", _number("clock_ppm", 0, "+"), 5),
+    _Column("norm", "m/s²", _number("norm_m_s2", 2), 2),
+    _Column("gravity", "m/s²", _number("gravity_error_m_s2", 2), 10),
+    _Column("tilt", "deg", _number("tilt_deg", 1), 1),
+    _Column("noise", "m/s²", _number("acc_noise_m_s2", 2), 8),
+    _Column("noise", "deg/s", _number("gyr_noise_deg_s", 1), 4),
+    _Column("bias", "deg/s", _number("bias_deg_s", 1), 3),
+    _Column("field", "uT", _number("field_ut", 1), 11),
+    _Column("heading", "deg", _number("heading_deg", 0, "+"), 3),
+)
+
+
+def _lines(state: State, width: int | None) -> list[str]:
+    """Headline, a row for each sensor, and advice; in columns that fit into the width, None for any."""
+    fine = len(state.sensors) - state.problems
+    counters = state.counters
+    headline = (
+        f"{state.seconds:.0f} s: {fine} of {len(state.sensors)} sensors fine; packets "
+        f"{counters.packets} good, {counters.lost} lost, {counters.bad} bad, {counters.unknown} unknown"
+    )
+    advice = [f"{sensor.placement}: {finding.advice}" for sensor, finding in state.sensors if finding.advice]
+    return [headline[:width], "", *_rows(state, width), *([""] if advice else []), *_wrapped(advice, width)]
+
+
+def _rows(state: State, width: int | None) -> list[str]:
+    names = [["", "sensor", *(sensor.placement for sensor, _ in state.sensors)]]
+    columns = [
+        (column.rank, [column.head, column.unit, *(column.text(sensor) for sensor, _ in state.sensors)])
+        for column in _COLUMNS
+    ]
+    findings = ["", "finding", *(finding.name for _, finding in state.sensors)]
+    # What nobody measures says nothing, and on a narrow screen less is enough.
+    columns = [(rank, cells) for rank, cells in columns if any(cell != "-" for cell in cells[2:])]
+    while columns and width is not None and _width([*names, *(c for _, c in columns), findings]) > width:
+        columns.remove(max(columns))
+    padded = [[cell.ljust(max(map(len, cells))) for cell in cells] for cells in names]
+    padded += [[cell.rjust(max(map(len, cells))) for cell in cells] for _, cells in columns]
+    rows = ["  ".join(cells) + "  " for cells in zip(*padded, strict=True)]
+    colours = [None, None, *(_colour(finding) for _, finding in state.sensors)]
+    return [
+        (row + (click.style(finding, fg=colour) if colour and is_coloured() else finding)).rstrip()
+        for row, finding, colour in zip(rows, findings, colours, strict=True)
+    ]
+
+
+def _width(columns: list[list[str]]) -> int:
+    return sum(max(map(len, cells)) + 2 for cells in columns) - 2
+
+
+def _colour(finding: Finding) -> str:
+    if finding.problem:
+        return "red"
+    return "yellow" if finding.advice else "green"
+
+
+def _wrapped(lines: list[str], width: int | None) -> list[str]:
+    if width is None:
+        return lines
+    return [piece for line in lines for piece in textwrap.wrap(line, max(width, 20), subsequent_indent="  ")]
+
+
+def _json(name: str, state: State, warnings: list[str]) -> str:
+    document = {
+        "source": name,
+        "seconds": round(state.seconds, 3),
+        **state.counters._asdict(),
+        "warnings": warnings,
+        "problems": state.problems,
+        "sensors": [
+            {
+                "placement": sensor.placement,
+                "finding": finding.name,
+                "problem": finding.problem,
+                "advice": finding.advice,
+                **_known(sensor),
+            }
+            for sensor, finding in state.sensors
+        ],
+    }
+    return json.dumps(document, indent=2, allow_nan=False)
+
+
+def _known(sensor: SensorHealth) -> dict[str, Any]:
+    """The fields of a sensor's health, null where a number is not known."""
+    return {
+        key: (float(f"{value:.6g}") if math.isfinite(value) else None) if isinstance(value, float) else value
+        for key, value in dataclasses.asdict(sensor).items()
+    }

@@ -1,0 +1,152 @@
+"""`edgepose convert`: recordings and poses of any kind to CSV, NPZ or BVH, many at once."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from edgepose.cli.options.outputs import overwrite_option
+from edgepose.cli.options.source import protocol_option, sensors_option
+from edgepose.cli.terminal.messages import printable, say, show
+from edgepose.errors import EdgeposeError
+from edgepose.utils.output_targets import check_free
+
+if TYPE_CHECKING:
+    from edgepose.convert import Result
+
+
+@click.command(short_help="Convert recordings, captures and poses.")
+@click.argument(
+    "inputs", nargs=-1, required=True, metavar="IN...", type=click.Path(path_type=Path, allow_dash=True)
+)
+@click.option(
+    "--to",
+    required=True,
+    type=click.Choice(["csv", "npz", "bvh"]),
+    help="Kind of file to write; bvh is for poses only.",
+)
+@click.option(
+    "--out",
+    required=True,
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Folder to write to; made if it is not there.",
+)
+@click.option(
+    "--filter",
+    type=click.Choice(["none", "kalman", "smoother", "vqf"]),
+    default="none",
+    show_default=True,
+    help="Make orientations of gyroscope, accelerometer and, where there is one, magnetometer; smoother uses "
+    "what comes later, too. none: leave the devices' own.",
+)
+@click.option(
+    "--height",
+    type=float,
+    default=1.75,
+    show_default=True,
+    help="The wearer's stature, for the bones of BVH files, metres.",
+)
+@protocol_option
+@sensors_option
+@click.option(
+    "--jobs",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="Recordings converted at a time, each by a process of its own.",
+)
+@click.option("--skip-existing", is_flag=True, help="Leave out recordings whose output is there already.")
+@overwrite_option
+def convert(
+    inputs: tuple[Path, ...],
+    to: str,
+    out: Path,
+    filter: str,
+    height: float,
+    protocol: str,
+    sensors: Path | None,
+    jobs: int,
+    skip_existing: bool,
+    overwrite: bool,
+) -> None:
+    """Convert recordings: CSV, NPZ, raw captures of a port, logs of a CAN bus, sessions of x-io's
+    software and of Xsens' MT Manager, MVNX of Xsens' MVN, TotalCapture's .sensors and DIP-IMU's .pkl.
+
+    IN are files, patterns and folders. A folder stands for the recordings in it, at any depth; one that holds
+    a folder for each x-io sensor is one recording, whose sensors' folders have placements in their names (or,
+    with --sensors, their serial numbers as ids: id = 0x64F61CB3). Of a damaged recording what is good is
+    written, of poses in CSV or BVH those before the first bad one, and the exit code is 1.
+
+    Files of poses, CSV and BVH as `run` writes them or NPZ with the keys of AMASS, become CSV, NPZ or BVH; of
+    a recording that holds true poses, as DIP-IMU's do, --to bvh takes these. - is CSV on standard input.
+
+    \b
+    Examples:
+      edgepose convert walk.npz --to csv --out .
+      edgepose convert sessions/ "more/*.bin" --to npz --out recordings --jobs 4
+      edgepose convert walk.part.csv --to npz --out saved
+      edgepose convert raw.csv --to npz --out oriented --filter smoother
+      edgepose convert poses/ --to bvh --out for-blender --jobs 2 --height 1.68
+      edgepose run --file walk.npz ... --csv - | edgepose convert - --to bvh --out .
+    """
+    from edgepose.convert import Options, Result, convert_all, plan
+    from edgepose.skeleton import default_body
+    from edgepose.sources.sensor_map import read_map
+
+    if skip_existing and overwrite:
+        raise click.UsageError("--skip-existing leaves alone what --overwrite replaces: give one of them")
+    # A mistake in one of these is told once.
+    default_body(height)
+    if sensors is not None:
+        read_map(sensors)
+    planned = plan(inputs, to, out)
+    done = {job: Result(job, skipped=True) for job in planned if skip_existing and job.target.exists()}
+    todo = [job for job in planned if job not in done]
+    if not overwrite:
+        check_free((job.target for job in todo), "give --skip-existing, --overwrite or another --out")
+    try:
+        options = Options(protocol, sensors, filter, height)
+        for result in _with_progress(convert_all(todo, options, jobs), len(todo)):
+            done[result.job] = result
+    finally:
+        show(_table([done[job] for job in planned if job in done]))
+    failed = sum(result.problem is not None for result in done.values())
+    if failed:
+        raise EdgeposeError(
+            f"{failed} of {len(planned)} recordings not or not wholly converted; see the table"
+        )
+
+
+def _with_progress(results: Iterable[Result], count: int) -> Iterator[Result]:
+    """The results, with a bar on a terminal and a line for each elsewhere."""
+    from edgepose.convert import describe
+
+    if sys.stderr.isatty():
+        with click.progressbar(length=count, label="Converting", file=sys.stderr, show_pos=True) as bar:
+            for result in results:
+                yield result
+                bar.update(1)
+        return
+    for number, result in enumerate(results, start=1):
+        yield result  # first: what is told must be in the table, whenever Ctrl-C comes
+        say(_one_line(f"{number} of {count}  {result.job.source}: {describe(result)}"))
+
+
+def _table(results: Sequence[Result]) -> str:
+    from edgepose.convert import describe
+
+    width = max([len("file"), *(len(str(result.job.source)) for result in results)])
+    lines = [f"{'file':{width}}  {'samples':>9}  {'seconds':>9}  result"]
+    for result in results:
+        counts = f"{result.samples:9d}  {result.seconds:9.1f}" if result.samples else f"{'-':>9}  {'-':>9}"
+        lines.append(_one_line(f"{result.job.source!s:{width}}  {counts}  {describe(result)}"))
+    return "\n".join(lines)
+
+
+def _one_line(text: str) -> str:
+    """Text in which names of files may have line breaks."""
+    return printable(text).replace("\n", "?").replace("\t", "?")

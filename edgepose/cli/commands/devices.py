@@ -1,0 +1,120 @@
+"""`edgepose devices`: what could be read from on this machine."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
+import click
+
+from edgepose.cli.terminal.messages import say, show
+from edgepose.errors import EdgeposeError
+
+if TYPE_CHECKING:
+    from edgepose.sources.probe import Finding
+
+
+@click.command(short_help="List serial ports and CAN interfaces.")
+@click.argument("names", nargs=-1, metavar="[PORT|INTERFACE:CHANNEL]...")
+@click.option(
+    "--probe",
+    is_flag=True,
+    help="Listen to each for some seconds, to the ports at the usual speeds, and tell protocol, sensor ids "
+    "and rates. Nothing is sent to the sensors.",
+)
+def devices(names: tuple[str, ...], probe: bool) -> None:
+    """List the serial ports and CAN interfaces of this machine, or those that are named.
+
+    \b
+    Examples:
+      edgepose devices
+      edgepose devices --probe
+      edgepose devices --probe /dev/ttyUSB0 slcan:/dev/ttyACM0
+    """
+    ports = dict.fromkeys((name for name in names if not _is_bus(name)), "") if names else _ports()
+    buses = [name for name in names if _is_bus(name)] if names else None
+    if ports or not names:
+        show("Serial ports (edgepose run --port NAME):")
+        width = max(map(len, ports), default=0)
+        for name, what in ports.items():
+            show(f"  {name.ljust(width)}  {what}".rstrip())
+            if probe:
+                show(f"    {_port_says(name)}")
+        if not ports:
+            show(
+                "  none found; plug the hub in, or check that its driver is loaded and you may read it "
+                "(group dialout)"
+            )
+    if buses is None:
+        buses = _buses()
+    if buses or not names:
+        show("CAN interfaces (edgepose run --can NAME):")
+        for name in buses:
+            show(f"  {name}")
+            if probe:
+                show(f"    {_bus_says(name)}")
+        if not buses:
+            show("  none found; adapters on a serial port are named slcan:PORT")
+
+
+def _is_bus(name: str) -> bool:
+    # Not COM3, nor anything under /dev.
+    return ":" in name and not name.startswith("/")
+
+
+def _ports() -> dict[str, str]:
+    """Ports found and what is known of them."""
+    from serial.tools import list_ports
+
+    result = {}
+    for port in sorted(list_ports.comports()):
+        what = port.description if port.description != "n/a" else ""
+        serial_number = f"serial number {port.serial_number}" if port.serial_number else ""
+        result[port.device] = "  ".join(part for part in (what, serial_number) if part)
+    return result
+
+
+def _buses() -> list[str]:
+    """CAN interfaces found."""
+    # Importing python-can costs more than the rest of this command.
+    from edgepose.sources.can_bus import can
+
+    found = can.detect_available_configs(
+        interfaces=["socketcan", "pcan", "vector", "kvaser", "ixxat", "usb2can"]
+    )
+    return [f"{config['interface']}:{config['channel']}" for config in found]
+
+
+def _port_says(name: str) -> str:
+    from edgepose.sources.probe import probe_port
+
+    _tell(name)
+    try:
+        finding, baud = probe_port(name)
+    except EdgeposeError as error:
+        return str(error)
+    return _says(finding, "bytes", f" at --baud {baud}")
+
+
+def _bus_says(name: str) -> str:
+    from edgepose.sources.probe import probe_bus
+
+    _tell(name)
+    try:
+        return _says(probe_bus(name), "frames", "")
+    except EdgeposeError as error:
+        return str(error)
+
+
+def _tell(name: str) -> None:
+    if sys.stderr.isatty():
+        say(f"listening to {name} ...")
+
+
+def _says(finding: Finding, unit: str, speed: str) -> str:
+    if finding.protocol is None:
+        if not finding.amount:
+            return "nothing comes"
+        return f"{finding.amount} {unit} came, of no known protocol; the device may be set to another speed"
+    ids = ", ".join(f"id {sensor} at {rate:.0f} Hz" for sensor, rate in finding.rates_hz.items())
+    return f"--protocol {finding.protocol}{speed}: {ids}"

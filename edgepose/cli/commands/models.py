@@ -1,0 +1,63 @@
+"""`edgepose models`: the archives that there are, and their cards."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from edgepose.cli.terminal.messages import show
+from edgepose.inference import archive
+
+
+@click.command(short_help="List model archives, show their cards.")
+@click.argument("names", nargs=-1, metavar="[NAME|PATH]...")
+@click.option(
+    "--trust", is_flag=True, help="Put the archives' SHA-256 sums on your own list, so that `run` loads them."
+)
+def models(names: tuple[str, ...], trust: bool) -> None:
+    """List the shipped model archives, or show what an archive says of itself. Nothing of an archive is run.
+
+    \b
+    Examples:
+      edgepose models
+      edgepose models birnn
+      edgepose models --trust my-model.pt
+    """
+    if trust and not names:
+        raise click.UsageError("--trust needs the PATH of an archive")
+    if not names:
+        _list()
+    for name in names:
+        path = archive.find(name)
+        _show(archive.trust(path) if trust else archive.inspect(path))
+
+
+def _list() -> None:
+    rows = [("name", "kind", "units", "frames", "size", "trained on")]
+    for path in archive.shipped():
+        about = archive.inspect(path).metadata
+        frames = (
+            f"{about['past']} past, {about['future']} future"
+            if about["kind"] == "birnn"
+            else "1, no look-ahead"
+        )
+        size = f"{path.stat().st_size / 1e6:.1f} MB"
+        rows.append(
+            (path.stem, about["kind"], str(about["hidden"]), frames, size, about["training"]["summary"])
+        )
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    for row in rows:
+        show("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+
+
+def _show(info: archive.ArchiveInfo) -> None:
+    card = info.path.with_suffix(".md")
+    if info.path.parent == archive.MODELS and card.is_file():
+        show(card.read_text(encoding="utf-8").rstrip())
+    else:
+        for key, value in info.metadata.items():
+            # JSON, so that a text from a stranger's file cannot steer the terminal.
+            show(f"{json.dumps(key)[1:-1]}: {json.dumps(value)}")
+    show(f"\nfile: {Path(info.path)}\nsha256: {info.sha256}\ntrusted: {'yes' if info.trusted else 'no'}")

@@ -1,0 +1,123 @@
+"""`edgepose record`: what arrives, to a recording."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from datetime import datetime, timezone
+from math import inf
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from edgepose import __version__
+from edgepose.cli.options.outputs import overwrite_option
+from edgepose.cli.options.source import SourceFlags, source_options
+from edgepose.cli.terminal.messages import end_status, has_terminal, say, status
+from edgepose.cli.terminal.stop_signal import Stop
+from edgepose.errors import EdgeposeError
+from edgepose.placements import PLACEMENTS
+
+if TYPE_CHECKING:
+    from edgepose.record import RecordSummary
+    from edgepose.sources import Source
+
+
+@click.command(short_help="Record what the sensors send.")
+@click.argument("out")
+@source_options
+@click.option(
+    "--seconds",
+    type=click.FloatRange(0, min_open=True),
+    help="Length of the recording from the first sample on.  [default: until Ctrl-C or the end of --file]",
+)
+@overwrite_option
+def record(source: SourceFlags, out: str, seconds: float | None, overwrite: bool) -> None:
+    """Write what arrives to OUT until Ctrl-C; at most the last second is lost when the power goes.
+
+    The ending of OUT says what is written: .csv and .npz samples; .bin the bytes of one port as they come,
+    with their times in OUT.times; .log, .asc and .blf the frames of a CAN bus. All of them are read with
+    --file. - is CSV on standard output.
+
+    \b
+    Examples:
+      edgepose record walk.csv --port /dev/ttyUSB0
+      edgepose record walk.npz --port COM3 --seconds 60
+      edgepose record walk.bin --port /dev/ttyUSB0 --baud 921600
+      edgepose record walk.blf --can socketcan:can0
+    """
+    from edgepose import record as recorder
+
+    kind = recorder.kind(out)
+    if kind == "port" and (source.port is None or "," in source.port or source.can is not None):
+        raise click.UsageError(
+            f"{out} takes the bytes of one port: give --port PORT, or name it .csv or .npz"
+        )
+    if kind == "bus" and (source.can is None or source.port is not None):
+        raise click.UsageError(f"{out} takes the frames of a CAN bus: give --can, or name it .csv or .npz")
+    raw: list[tuple[float, Any]] = []
+    with ExitStack() as stack:
+        recorder.check_free(out, overwrite)
+        opened = stack.enter_context(source.open(raw if kind != "samples" else None))
+        stop = stack.enter_context(Stop())
+        output = recorder.open_output(out, _metadata(source), overwrite)
+        say(f"recording to {out}; Ctrl-C ends it. Samples are counted in the order {', '.join(PLACEMENTS)}")
+        summary = recorder.record(
+            opened,
+            output,
+            raw,
+            inf if seconds is None else seconds,
+            _progress(opened),
+            stopped=lambda: stop.asked,
+        )
+    _report(out, summary, opened)
+    if summary.error:
+        raise summary.error
+    if opened.damage:
+        raise EdgeposeError(opened.damage)
+
+
+def _metadata(source: SourceFlags) -> dict[str, str]:
+    return {
+        "program": f"edgepose {__version__}",
+        "source": source.name,
+        "protocol": source.protocol,
+        "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "frame": "Z up",
+        "units": "s, m/s^2, rad/s, uT",
+    }
+
+
+def _progress(source: Source) -> Callable[[RecordSummary], None]:
+    """A callback that keeps one line on a terminal up to date; elsewhere it writes a line now and then."""
+    every_s = 1.0 if has_terminal() else 10.0
+    shown_s, before = time.monotonic(), 0
+
+    def show(summary: RecordSummary) -> None:
+        nonlocal shown_s, before
+        now_s = time.monotonic()
+        if now_s - shown_s >= every_s:
+            total = sum(summary.samples)
+            rate = (total - before) / (now_s - shown_s)
+            shown_s, before = now_s, total
+            status(
+                f"{summary.seconds:.0f} s, {' '.join(map(str, summary.samples))}, {rate:.0f} a second, "
+                f"{source.counters.lost} lost"
+            )
+
+    return show
+
+
+def _report(out: str, summary: RecordSummary, source: Source) -> None:
+    """Prints the counts of a finished recording."""
+    end_status()
+    total = sum(summary.samples)
+    rate = total / summary.seconds if summary.seconds else 0.0
+    counts = source.counters
+    say(f"samples  {total} in {summary.seconds:.1f} s, {rate:.0f} a second; to {out}")
+    say(f"sensors  {', '.join(f'{n} {name}' for name, n in zip(PLACEMENTS, summary.samples, strict=True))}")
+    say(f"packets  {counts.packets} good, {counts.lost} lost, {counts.bad} bad, {counts.unknown} unknown")
+    silent = [name for name, n in zip(PLACEMENTS, summary.samples, strict=True) if not n]
+    if total and silent:
+        say(f"warning: nothing came from {', '.join(silent)}; poses need all six sensors")

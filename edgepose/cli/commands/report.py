@@ -1,0 +1,53 @@
+"""`edgepose report`: one page about the poses of a file."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import click
+
+from edgepose.cli.options.outputs import overwrite_option
+from edgepose.cli.terminal.messages import show
+from edgepose.utils.output_targets import check_output
+
+
+@click.command(short_help="Make a page with angles, steps and sensors of poses.")
+@click.argument("poses", type=click.Path(path_type=Path))
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="HTML file to write.  [default: POSES with the ending .html]",
+)
+@click.option(
+    "--height",
+    type=float,
+    default=1.75,
+    show_default=True,
+    help="The wearer's stature, for the figures and for telling steps, metres.",
+)
+@overwrite_option
+def report(poses: Path, out: Path | None, height: float, overwrite: bool) -> None:
+    """Make one HTML page about the poses of a file (CSV, BVH, or NPZ with the keys of AMASS): figures, steps
+    and cadence, joint angles over time, ranges of motion, and how often each sensor was silent.
+
+    The page has everything in it. It needs `pip install 'edgepose[plot]'`.
+
+    \b
+    Examples:
+      edgepose report poses.csv
+      edgepose report walk.npz --out reports/walk.html --height 1.68
+    """
+    from edgepose.analysis.report import write_report
+    from edgepose.formats.poses.reading import read_poses
+    from edgepose.skeleton import default_body
+
+    if poses.is_dir():
+        raise click.UsageError(f"{poses} is a folder: name a file of poses")
+    path = poses.with_suffix(".html") if out is None else out
+    if os.path.realpath(path) == os.path.realpath(poses):
+        raise click.UsageError(f"--out would overwrite {poses}; name another file")
+    check_output(path, "the report", (".html", ".htm"), overwrite)
+    body = default_body(height)
+    write_report(path, read_poses(poses), body, poses.name)
+    show(f"Wrote {path}.")

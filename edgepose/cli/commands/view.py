@@ -1,0 +1,109 @@
+"""`edgepose view`: poses as a figure in the browser."""
+
+from __future__ import annotations
+
+import os
+import socket
+from contextlib import ExitStack, closing
+from typing import TYPE_CHECKING
+
+import click
+
+from edgepose.cli.terminal.messages import say
+from edgepose.cli.terminal.stop_signal import Stop
+from edgepose.errors import EdgeposeError
+from edgepose.utils.sockets import resolve
+
+if TYPE_CHECKING:
+    from edgepose.skeleton import Body
+    from edgepose.viewer.viewer import Viewer
+
+
+@click.command(short_help="Show poses as a figure in the browser.")
+@click.argument("poses", required=False, metavar="[POSES]")
+@click.option(
+    "--udp", metavar="HOST:PORT", help="Show poses that `edgepose run --udp` sends here, as they come."
+)
+@click.option(
+    "--reference", metavar="FILE", help="Poses that are drawn transparently over those of the file."
+)
+@click.option(
+    "--host",
+    default="127.0.0.1",
+    show_default=True,
+    help="Address at which browsers find the page; 0.0.0.0 lets other machines see it.",
+)
+@click.option(
+    "--port", type=click.IntRange(1, 65535), default=8080, show_default=True, help="TCP port of the page."
+)
+@click.option("--height", type=float, default=1.75, show_default=True, help="Stature of the figure, metres.")
+@click.option("--with-parent", is_flag=True, hidden=True, help="End with the program that has started this.")
+def view(
+    poses: str | None,
+    udp: str | None,
+    reference: str | None,
+    host: str,
+    port: int,
+    height: float,
+    with_parent: bool,
+) -> None:
+    """Show poses as a 3-D figure in the browser until Ctrl-C: those of a file (CSV, BVH, or NPZ with the keys
+    of AMASS) with a time line, or those that come over UDP.
+
+    The page needs `pip install 'edgepose[view]'`. Beside the figure is what each sensor does: how many new
+    values a second, the longest gap, whether its last values are being repeated.
+
+    \b
+    Examples:
+      edgepose view poses.csv
+      edgepose view poses.csv --reference truth.npz
+      edgepose view --udp 127.0.0.1:9000
+      edgepose view --udp 0.0.0.0:9000 --host 0.0.0.0
+    """
+    if (poses is None) == (udp is None):
+        raise click.UsageError("give POSES, a file, or --udp HOST:PORT")
+    if reference is not None and poses is None:
+        raise click.UsageError("--reference needs POSES, a file")
+
+    from edgepose.formats.poses.reading import read_poses
+    from edgepose.skeleton import default_body
+
+    body = default_body(height)
+    parent = os.getppid()
+    with ExitStack() as stack:
+        stop = stack.enter_context(Stop())
+        if udp is not None:
+            receiver = stack.enter_context(_listen(udp))
+            viewer = stack.enter_context(closing(_open(host, port, body)))
+            viewer.follow(receiver, lambda: stop.asked or (with_parent and os.getppid() != parent))
+        else:
+            shown = read_poses(str(poses))
+            beside = None if reference is None else read_poses(reference)
+            viewer = stack.enter_context(closing(_open(host, port, body)))
+            viewer.play(shown, beside, lambda: stop.asked)
+
+
+def _open(host: str, port: int, body: Body) -> Viewer:
+    from edgepose.viewer.viewer import Viewer
+
+    viewer = Viewer(host, port, body)
+    name = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
+    say(f"open http://{name}:{port} in a browser; Ctrl-C ends the view")
+    return viewer
+
+
+def _listen(udp: str) -> socket.socket:
+    from edgepose.sinks.udp import parse_address
+
+    host, port = parse_address(udp)
+    try:
+        family, address = resolve(host, port, socket.SOCK_DGRAM)
+        receiver = socket.socket(family, socket.SOCK_DGRAM)
+    except (OSError, UnicodeError) as error:
+        raise EdgeposeError(f"cannot listen for poses at {udp}: {error}") from error
+    try:
+        receiver.bind(address)
+    except OSError as error:
+        receiver.close()
+        raise EdgeposeError(f"cannot listen for poses at {udp}: {error.strerror or error}") from error
+    return receiver

@@ -1,0 +1,1 @@
+"""The terminal: messages, keys, the live page, signals."""

@@ -1,0 +1,1 @@
+"""What is wrong with a sensor, from its samples."""

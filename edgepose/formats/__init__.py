@@ -1,0 +1,1 @@
+"""File formats of motion capture and of recordings."""

@@ -1,0 +1,36 @@
+"""Columns of poses as comma-separated values, described in docs/outputs.md."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numpy.typing import NDArray
+
+from edgepose.rotations import matrix_to_euler_zxy, matrix_to_quat, matrix_to_rotvec
+from edgepose.skeleton import JOINTS
+
+FORMS = {
+    "axis-angle": ("x", "y", "z"),
+    "quat": ("w", "x", "y", "z"),
+    "matrix": ("r00", "r01", "r02", "r10", "r11", "r12", "r20", "r21", "r22"),
+    "euler": ("rz", "rx", "ry"),
+}
+"""Column endings of each representation; euler: R = Rz Rx Ry, turns about the axes as they have moved."""
+
+
+def pose_columns(rotations: str, std: bool, translation: bool = False) -> list[str]:
+    """Names of all columns, in order; `rotations` is a key of `FORMS`."""
+    names = ["frame", "time_s", "status"] + [f"{joint}_{end}" for joint in JOINTS for end in FORMS[rotations]]
+    names += [f"{joint}_std" for joint in JOINTS] if std else []
+    return names + [f"trans_{axis}" for axis in "xyz"] if translation else names
+
+
+def numbers(rotations: str, matrices: NDArray[Any]) -> NDArray[Any]:
+    """Rotation matrices (24, 3, 3) in the representation `rotations`, (24, n)."""
+    if rotations == "axis-angle":
+        return matrix_to_rotvec(matrices)
+    if rotations == "quat":
+        return matrix_to_quat(matrices)
+    if rotations == "euler":
+        return matrix_to_euler_zxy(matrices)
+    return matrices

@@ -1,0 +1,1 @@
+"""Recordings of sensors: one module for each format."""

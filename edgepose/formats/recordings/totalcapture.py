@@ -1,0 +1,165 @@
+"""TotalCapture's files of Xsens sensors (cvssp.org/data/totalcapture).
+
+`NAME_Xsens_AuxFields.sensors`: the number of sensors and of frames, then for each frame its number from 1 and
+a line a sensor: name, quaternion w x y z to the inertial frame, acceleration with gravity in the sensor's
+frame, and more; 60 Hz.
+"""
+
+from __future__ import annotations
+
+from array import array
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgepose import rotations as rot
+from edgepose.calibration import GRAVITY
+from edgepose.calibration.checks import tilt_deg
+from edgepose.errors import EdgeposeError
+from edgepose.formats.recordings.csv_npz import Recording, SensorData
+from edgepose.placements import PLACEMENTS
+
+Array = NDArray[np.float64]
+
+NAMES = ("L_LowArm", "R_LowArm", "L_LowLeg", "R_LowLeg", "Head", "Pelvis")
+"""TotalCapture's names of the six placements, in their order."""
+
+RATE = 60.0
+"""Frames a second."""
+
+MAX_FRAMES = 1_000_000
+_NUMBERS = 7  # of each line: quaternion and acceleration; AuxFields has more behind them
+_AT_REST = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY)
+_LONGEST_LINE = 4096
+_TILT_DEG = 30.0  # of what a sensor measures on average over a take
+_METADATA = {
+    "rate": f"{RATE:g}",
+    "frame": "Z up",
+    "units": "s, m/s^2",
+    "source": "TotalCapture",
+}
+
+
+def read_recording(path: Path) -> Recording:
+    """The sensors of a file, as they were strapped on; rows that are no good are not there.
+
+    Raises:
+        EdgeposeError: not such a file, or its inertial frame has not Z up.
+    """
+    readings = read_sensors(path)
+    orientation, force, measured = readings.orientation, readings.force, readings.measured
+    quats = rot.matrix_to_quat(orientation)
+    times = np.arange(len(quats)) / RATE
+    sensors = {}
+    for i, (name, placement) in enumerate(zip(NAMES, PLACEMENTS, strict=True)):
+        there = measured[:, i]
+        if not there.any():
+            continue
+        mean = (orientation[there, i] @ force[there, i, :, None]).mean(axis=0)[:, 0]
+        if not tilt_deg(mean) < _TILT_DEG:
+            raise EdgeposeError(
+                f"{path}: {name} measures gravity along {np.round(mean, 1).tolist()} and not along Z; "
+                "the file is not laid out as TotalCapture's"
+            )
+        sensors[placement] = SensorData(times[there], quats[there, i], force[there, i])
+    return Recording(sensors, _METADATA, readings.damage)
+
+
+class Readings(NamedTuple):
+    """What a file holds.
+
+    Attributes:
+        orientation: (T, 6, 3, 3) R_IS.
+        force: (T, 6, 3) specific force in the sensors' frames, m/s^2.
+        measured: (T, 6) where both are good; elsewhere they are those of a sensor at rest.
+        damage: one line on what is not; None if all is.
+    """
+
+    orientation: Array
+    force: Array
+    measured: NDArray[np.bool_]
+    damage: str | None
+
+
+def read_sensors(path: Path) -> Readings:
+    """What is good in a .sensors file.
+
+    Raises:
+        EdgeposeError: not such a file.
+    """
+    rows, problems = array("d"), list[str]()
+    try:
+        with path.open(encoding="ascii", errors="replace") as file:
+            lines = enumerate(iter(partial(file.readline, _LONGEST_LINE), ""), start=1)
+            sensors, frames = _counts(path, next(lines, (1, ""))[1])
+            for frame in range(1, frames + 1):
+                number, line = next(lines, (0, ""))
+                if line.strip() != str(frame):
+                    problems.append(
+                        f"line {number or 'at the end'}: expected frame {frame} of {frames}, "
+                        f"found {line.strip()[:40]!r}"
+                    )
+                    break
+                block = list(islice(lines, sensors))
+                # Where the file is cut digits may be missing, which nobody can see.
+                if (len(block) < sensors or frame < frames) and block and not block[-1][1].endswith("\n"):
+                    block.pop()
+                rows.extend(_frame(block, frame, problems).ravel())
+    except OSError as error:
+        raise EdgeposeError(f"{path}: cannot be read: {error.strerror or error}") from error
+    damage = None
+    if problems:
+        damage = f"{path}, {problems[0]}; {len(problems)} such places in all, the rest is good"
+    values = np.frombuffer(rows).reshape(-1, len(NAMES), _NUMBERS)
+    measured = ~np.isnan(values[..., 0])
+    if not measured.any():
+        raise EdgeposeError(f"{path}, {problems[0]}")
+    values = np.where(measured[..., None], values, _AT_REST)
+    quats = values[..., :4] / np.linalg.norm(values[..., :4], axis=-1, keepdims=True)
+    return Readings(rot.quat_to_matrix(quats), values[..., 4:], measured, damage)
+
+
+def _frame(lines: list[tuple[int, str]], frame: int, problems: list[str]) -> Array:
+    """Rows (6, 7) of a frame's lines, NaN where there is none; adds what is wrong to the problems."""
+    rows = np.full((len(NAMES), _NUMBERS), np.nan)
+    missing = set(NAMES)
+    for number, line in lines:
+        name, *cells = line.split()[: 1 + _NUMBERS] or [""]
+        if name not in NAMES:
+            continue
+        missing.discard(name)
+        try:
+            rows[NAMES.index(name)] = _row(cells)
+        except ValueError:
+            problems.append(f"line {number}: expected a unit quaternion and an acceleration of {name}")
+    if missing:
+        problems.append(f"frame {frame} has no {', '.join(name for name in NAMES if name in missing)}")
+    return rows
+
+
+def _counts(path: Path, line: str) -> tuple[int, int]:
+    """Numbers of sensors and of frames in a file's first line."""
+    cells = line.split()
+    if len(cells) == 2 and all(cell.isdecimal() and len(cell) < 9 for cell in cells):
+        sensors, frames = map(int, cells)
+        if len(NAMES) <= sensors <= 100 and 0 < frames <= MAX_FRAMES:
+            return sensors, frames
+    raise EdgeposeError(
+        f"{path}, line 1: expected the numbers of sensors and frames, found {line.strip()[:40]!r}"
+    )
+
+
+def _row(cells: list[str]) -> list[float]:
+    """Quaternion and acceleration of a line.
+
+    Raises:
+        ValueError: they are none.
+    """
+    row = [float(cell) for cell in cells]
+    if len(row) != _NUMBERS or not np.abs(row).max() < 1e4 or not abs(np.linalg.norm(row[:4]) - 1.0) < 0.1:
+        raise ValueError
+    return row

@@ -1,0 +1,151 @@
+"""Sessions of x-io's software: a folder with a folder for each sensor, and CSV files in that."""
+
+from __future__ import annotations
+
+import heapq
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+from edgepose.errors import EdgeposeError
+from edgepose.formats.recordings.csv_npz import Recording, from_samples
+from edgepose.imu import ImuSample
+from edgepose.placements import PLACEMENTS
+from firmware_protocols.sample import Sample
+from firmware_protocols.ximu3 import Decoder
+
+MAIN_FILE = "Inertial.csv"
+"""The file that makes a folder one of a sensor."""
+
+_LETTERS = {"Inertial.csv": "I", "Quaternion.csv": "Q", "Magnetometer.csv": "M"}
+_TIME = "Timestamp (us)"
+_SERIAL_NUMBER = re.compile(r"(?<![0-9A-Za-z])[0-9A-Fa-f]{8}(?![0-9A-Za-z])")
+_CHUNK = 1000  # lines
+
+_METADATA = {
+    "frame": "Z up, NWU",
+    "units": "s, m/s^2, rad/s; mag in the device's own units",
+    "source": "x-io CSV",
+}
+
+
+def is_sensor(folder: Path) -> bool:
+    """Whether a folder is one of an x-io sensor."""
+    return (folder / MAIN_FILE).exists()
+
+
+def is_session(folder: Path) -> bool:
+    """Whether a folder holds folders of x-io sensors."""
+    return any(folder.glob(f"*/{MAIN_FILE}"))
+
+
+def read_session(folder: Path, ids: Mapping[int, str] | None = None) -> Recording:
+    """The recording in a session, in the time of the sensors, whose clocks x-io's software sets alike.
+
+    Args:
+        folder: of the session.
+        ids: placements by serial number. Without them a sensor's folder has the placement in its name, such
+            as "Left Lower Leg 64F61CB3 (UDP)".
+
+    Raises:
+        EdgeposeError: no folder is of a placement, two are of one, or a file is of another kind.
+    """
+    places = by_placement(folder, sorted(path.parent for path in folder.glob(f"*/{MAIN_FILE}")), ids)
+    problems: list[str] = []
+    rows = [
+        sample
+        for name, sensor in places.items()
+        for sample in _samples(PLACEMENTS.index(name), sensor, problems)
+    ]
+    recording = from_samples(rows, _METADATA, name=str(folder), salvage=True)
+    starts = [data.time_s[0] for data in recording.sensors.values()]
+    ends = [data.time_s[-1] for data in recording.sensors.values()]
+    if starts and max(starts) > min(ends):
+        problems.append(
+            f"{folder}: the sensors' clocks have no time in common; synchronise them and record anew"
+        )
+    if recording.damage:
+        problems.append(recording.damage)
+    return recording._replace(damage="; ".join(problems) or None)
+
+
+def by_placement(folder: Path, sensors: Sequence[Path], ids: Mapping[int, str] | None) -> dict[str, Path]:
+    """Files or folders of the sensors of a session by placement; those of no placement are left out.
+
+    Raises:
+        EdgeposeError: none is of a placement, or two are of one.
+    """
+    places: dict[str, Path] = {}
+    for sensor in sensors:
+        placement = placement_of(sensor.name, ids)
+        if placement is None:
+            continue
+        if placement in places:
+            raise EdgeposeError(
+                f"{folder}: {places[placement].name!r} and {sensor.name!r} are both {placement}; rename one"
+            )
+        places[placement] = sensor
+    if not places:
+        how = f"in the names of its {'folders' if sensors[0].is_dir() else 'files'}"
+        how = how if ids is None else "with a serial number of --sensors"
+        names = ", ".join(sensor.name for sensor in sensors)
+        raise EdgeposeError(f"{folder}: no placement {how} ({names}); placements are {', '.join(PLACEMENTS)}")
+    return places
+
+
+def placement_of(name: str, ids: Mapping[int, str] | None) -> str | None:
+    """Placement of a sensor by the name of its folder or file."""
+    if ids is not None:
+        numbers = [int(number, 16) for number in _SERIAL_NUMBER.findall(name)]
+        return next((ids[number] for number in numbers if number in ids), None)
+    words = re.sub(r"[^a-z]+", "_", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower())
+    return next((placement for placement in PLACEMENTS if f"_{placement}_" in f"_{words}_"), None)
+
+
+def _samples(index: int, folder: Path, problems: list[str]) -> Iterator[ImuSample]:
+    """Samples of a sensor; what is wrong with its files is added to the problems.
+
+    A line of a file is a message as the device sends it, but for the letter at its start.
+    """
+    decoder = Decoder()
+    files = [
+        _messages(folder / name, letter) for name, letter in _LETTERS.items() if (folder / name).exists()
+    ]
+    lines = (line for _, line in heapq.merge(*files))
+    for data in _chunks(lines):
+        yield from (_sample(index, s) for s in decoder.feed(data))
+    yield from (_sample(index, s) for s in decoder.flush())
+    if decoder.counters.bad:
+        problems.append(f"{folder}: {decoder.counters.bad} bad rows left out")
+
+
+def _sample(index: int, sample: Sample) -> ImuSample:
+    assert sample.time_us is not None  # every message has one
+    return ImuSample(index, sample.time_us * 1e-6, sample.quat, sample.acc, sample.gyr, sample.mag)
+
+
+def _messages(path: Path, letter: str) -> Iterator[tuple[int, bytes]]:
+    """Time and message of each row; one without a time has that of the row before."""
+    time_us = 0
+    try:
+        with path.open("rb") as file:
+            header = file.readline(4096).decode("utf-8-sig", "replace")
+            if not header.startswith(_TIME):
+                raise EdgeposeError(f"{path}: starts with {header.strip()[:40]!r} and not with {_TIME!r}")
+            for line in file:
+                number = line.partition(b",")[0]
+                time_us = int(number) if number.isdigit() and len(number) < 20 else time_us
+                # Digits of a row without an end may be missing; the decoder has no number to read then.
+                yield time_us, letter.encode() + b"," + (line if line.endswith(b"\n") else b"\n")
+    except OSError as error:
+        raise EdgeposeError(f"{path}: cannot read it: {error.strerror}") from None
+
+
+def _chunks(lines: Iterable[bytes]) -> Iterator[bytes]:
+    chunk: list[bytes] = []
+    for line in lines:
+        chunk.append(line)
+        if len(chunk) == _CHUNK:
+            yield b"".join(chunk)
+            chunk = []
+    yield b"".join(chunk)

@@ -1,0 +1,208 @@
+"""Model archives: find, check and describe them without running anything; load them once they are trusted.
+
+An archive is a TorchScript file, and loading one runs the code in it. So a file is loaded only when its
+SHA-256 sum is known: from `SHA256SUMS` beside the shipped archives, or from the user's own list, or when the
+user says so for this once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import zipfile
+import zlib
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from edgepose.errors import EdgeposeError
+from edgepose.inference.quantisation import quantized_quietly
+from edgepose.placements import PLACEMENTS
+
+if TYPE_CHECKING:
+    import torch
+
+METADATA_FILE = "edgepose.json"
+FORMAT = 1
+MODELS = Path(str(resources.files("edgepose.inference") / "models"))
+KINDS = ("birnn", "rnn", "feed-forward", "wavenet")
+
+_METADATA_LIMIT = 1 << 20
+_MOST_FRAMES = 1000
+
+
+class ArchiveInfo(NamedTuple):
+    """What is known of an archive before it is loaded.
+
+    Attributes:
+        path: of the file.
+        sha256: its sum, hexadecimal.
+        trusted: the sum is that of a shipped archive or on the user's own list.
+        metadata: the archive's own JSON description.
+    """
+
+    path: Path
+    sha256: str
+    trusted: bool
+    metadata: dict[str, Any]
+
+
+def _settings() -> str:
+    """The folder of the user's settings; with "~" in front where the user has no home."""
+    return os.path.expanduser(os.environ.get("XDG_CONFIG_HOME") or "~/.config")  # noqa: PTH111 - never raises
+
+
+def has_home() -> bool:
+    """Whether the user can have a list of trusted sums; under any number in a container, maybe not."""
+    return not _settings().startswith("~")
+
+
+def trust_file() -> Path:
+    """The user's own list of trusted sums, in the format of `sha256sum`.
+
+    Raises:
+        EdgeposeError: the user has no home.
+    """
+    if not has_home():
+        raise EdgeposeError("you have no home folder for a list of trusted archives: set XDG_CONFIG_HOME")
+    return Path(_settings()) / "edgepose" / "trusted-archives"
+
+
+def shipped() -> list[Path]:
+    """Archives that come with the package, those trained on everything first."""
+    return sorted(MODELS.glob("*.pt"), key=lambda path: ("-" in path.stem, path.stem))
+
+
+def find(name: str) -> Path:
+    """The shipped archive of that name, or the file at that path.
+
+    Raises:
+        EdgeposeError: there is neither.
+    """
+    for path in shipped():
+        if path.stem == name:
+            return path
+    if Path(name).is_file():
+        return Path(name)
+    names = ", ".join(path.stem for path in shipped()) or "none"
+    raise EdgeposeError(
+        f"{name}: no such model; shipped are {names}, anything else is the path of an archive"
+    )
+
+
+def _sums(path: Path) -> set[str]:
+    try:
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        return {line.split()[0].lower() for line in lines if line.strip()}
+    except FileNotFoundError:
+        return set()
+    except OSError as error:
+        raise EdgeposeError(f"{path}: {error.strerror}") from error
+
+
+def inspect(path: Path) -> ArchiveInfo:
+    """Reads an archive's metadata and sum; runs nothing of it.
+
+    Raises:
+        EdgeposeError: not an archive of edgepose, damaged, or of a newer format.
+    """
+    try:
+        content = path.read_bytes()
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            entries = [e for e in archive.infolist() if e.filename.endswith(f"/extra/{METADATA_FILE}")]
+            if len(entries) != 1 or entries[0].file_size > _METADATA_LIMIT:
+                raise EdgeposeError(
+                    f"{path}: not a model archive of edgepose (it has no {METADATA_FILE}); "
+                    "make one with edgepose export"
+                )
+            metadata = json.loads(archive.read(entries[0]))
+    except (zipfile.BadZipFile, EOFError) as error:
+        raise EdgeposeError(
+            f"{path}: not a model archive (no complete zip file); make one with edgepose export"
+        ) from error
+    except OSError as error:
+        raise EdgeposeError(f"{path}: {error.strerror or error}") from error
+    # zipfile gives RuntimeError for passwords, NotImplementedError for odd compression, json RecursionError.
+    except (ValueError, RuntimeError, zlib.error) as error:
+        raise EdgeposeError(f"{path}: the archive's metadata cannot be read ({error})") from error
+    _check(path, metadata)
+    sha256 = hashlib.sha256(content).hexdigest()
+    known = _sums(MODELS / "SHA256SUMS")
+    if has_home():
+        known |= _sums(trust_file())
+    return ArchiveInfo(path, sha256, sha256 in known, metadata)
+
+
+def _check(path: Path, metadata: Any) -> None:
+    if not isinstance(metadata, dict) or not isinstance(metadata.get("format"), int):
+        raise EdgeposeError(f"{path}: the archive's metadata is not what edgepose export writes")
+    if metadata["format"] > FORMAT:
+        raise EdgeposeError(
+            f"{path}: archive format {metadata['format']} is newer than this edgepose reads ({FORMAT}); "
+            "update edgepose"
+        )
+    if metadata.get("kind") not in KINDS:
+        raise EdgeposeError(f"{path}: unknown kind of network {metadata.get('kind')!r}")
+    if metadata.get("placements") != list(PLACEMENTS):
+        raise EdgeposeError(f"{path}: made for other sensor placements: {metadata.get('placements')}")
+    if not isinstance(metadata.get("rate_hz"), (int, float)) or not 1 <= metadata["rate_hz"] <= 1000:
+        raise EdgeposeError(f"{path}: the archive's frame rate {metadata.get('rate_hz')!r} is not a rate")
+    for name in ("past", "future"):
+        frames = metadata.get(name)
+        if type(frames) is not int or not 0 <= frames <= _MOST_FRAMES:
+            raise EdgeposeError(f"{path}: the archive's number of {name} frames {frames!r} is not a number")
+
+
+def load(info: ArchiveInfo, trust: bool = False) -> torch.jit.ScriptModule:
+    """Loads a trusted archive for the CPU, ready to run on one thread.
+
+    Args:
+        info: from `inspect`.
+        trust: the user vouches for the file.
+
+    Raises:
+        EdgeposeError: the sum is not known and the user does not vouch, or torch cannot load the file.
+    """
+    if not (info.trusted or trust):
+        raise EdgeposeError(
+            f"{info.path}: loading a model archive runs its code, and this one's SHA-256 sum "
+            f"{info.sha256[:16]}... is not known; if you made it or know who did, run with --trust, or once: "
+            "edgepose models --trust PATH"
+        )
+    import torch
+
+    torch.set_num_threads(1)
+    # torch.nn.LSTM and small products are slower through oneDNN at batch 1.
+    torch.backends.mkldnn.enabled = False  # type: ignore[assignment]
+    try:
+        content = info.path.read_bytes()
+        if hashlib.sha256(content).hexdigest() != info.sha256:
+            raise EdgeposeError(f"{info.path}: the archive changed while it was being loaded; run again")
+        with quantized_quietly():
+            module: torch.jit.ScriptModule = torch.jit.load(io.BytesIO(content), map_location="cpu")
+    except (RuntimeError, ValueError, OSError) as error:
+        reason = str(error).strip().splitlines()
+        raise EdgeposeError(
+            f"{info.path}: torch cannot load the archive ({reason[0] if reason else type(error).__name__})"
+        ) from error
+    return module
+
+
+def trust(path: Path) -> ArchiveInfo:
+    """Adds an archive's sum to the user's own list.
+
+    Raises:
+        EdgeposeError: not an archive, or the list cannot be written.
+    """
+    info = inspect(path)
+    if not info.trusted:
+        try:
+            trust_file().parent.mkdir(parents=True, exist_ok=True)
+            with trust_file().open("a") as file:
+                # The line break in front is for a list that was edited and does not end in one.
+                file.write(f"\n{info.sha256}  {' '.join(path.name.split())}\n")
+        except OSError as error:
+            raise EdgeposeError(f"{trust_file()}: {error.strerror}") from error
+    return info._replace(trusted=True)

@@ -1,0 +1,135 @@
+"""The step of the walk that orients samples of all sensors."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from edgepose.imu import ImuSample, Vector3
+from edgepose.orientation.arrays import NO_FIELD
+from edgepose.orientation.filter import OrientationFilter
+from edgepose.orientation.settings import FilterSettings
+from edgepose.orientation.types import Event, Oriented
+from edgepose.orientation.vqf_filter import VqfFilter
+
+
+class SensorFilter(Protocol):
+    """Orients one sensor's samples."""
+
+    def update(
+        self, time_s: ArrayLike, gyr: ArrayLike, acc: ArrayLike, mag: ArrayLike | None = None
+    ) -> Oriented:
+        """See `OrientationFilter.update`."""
+
+
+KINDS: dict[str, type[OrientationFilter] | type[VqfFilter]] = {"kalman": OrientationFilter, "vqf": VqfFilter}
+"""Filters by the names they have on the command line."""
+
+
+class SensorStatus(NamedTuple):
+    """What a sensor's filter says of itself.
+
+    Attributes:
+        rest: the sensor is at rest.
+        disturbed: the magnetic field is not the usual one.
+        bias: of the gyroscope, sensor frame, deg/s.
+        events: samples with each event since the start; events that never were are missing.
+    """
+
+    rest: bool
+    disturbed: bool
+    bias: Vector3
+    events: dict[Event, int]
+
+
+class Orienter:
+    """Gives samples orientations, each sensor by a filter of its own."""
+
+    def __init__(
+        self, kind: str = "kalman", magnetometer: bool = True, settings: FilterSettings | None = None
+    ) -> None:
+        """Start with no sample seen.
+
+        Args:
+            kind: one of KINDS.
+            magnetometer: use fields, where there are any.
+            settings: of the filters.
+
+        Raises:
+            EdgeposeError: a package that the kind needs is not installed.
+        """
+        self._class, self._settings = KINDS[kind], settings
+        # The first one is made now: what is missing is told, and what has to be imported is.
+        self._spare: list[SensorFilter] = [self._class(settings)]
+        self._magnetometer = magnetometer
+        self._filters: dict[int, SensorFilter] = {}
+        self._last: dict[int, Oriented] = {}
+        self._events: defaultdict[int, Counter[int]] = defaultdict(Counter)
+        self._fields: dict[int, Vector3] = {}  # that came in samples of their own
+
+    def orient(self, samples: list[ImuSample]) -> list[ImuSample]:
+        """The samples in the same order, those with rate and force with the filter's orientation.
+
+        It replaces a device's own, which samples without a rate keep. A field that comes in a sample without
+        a rate counts for the sensor's next one.
+        """
+        places: defaultdict[int, list[int]] = defaultdict(list)
+        fields: list[Vector3 | None] = [sample.mag for sample in samples]
+        for place, sample in enumerate(samples):
+            if sample.gyr is None or sample.acc is None:
+                if sample.mag is not None:
+                    self._fields[sample.sensor] = sample.mag
+                continue
+            waiting = self._fields.pop(sample.sensor, None)
+            fields[place] = sample.mag or waiting
+            places[sample.sensor].append(place)
+        result = list(samples)
+        for sensor, own in places.items():
+            quats = self._orient_sensor(
+                sensor, [samples[place] for place in own], [fields[place] for place in own]
+            )
+            for place, (w, x, y, z) in zip(own, quats, strict=True):
+                result[place] = samples[place]._replace(quat=(w, x, y, z))
+        return result
+
+    def _orient_sensor(
+        self, sensor: int, samples: Sequence[ImuSample], fields: Sequence[Vector3 | None]
+    ) -> list[list[float]]:
+        own = self._filters.get(sensor)
+        if own is None:
+            own = self._filters[sensor] = self._spare.pop() if self._spare else self._class(self._settings)
+        with_field = self._magnetometer and any(field is not None for field in fields)
+        oriented = own.update(
+            [sample.time_s for sample in samples],
+            np.array([sample.gyr for sample in samples], float),
+            np.array([sample.acc for sample in samples], float),
+            [NO_FIELD if field is None else field for field in fields] if with_field else None,
+        )
+        self._last[sensor] = oriented
+        self._events[sensor].update(flag for flag in oriented.flagged.tolist() if flag)
+        quats: list[list[float]] = oriented.quat.tolist()
+        return quats
+
+    def status(self) -> dict[int, SensorStatus]:
+        """State of each sensor that has been oriented."""
+        return {
+            sensor: SensorStatus(
+                bool(last.rest[-1]),
+                bool(last.disturbed[-1]),
+                tuple(np.rad2deg(last.bias[-1]).tolist()),
+                _by_event(self._events[sensor].items()),
+            )
+            for sensor, last in sorted(self._last.items())
+        }
+
+
+def _by_event(counts: Iterable[tuple[int, int]]) -> dict[Event, int]:
+    """Counts by event of counts by combination of events."""
+    result: Counter[Event] = Counter()
+    for flags, count in counts:
+        result.update({event: count for event in Event if event & flags})
+    return dict(result)

@@ -1,0 +1,103 @@
+"""Checks of one sensor's samples before a filter takes them: numbers, stamps, gaps, ends of ranges."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import inf
+
+from edgepose.orientation.settings import FilterSettings
+from edgepose.orientation.types import Event
+
+_MAX_RATE, _MAX_FORCE, _MAX_FIELD = 1e3, 1e4, 1e6  # rad/s, m/s^2, uT: no sensor measures more
+_LONGEST_PERIOD_S = 0.04  # 25 Hz
+_BACK_S = 1.0
+_FOLLOW = 0.05
+_LEAST_PEAK_RATE, _LEAST_PEAK_FORCE = 4.0, 19.0  # ranges end above 250 deg/s and 2 g
+
+_GAP, _BAD, _STAMP, _SATURATED = (int(e) for e in (Event.GAP, Event.BAD, Event.STAMP, Event.SATURATED))
+
+
+class Intake:
+    """What came before the next sample, as far as it says whether that one is good.
+
+    Attributes:
+        period_s: usual time between samples.
+    """
+
+    def __init__(self, settings: FilterSettings) -> None:
+        """Start with no sample seen."""
+        self.period_s = _LONGEST_PERIOD_S
+        self._settings = settings
+        self._time_s: float | None = None
+        self._rate_peak, self._force_peak = _LEAST_PEAK_RATE, _LEAST_PEAK_FORCE
+        self._rate = self._force = 0.0  # largest component of the sample before
+
+    def check(self, time_s: float, gyr: Sequence[float], acc: Sequence[float]) -> tuple[int, float]:
+        """Events of a sample, and the time since the last good one, s.
+
+        The time is 0 where the sample is to be left out, inf where there is nothing to go on from: at the
+        first one, after a long gap, and when the clock has begun anew.
+        """
+        rate = max(abs(gyr[0]), abs(gyr[1]), abs(gyr[2]))
+        force = max(abs(acc[0]), abs(acc[1]), abs(acc[2]))
+        # Sums, because max() passes over a NaN that is not the first.
+        if not (
+            abs(gyr[0]) + abs(gyr[1]) + abs(gyr[2]) < _MAX_RATE
+            and abs(acc[0]) + abs(acc[1]) + abs(acc[2]) < _MAX_FORCE
+            and -inf < time_s < inf
+        ):
+            return _BAD, 0.0
+        events = 0
+        if rate > _LEAST_PEAK_RATE or force > _LEAST_PEAK_FORCE:
+            events = self._saturation(rate, force)
+        self._rate, self._force = rate, force
+        if self._time_s is None:
+            self._time_s = time_s
+            return events, inf
+        step_s = time_s - self._time_s
+        if step_s <= 0.0:
+            if step_s < -_BACK_S:
+                self._time_s = time_s
+                return events | _STAMP, inf
+            return events | _STAMP, 0.0
+        self._time_s = time_s
+        if step_s > self._settings.gap_periods * self.period_s:
+            events |= _GAP
+        # A longer period is learnt slowly: it may be a gap.
+        self.period_s += _FOLLOW * (min(step_s, 2.0 * self.period_s, _LONGEST_PERIOD_S) - self.period_s)
+        return events, inf if step_s > self._settings.restart_s else step_s
+
+    def _saturation(self, rate: float, force: float) -> int:
+        """Whether the largest value so far has come twice running: noise does not do that below the end."""
+        end = (rate >= self._rate_peak and rate == self._rate) or (
+            force >= self._force_peak and force == self._force
+        )
+        self._rate_peak = max(self._rate_peak, rate)
+        self._force_peak = max(self._force_peak, force)
+        return _SATURATED if end or force > self._settings.shock else 0
+
+
+class FieldWatch:
+    """Whether one sensor's magnetometer speaks.
+
+    Attributes:
+        seen: there was a field.
+        lost: there was one, and it has been too long since.
+    """
+
+    def __init__(self, settings: FilterSettings) -> None:
+        """Start with no field seen."""
+        self.seen = self.lost = False
+        self._longest_s = settings.mag_lost_s
+        self._since_s = 0.0
+
+    def check(self, dt: float, mag: Sequence[float]) -> bool:
+        """Whether numbers are a field; dt is the time since the sample before, s."""
+        # A sum, for NaN is smaller than nothing.
+        if 0.0 < abs(mag[0]) + abs(mag[1]) + abs(mag[2]) < _MAX_FIELD:
+            self._since_s = 0.0
+            self.seen, self.lost = True, False
+            return True
+        self._since_s += dt
+        self.lost = self.seen and self._since_s > self._longest_s
+        return False

@@ -1,0 +1,1 @@
+"""The steps of a run joined, for one wearer and for several."""

@@ -1,0 +1,110 @@
+"""Poses as comma-separated values, one row a frame. The columns are described in docs/outputs.md."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from edgepose.errors import EdgeposeError
+from edgepose.formats.poses.csv_columns import FORMS, numbers, pose_columns
+from edgepose.pose import PoseFrame
+from edgepose.sinks import Sink
+from edgepose.utils.growing_files import FLUSH_S, GrowingFile
+
+
+class CsvSink(Sink):
+    """Writes poses to a file, or to standard output for the path "-".
+
+    Rows to a file are gathered and written about once a second; a pipe or terminal gets each at once, so that
+    a program that reads along has no added latency. After an error a file ends at a whole row.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        rotations: str = "axis-angle",
+        std: bool = False,
+        translation: bool = False,
+        *,
+        overwrite: bool = True,
+        follow: bool = True,
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """Open the file and write the header.
+
+        Args:
+            path: file to write; "-" is standard output. It appears with the first pose.
+            rotations: a key of `FORMS`; angles are in radians.
+            std: add the network's standard deviation of each joint, radians.
+            translation: add the place of the pelvis, metres, which every pose must then have.
+            overwrite: whether it may take the place of a file.
+            follow: write to the file at the end of a link; without, in the place of the link.
+            stopped: whether the run is to end: then a reader that takes nothing is not waited for.
+
+        Raises:
+            EdgeposeError: the file cannot be written.
+        """
+        if rotations not in FORMS:
+            raise EdgeposeError(f"unknown rotations {rotations!r}: choose one of {', '.join(FORMS)}")
+        self._rotations, self._std, self._translation = rotations, std, translation
+        columns = pose_columns(rotations, std, translation)
+        self._format = ",".join(["%d,%.6f,%s"] + ["%.6f"] * (len(columns) - 3)) + "\n"
+        self._closed, self._empty = False, True
+        self._file = GrowingFile(path, "poses", overwrite=overwrite, follow=follow, stopped=stopped)
+        self._rows = [",".join(columns) + "\n"]
+        try:
+            self._flush()
+        except EdgeposeError:
+            self.discard()
+            raise
+
+    def start(self) -> None:
+        """Let the file appear; where one is there already, with the first pose.
+
+        Raises:
+            EdgeposeError: another file is there now.
+        """
+        if not self._file.exists:
+            self._file.start()
+
+    def write(self, pose: PoseFrame) -> None:
+        """Add a row; a file has it on disk within about a second."""
+        if self._empty:
+            self._empty = False
+            self._file.start()
+        values = numbers(self._rotations, pose.rotations).ravel().tolist()
+        if self._std:
+            values += pose.std.tolist()
+        if self._translation:
+            if pose.translation is None:
+                raise ValueError(f"pose {pose.index} has no translation")
+            values += pose.translation.tolist()
+        self._rows.append(self._format % (pose.index, pose.time_s, pose.status, *values))
+        if not self._file.regular or time.monotonic() - self._flushed >= FLUSH_S:
+            self._flush()
+
+    def close(self) -> None:
+        """Write what is still held back and close the file; standard output stays open. A file that is there
+        already stays if no pose has come."""
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            self._flush()
+        finally:
+            self._file.close()
+
+    def discard(self) -> None:
+        """As `close`, but without a pose no file appears."""
+        if not self._empty:
+            self.close()
+            return
+        self._closed = True
+        self._file.discard()
+
+    def _flush(self) -> None:
+        rows, self._rows = "".join(self._rows).encode(), []
+        self._flushed = time.monotonic()
+        if rows:
+            self._file.write(rows)

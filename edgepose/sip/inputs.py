@@ -1,0 +1,70 @@
+"""What `edgepose solve` reads: a recording of any sensors, with orientations, and how they are mounted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from edgepose.calibration import Calibration
+from edgepose.errors import EdgeposeError
+from edgepose.formats.recordings.csv_npz import Recording, from_samples, read_sensors, samples
+from edgepose.placements import PLACEMENTS, SITES
+from edgepose.sip.measurements import Mount, mounts, mounts_from_hold
+
+DEFAULT_HOLD_S = 4.0
+
+
+def read(path: Path, calibration: Calibration) -> Recording:
+    """A recording of any sensors of SITES, its orientations made as the calibration says.
+
+    Raises:
+        EdgeposeError: no such recording, or one of which no orientations can be made.
+    """
+    recording = read_sensors(path, tuple(SITES))
+    if not recording.sensors:
+        raise EdgeposeError(f"{path}: the recording has no samples")
+    if calibration.filter == "none":
+        return recording
+    others = [name for name in recording.sensors if name not in PLACEMENTS]
+    if others:
+        raise EdgeposeError(
+            f"{path}: the calibration was made with --filter {calibration.filter}, which takes the six "
+            f"placements only, and there is {', '.join(others)}; use orientations that the sensors send"
+        )
+    from edgepose.orientation import Orienter
+
+    orienter = Orienter(calibration.filter, magnetometer=calibration.north)
+    oriented = from_samples(orienter.orient(list(samples(recording))), recording.metadata, name=str(path))
+    return oriented._replace(damage=recording.damage)
+
+
+def mounted(
+    path: Path, recording: Recording, calibration: Calibration, hold_from_s: float | None
+) -> dict[str, Mount]:
+    """How each sensor of a recording is mounted, by name.
+
+    The calibration knows the six placements. Others are taken from the calibration's pose, which the wearer
+    holds in this recording: at `hold_from_s` on its clock, or, if the calibration was made from this very
+    file, where that was.
+
+    Raises:
+        EdgeposeError: it is not known when the pose was held, or a sensor said too little then.
+    """
+    known = {name: mount for name, mount in mounts(calibration).items() if name in recording.sensors}
+    others = [name for name in recording.sensors if name not in known]
+    if not others:
+        return known
+    about = calibration.metadata
+    seconds = _number(about.get("hold_s")) or DEFAULT_HOLD_S
+    start = hold_from_s
+    if start is None and about.get("source") == str(path):
+        start = _number(about.get("from_s"))
+    if start is None:
+        raise EdgeposeError(
+            f"{path}: the calibration does not know {', '.join(others)}; say with --hold-from from when the "
+            f"wearer holds its {calibration.pose} pose in this recording"
+        )
+    return known | mounts_from_hold(recording, calibration, others, start, start + seconds)
+
+
+def _number(value: object) -> float | None:
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None

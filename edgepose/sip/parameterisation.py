@@ -1,0 +1,114 @@
+"""Which numbers describe a pose: all that sensors can see of SMPL's, or a hand-rigged skeleton with hinges.
+
+A rig says how its parameters give exponential coordinates, `coordinates = rest + basis @ parameters`, and
+carries the prior in those parameters. The first three are the pelvis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from edgepose.sip.kinematics import JOINT_COUNT, TURNS
+from edgepose.sip.prior import Prior
+from edgepose.skeleton import JOINTS
+
+Array = NDArray[np.float64]
+
+WIDTH = 3 * JOINT_COUNT
+"""Exponential coordinates of a pose."""
+
+
+class Rig(NamedTuple):
+    """A rig of P parameters.
+
+    Attributes:
+        basis: (72, P) change of the exponential coordinates with the parameters.
+        mean: (P - 3,) prior mean of the parameters behind the pelvis, rad.
+        root: (P - 3, P - 3) L of SIP eq. 29: squares of L (x - mean) sum up to the Mahalanobis distance.
+        lower: (P - 3,) lower limits, rad.
+        upper: (P - 3,) upper limits, rad.
+        regression: (72, P - 3) of coordinates that no parameter moves on the parameters: what the prior
+            expects of them; other rows are zero.
+        rest: (72,) what the prior expects of them at the mean; other rows are zero.
+    """
+
+    basis: Array
+    mean: Array
+    root: Array
+    lower: Array
+    upper: Array
+    regression: Array
+    rest: Array
+
+
+def smpl_rig(prior: Prior, bones: ArrayLike) -> Rig:
+    """SMPL's joints with three degrees of freedom each, for sensors on some bones.
+
+    A joint that turns none of these bones moves no residual but the prior's, which is Gaussian: its best
+    value follows from the other joints and it need not be searched for.
+    """
+    seen = np.asarray(TURNS[np.asarray(bones)].any(axis=0))
+    seen[0] = True
+    chosen = np.flatnonzero(np.repeat(seen, 3))
+    inner, others = chosen[3:] - 3, np.flatnonzero(np.repeat(~seen, 3)) - 3
+    covariance = prior.covariance[np.ix_(inner, inner)]
+    gain = np.linalg.solve(covariance, prior.covariance[np.ix_(inner, others)]).T
+    regression, rest = np.zeros((WIDTH, len(inner))), np.zeros(WIDTH)
+    regression[others + 3] = gain
+    rest[others + 3] = prior.mean[others]
+    return Rig(
+        np.eye(WIDTH)[:, chosen],
+        prior.mean[inner],
+        _root(covariance),
+        prior.lower[inner],
+        prior.upper[inner],
+        regression,
+        rest,
+    )
+
+
+_HINGES: Sequence[tuple[str, str]] = (
+    ("spine2", "xyz"), ("head", "xy"),
+    ("left_hip", "xyz"), ("left_knee", "x"), ("left_ankle", "x"),
+    ("right_hip", "xyz"), ("right_knee", "x"), ("right_ankle", "x"),
+    ("left_shoulder", "xyz"), ("left_elbow", "xy"),
+    ("right_shoulder", "xyz"), ("right_elbow", "xy"),
+)  # fmt: skip
+"""Joints of the hand-rigged skeleton and the axes they turn about: one waist, a head that nods and shakes,
+hinges at knees and ankles, elbows that bend and twist."""
+
+
+def hinge_rig(prior: Prior) -> Rig:
+    """SIP-M: 28 angles (31 parameters with the translation) of a skeleton as one rigs by hand (SIP 5.2).
+
+    The prior of an angle is that of the same coordinate of SMPL; the other joints are stiff.
+    """
+    rows = [0, 1, 2] + [3 * JOINTS.index(name) + "xyz".index(axis) for name, axes in _HINGES for axis in axes]
+    inner = np.array(rows[3:]) - 3
+    none = np.zeros((WIDTH, len(inner)))
+    return Rig(
+        np.eye(WIDTH)[:, rows],
+        prior.mean[inner],
+        _root(prior.covariance[np.ix_(inner, inner)]),
+        prior.lower[inner],
+        prior.upper[inner],
+        none,
+        np.zeros(WIDTH),
+    )
+
+
+def _root(covariance: Array) -> Array:
+    """L with inverse(covariance) = L^T L."""
+    return np.linalg.inv(np.linalg.cholesky(covariance))
+
+
+def coordinates(rig: Rig, parameters: Array) -> Array:
+    """Exponential coordinates (T, 24, 3) of parameters (T, P); those that nothing moves as the prior has
+    them.
+    """
+    expected = rig.rest + (parameters[:, 3:] - rig.mean) @ rig.regression.T
+    return (parameters @ rig.basis.T + expected).reshape(-1, JOINT_COUNT, 3)

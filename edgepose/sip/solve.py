@@ -1,0 +1,218 @@
+"""A whole recording to poses: in chunks that overlap, one after the other or several at a time."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import pairwise
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgepose import rotations as rot
+from edgepose.errors import EdgeposeError
+from edgepose.sip.energy import Problem, Weights, second_difference
+from edgepose.sip.kinematics import SensorPoints
+from edgepose.sip.levenberg_marquardt import SIP_EVALUATIONS, Minimum, inertial_poser, orientation_poser
+from edgepose.sip.measurements import Measurements
+from edgepose.sip.parameterisation import Rig, coordinates
+
+Array = NDArray[np.float64]
+
+CHUNK = 900
+"""Frames solved at once: 15 s at 60 Hz."""
+
+OVERLAP = 60
+"""Frames that neighbouring chunks share. In the outer half of them each chunk knows too little of what lies
+beyond its end, which is why the poses pass over from one to the other."""
+
+Method = Literal["sip", "sop"]
+
+
+class Settings(NamedTuple):
+    """How to solve.
+
+    Attributes:
+        method: "sip" or "sop".
+        rig: parameters of a pose, and their prior.
+        body: where the sensors sit.
+        weights: of the energy's terms.
+        evaluations: of SIP's cost at most.
+    """
+
+    method: Method
+    rig: Rig
+    body: SensorPoints
+    weights: Weights
+    evaluations: int = SIP_EVALUATIONS
+
+
+class Solution(NamedTuple):
+    """Poses of consecutive frames, and how well they explain the sensors.
+
+    Attributes:
+        rotations: (T, 24, 3, 3) local rotations, joint 0 against the body frame T.
+        costs: (T, 4) weighted cost of the terms, as in `edgepose.sip.energy.Costs`.
+        turn_rad: (T, N) angle between estimated and measured orientation of each sensor, rad.
+        pull: (T, N) length of each sensor's acceleration residual, m/s^2; 0 where none was measured.
+        acceleration: (T, 3) of the pelvis in T, m/s^2; NaN where no sensor measured any.
+        evaluations: of the cost.
+    """
+
+    rotations: Array
+    costs: Array
+    turn_rad: Array
+    pull: Array
+    acceleration: Array
+    evaluations: int
+
+
+OnProgress = Callable[[int, int, int, float], None]
+"""Told the chunk (from 1), the number of chunks, cost evaluations in it so far and the cost a frame."""
+
+
+def chunks(frames: int) -> list[slice]:
+    """Chunks of a recording, of equal length save for rounding."""
+    count = max(1, -(-(frames - OVERLAP) // (CHUNK - OVERLAP)))
+    edges = np.linspace(0, max(frames - OVERLAP, 0), count + 1).astype(int)
+    return [slice(a, min(b + OVERLAP, frames)) for a, b in pairwise(edges.tolist())]
+
+
+def solve(
+    measurements: Measurements,
+    settings: Settings,
+    jobs: int = 1,
+    on_progress: OnProgress = lambda chunk, count, evaluations, cost: None,
+) -> Iterator[Solution]:
+    """Solves a recording; each solution goes on where the one before it ends.
+
+    Args:
+        measurements: of all frames.
+        settings: how to solve.
+        jobs: chunks solved at a time, each by a process of its own.
+        on_progress: told how far it is; with more than one job, of whole chunks only.
+
+    Raises:
+        EdgeposeError: there is no frame, or a process was ended.
+    """
+    if not len(measurements.time_s):
+        raise EdgeposeError("the recording has no frame in which all sensors report")
+    parts = chunks(len(measurements.time_s))
+    problems = [_problem(measurements, part, settings) for part in parts]
+    held: Solution | None = None  # what the next chunk passes over
+    for number, solution in enumerate(_solutions(problems, settings, jobs, on_progress), start=1):
+        if held is not None:
+            solution = _passed_over(held, solution)
+        last = number == len(parts)
+        stop = None if last else parts[number].start - parts[number - 1].start
+        yield _rows(solution, slice(0, stop))
+        held = None if last else _rows(solution, slice(stop, None))
+
+
+def _solutions(
+    problems: list[Problem], settings: Settings, jobs: int, on_progress: OnProgress
+) -> Iterator[Solution]:
+    """Solutions of whole chunks, in order."""
+    count = len(problems)
+    work = partial(solve_chunk, method=settings.method, evaluations=settings.evaluations)
+    if jobs == 1 or count == 1:
+        for number, problem in enumerate(problems, start=1):
+            yield work(problem, on_step=partial(on_progress, number, count))
+        return
+    from concurrent.futures import ProcessPoolExecutor
+    from concurrent.futures.process import BrokenProcessPool
+    from multiprocessing import get_context
+
+    # Not forked: a copy of a process with threads may hang.
+    with ProcessPoolExecutor(min(jobs, count), get_context("spawn"), _ignore_interrupts) as pool:
+        # A new process ignores Ctrl-C from its first moment on where this one does.
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        try:
+            solutions = pool.map(work, problems)
+        finally:
+            signal.signal(signal.SIGINT, before)
+        try:
+            for number, solution in enumerate(solutions, start=1):
+                on_progress(number, count, solution.evaluations, float(solution.costs.sum(axis=1).mean()))
+                yield solution
+        except BrokenProcessPool as error:
+            raise EdgeposeError(
+                "a process was ended, perhaps for want of memory; use fewer --jobs"
+            ) from error
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _ignore_interrupts() -> None:
+    """Ctrl-C goes to all processes of a terminal; the one that started the others handles it for them."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def solve_chunk(
+    problem: Problem,
+    method: Method,
+    evaluations: int = SIP_EVALUATIONS,
+    on_step: Callable[[int, float], None] = lambda count, cost: None,
+) -> Solution:
+    """All frames of a problem: SOP, and from there SIP."""
+    minimum = orientation_poser(problem, on_step)
+    done = minimum.evaluations
+    if method == "sip":
+        minimum = inertial_poser(
+            problem, minimum.parameters, evaluations, lambda count, cost: on_step(done + count, cost)
+        )
+        done += minimum.evaluations
+    return _solution(problem, minimum, done)
+
+
+def _problem(measurements: Measurements, part: slice, settings: Settings) -> Problem:
+    valid = measurements.valid[part].astype(float)
+    valid[[0, -1]] = 0.0
+    return Problem(
+        settings.rig,
+        settings.body,
+        measurements.orientation[part],
+        measurements.acceleration[part],
+        valid,
+        measurements.rate,
+        settings.weights,
+    )
+
+
+def _solution(problem: Problem, minimum: Minimum, evaluations: int) -> Solution:
+    here, valid = minimum.evaluation, problem.valid[..., None]
+    left = problem.acceleration - second_difference(here.posed.position, problem.rate)
+    with np.errstate(invalid="ignore"):
+        acceleration = (valid * left).sum(axis=1) / valid.sum(axis=1)
+    return Solution(
+        rot.rotvec_to_matrix(coordinates(problem.rig, minimum.parameters)),
+        np.stack(here.costs, axis=1),
+        np.linalg.norm(here.turn, axis=-1),
+        np.linalg.norm(here.pull, axis=-1),
+        acceleration,
+        evaluations,
+    )
+
+
+def _rows(solution: Solution, rows: slice) -> Solution:
+    columns = {name: getattr(solution, name)[rows] for name in Solution._fields if name != "evaluations"}
+    return solution._replace(**columns)
+
+
+def _passed_over(before: Solution, after: Solution) -> Solution:
+    """`after`, its first frames turned gradually from those of `before`, which are the same instants."""
+    frames = len(before.rotations)
+    share = (np.arange(frames) + 0.5) / frames
+    share = share * share * (3.0 - 2.0 * share)
+    first, last = (rot.matrix_to_quat(s.rotations[:frames]) for s in (before, after))
+    between = rot.quat_to_matrix(rot.slerp(first, last, share[:, None]))
+    # Of all else the nearer chunk's: the ends of a chunk have no acceleration.
+    middle = frames // 2
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(before, name)[:middle], getattr(after, name)[middle:]])
+        for name in ("costs", "turn_rad", "pull", "acceleration")
+    }
+    rotations = np.concatenate([between, after.rotations[frames:]])
+    return after._replace(rotations=rotations, **columns)

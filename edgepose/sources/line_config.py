@@ -1,0 +1,134 @@
+"""The lines that the flags and the map of sensors name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from edgepose.errors import EdgeposeError
+from edgepose.sources.line_decoder import Places
+from edgepose.sources.live import Handle, Link
+from edgepose.sources.protocol_detection import candidates
+from edgepose.sources.sensor_map import PortSettings, SensorMap, channel, default_places
+from firmware_protocols.registry import Protocol
+
+BAUD = 115200
+"""Speed of a serial port of which nothing is known, bit/s."""
+
+BITRATE = 500_000
+"""Speed of a CAN bus of which nothing is known, bit/s."""
+
+
+def links(
+    port: str | None,
+    baud: int | None,
+    can: str | None,
+    bitrate: int | None,
+    fd: bool,
+    protocol: str,
+    sensor_map: SensorMap | None,
+) -> list[Link]:
+    """Ports and buses to listen to; the arguments are those of `open_source`.
+
+    Raises:
+        EdgeposeError: there are none, a name is wrong, or the map names another one.
+    """
+    ports = _names("--port", port)
+    buses = _names("--can", can)
+    if sensor_map is not None:
+        if not ports and not buses:
+            ports, buses = sensor_map.lines("port"), sensor_map.lines("can")
+        known = {*ports, *map(channel, buses)}
+        for name, device in sensor_map.devices.items():
+            if device.line is not None and device.line not in known:
+                raise EdgeposeError(
+                    f"{sensor_map.path}: {name}: {device.port or device.can} is none of "
+                    f"{', '.join([*ports, *buses])}, which --port and --can name"
+                )
+        for name in sensor_map.ports:
+            if name not in ports and name not in buses:
+                raise EdgeposeError(
+                    f"{sensor_map.path}: ports.{name}: no such line, only {', '.join([*ports, *buses])}"
+                )
+    count = len(ports) + len(buses)
+    if not count:
+        raise EdgeposeError("give one input: --port, --can or --file")
+    for bus in buses:
+        if ":" not in bus:
+            raise EdgeposeError(f"{bus}: give --can as INTERFACE:CHANNEL, such as socketcan:can0")
+
+    def places(line: str, index: int) -> Callable[[Protocol], Places]:
+        if sensor_map is not None:
+            return lambda spoken: sensor_map.places(line)
+        return lambda spoken: default_places(line, spoken, index, count)
+
+    result = []
+    for index, name in enumerate([*ports, *buses]):
+        settings = PortSettings() if sensor_map is None else sensor_map.settings(name)
+        spoken = settings.protocol or protocol
+        if index < len(ports):
+            link = serial_link(name, spoken, settings.baud or baud, places(name, index))
+        else:
+            link = can_link(name, spoken, settings.baud or bitrate, fd, places(name, index))
+        result.append(link)
+    return result
+
+
+def serial_link(name: str, protocol: str, baud: int | None, places: Callable[[Protocol], Places]) -> Link:
+    """One serial port.
+
+    Raises:
+        EdgeposeError: no such protocol.
+    """
+    protocols = candidates(protocol, "bytes", live=True)
+    named = protocols[0] if len(protocols) == 1 else None
+    speed = baud or (named.speed if named else BAUD)
+    requests: list[tuple[bytes, int]] = []
+    if named is not None and named.request is not None:
+        requests = [named.request(sensor) for sensor in places(named) if sensor is not None]
+        if not requests:
+            raise EdgeposeError(
+                f"{name}: devices of {named.name} are asked by id; give their ids with --sensors"
+            )
+
+    def open_it() -> Handle:
+        # pyserial is not needed to read files.
+        from edgepose.sources.serial_port import SerialPort
+
+        return SerialPort(name, speed, requests)
+
+    check = ("--port and that the device is on and sending", f"--baud (now {speed}) and --protocol")
+    return Link(name, open_it, protocols, places, "bytes", check)
+
+
+def can_link(
+    name: str, protocol: str, bitrate: int | None, fd: bool, places: Callable[[Protocol], Places]
+) -> Link:
+    """One CAN bus.
+
+    Raises:
+        EdgeposeError: no such protocol.
+    """
+    protocols = candidates(protocol, "can", live=True)
+    speed = bitrate or (protocols[0].speed if len(protocols) == 1 else BITRATE)
+
+    def open_it() -> Handle:
+        # python-can takes a while to import.
+        from edgepose.sources.can_bus import CanBus
+
+        return CanBus(name, speed, fd)
+
+    check = (
+        f"that the devices are on and that --bitrate (now {speed}) is theirs",
+        "--protocol, --fd and the ids that the devices are set to",
+    )
+    return Link(name, open_it, protocols, places, "frames", check)
+
+
+def _names(flag: str, text: str | None) -> Sequence[str]:
+    names = [] if text is None else [name.strip() for name in text.split(",")]
+    for i, name in enumerate(names):
+        if not name:
+            raise EdgeposeError(f"{flag} {text}: an empty name between commas")
+        if name in names[:i]:
+            raise EdgeposeError(f"{flag} {text}: {name} is there twice")
+    return names

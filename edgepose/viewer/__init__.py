@@ -1,0 +1,1 @@
+"""Poses as a figure in the browser."""

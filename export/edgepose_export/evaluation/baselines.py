@@ -1,0 +1,156 @@
+"""Trivial answers that a network must beat: they stand beside every result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from edgepose import rotations as rot
+from edgepose.inference.features import network_input
+from edgepose.placements import BONES, ROOT
+from edgepose.skeleton import JOINTS, PARENTS, UNOBSERVED, forward_kinematics, local_from_global
+from edgepose_export.synthesis.virtual_imus import straight_pose
+from edgepose_export.training.dataset import Take
+
+Array = NDArray[np.float64]
+
+NEIGHBOURS = 8
+
+MOST_FRAMES = 50_000
+"""Training frames that the nearest neighbours are looked for in, spread evenly: 55 MB."""
+
+_BETWEEN = {
+    # unobserved joint: (nearest sensors' bones along the body, share of the way from the first to the second)
+    1: (0, 4, 1 / 2), 2: (0, 5, 1 / 2),
+    3: (0, 15, 1 / 5), 6: (0, 15, 2 / 5), 9: (0, 15, 3 / 5), 12: (0, 15, 4 / 5),
+    13: (0, 15, 3 / 5), 14: (0, 15, 3 / 5),
+    16: (9, 18, 1 / 2), 17: (9, 19, 1 / 2),
+}  # fmt: skip
+"""Thighs halfway between pelvis and shank, trunk and neck in equal steps from pelvis to head, collars with
+the chest, upper arms halfway between chest and forearm."""
+
+
+def _measured(take: Take) -> Array:
+    """Global rotations (T, 24, 3, 3) in T with the measured bones in place, the rest undefined."""
+    poses = np.full((len(take.orientation), 24, 3, 3), np.nan)
+    poses[:, list(BONES)] = take.orientation
+    return poses
+
+
+def _local(poses: Array) -> Array:
+    """Local rotations of global ones; feet, toes, wrists and hands first take their parents' rotation."""
+    for joint, parent in enumerate(PARENTS):
+        if JOINTS[joint].endswith(("ankle", "foot", "wrist", "hand")):
+            poses[:, joint] = poses[:, parent]
+    return local_from_global(poses)
+
+
+def interpolated(take: Take, offsets: Array | None = None) -> Array:
+    """Local poses (T, 24, 3, 3): measured bones, the others interpolated from the nearest sensors.
+
+    Args:
+        take: whose sensors are used.
+        offsets: (24, 3, 3) turned in behind each interpolated rotation, see `Baselines.offsets`.
+    """
+    poses = _measured(take)
+    for joint, (first, second, share) in sorted(_BETWEEN.items(), key=lambda item: item[0]):
+        a, b = (rot.matrix_to_quat(poses[:, bone]) for bone in (first, second))
+        poses[:, joint] = rot.quat_to_matrix(rot.slerp(a, b, np.full(len(a), share)))
+    if offsets is not None:
+        poses[:, list(UNOBSERVED)] = poses[:, list(UNOBSERVED)] @ offsets[list(UNOBSERVED)]
+    return _local(poses)
+
+
+class Baselines(NamedTuple):
+    """What the baselines know of the training takes.
+
+    Attributes:
+        mean_pose: (24, 3, 3) mean local rotations.
+        offsets: (24, 3, 3) mean rotation from each interpolated joint's guess to its truth, in its frame.
+        inputs: (N, 60) float32 network inputs of single frames, at most `MOST_FRAMES`.
+        poses: (N, 24, 3, 3) float32 their local rotations.
+    """
+
+    mean_pose: Array
+    offsets: Array
+    inputs: NDArray[np.float32]
+    poses: NDArray[np.float32]
+
+
+def learn(takes: Iterable[Take], every: int = 10) -> Baselines:
+    """Means over every tenth frame of the training takes, and single frames; one take in memory at a time."""
+    sums, count = np.zeros((2, 24, 3, 3)), 0
+    kept: list[tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]] = []
+    seen, stride = 0, 1
+    for take in takes:
+        part = take._replace(orientation=take.orientation[::every], pose=take.pose[::every])
+        local = part.pose.astype(float)
+        sums += local.sum(0), (rot.transpose(_globals(interpolated(part))) @ _globals(local)).sum(0)
+        count += len(local)
+        frames = np.arange(seen, seen + len(take.pose))
+        seen += len(frames)
+        chosen = frames % stride == 0
+        kept.append((frames[chosen], _inputs(take)[chosen], take.pose[chosen]))
+        while sum(len(numbers) for numbers, *_ in kept) > MOST_FRAMES:
+            stride *= 2
+            kept = [tuple(x[row[0] % stride == 0] for x in row) for row in kept]  # type: ignore[misc]
+    mean_pose, offsets = rot.nearest_rotation(sums / count)
+    _, inputs, poses = (np.concatenate(column) for column in zip(*kept, strict=True))
+    return Baselines(mean_pose, offsets, inputs, poses)
+
+
+def _inputs(take: Take) -> NDArray[np.float32]:
+    orientation, acceleration = torch.tensor(take.orientation), torch.tensor(take.acceleration)
+    return network_input(orientation.float(), acceleration.float()).numpy()
+
+
+def _globals(local: Array) -> Array:
+    return forward_kinematics(local, np.zeros((24, 3)))[0]
+
+
+def _still(pose: Array, take: Take) -> Array:
+    """One local pose (24, 3, 3) for every frame of a take, turned as the pelvis sensor is."""
+    poses = np.tile(pose, (len(take.orientation), 1, 1, 1))
+    poses[:, 0] = take.orientation[:, ROOT]
+    return poses
+
+
+def with_measured_bones(take: Take, pose: Array) -> Array:
+    """Local poses (T, 24, 3, 3): measured bones, all other joints as in a local pose (24, 3, 3)."""
+    poses = _measured(take)
+    for joint, parent in enumerate(PARENTS):
+        if joint not in BONES:
+            poses[:, joint] = poses[:, parent] @ pose[joint]
+    return local_from_global(poses)
+
+
+def nearest(take: Take, learnt: Baselines) -> Array:
+    """Local poses (T, 24, 3, 3): the mean of the training frames whose inputs are nearest, frame by frame."""
+    scale = learnt.inputs.std(0).clip(1e-3)
+    known = torch.from_numpy(learnt.inputs / scale)
+    rows = []
+    for part in torch.from_numpy(_inputs(take) / scale).split(256):
+        distances = torch.cdist(part, known)
+        rows.append(distances.topk(min(NEIGHBOURS, len(known)), largest=False).indices)
+    poses = rot.nearest_rotation(learnt.poses[torch.cat(rows).numpy()].astype(float).mean(1))
+    poses[:, 0] = take.orientation[:, ROOT]
+    return poses
+
+
+METHODS: dict[str, Callable[[Take, Baselines], Array]] = {
+    "mean pose": lambda take, learnt: _still(learnt.mean_pose, take),
+    "frozen calibration pose": lambda take, _: _still(local_from_global(straight_pose()), take),
+    "measured bones, others' mean local pose": lambda take, learnt: with_measured_bones(
+        take, learnt.mean_pose
+    ),
+    "measured bones, others interpolated": lambda take, _: interpolated(take),
+    "measured bones, others interpolated + mean offsets": lambda take, learnt: interpolated(
+        take, learnt.offsets
+    ),
+    f"{NEIGHBOURS} nearest neighbours of the frame": nearest,
+}
+"""Local poses (T, 24, 3, 3) of each baseline, by its name; all of them know the root's orientation."""

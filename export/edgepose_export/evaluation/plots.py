@@ -1,0 +1,107 @@
+"""Pictures of evaluations, DIP's figures 5 and 6 among them; needs matplotlib."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgepose.analysis.figures import require_matplotlib, save_picture
+from edgepose.errors import EdgeposeError
+from edgepose.utils.durable_files import reason
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from edgepose_export.evaluation.uncertainty import Reliability
+
+Array = NDArray[np.float64]
+
+PANEL_IN, DPI = 4.5, 150
+MOST_DEG = 60
+"""Errors beyond are counted in the last bin of a histogram."""
+
+
+def histogram(path: Path, parts: Mapping[str, Mapping[str, Array]]) -> None:
+    """Distribution of errors, as DIP's figure 5.
+
+    Args:
+        path: picture to write.
+        parts: for each part of the split each method's errors (N,), deg.
+    """
+    figure, axes = _panels(list(parts))
+    edges = np.arange(MOST_DEG + 1)
+    for ax, methods in zip(axes, parts.values(), strict=True):
+        for name, errors in methods.items():
+            share = 100.0 * np.histogram(errors.clip(0, MOST_DEG), edges)[0] / len(errors)
+            ax.stairs(share, edges, label=name)
+        label = f"SIP error, deg (the last degree: all beyond {MOST_DEG - 1})"
+        ax.set(xlabel=label, ylabel="frames, %", xlim=(0, MOST_DEG), ylim=(0, None))
+    _legend(figure, axes)
+    _save(figure, path)
+
+
+def heat_map(path: Path, parts: Mapping[str, Array], past: list[int], future: list[int]) -> None:
+    """Mean errors against past and future frames, as DIP's figure 6.
+
+    Args:
+        path: picture to write.
+        parts: for each part of the split mean errors (len(future), len(past)), deg.
+        past: numbers of past frames, rising.
+        future: numbers of future frames, rising.
+    """
+    figure, axes = _panels(list(parts))
+    for ax, means in zip(axes, parts.values(), strict=True):
+        image = ax.imshow(means, origin="lower", cmap="viridis_r", aspect="auto")
+        ax.set_xticks(range(len(past)), past)
+        ax.set_yticks(range(len(future)), future)
+        ax.set(xlabel="past frames", ylabel="future frames")
+        middle = (means.min() + means.max()) / 2
+        for (row, column), value in np.ndenumerate(means):
+            ink = "white" if value > middle else "black"
+            ax.text(column, row, f"{value:.1f}", ha="center", va="center", color=ink, fontsize="small")
+        figure.colorbar(image, ax=ax, label="SIP error, deg")
+    _save(figure, path)
+
+
+def reliability_plot(path: Path, parts: Mapping[str, Mapping[str, Reliability]]) -> None:
+    """Actual against predicted errors in quantiles of the predicted ones, for each part and method."""
+    figure, axes = _panels(list(parts))
+    for ax, methods in zip(axes, parts.values(), strict=True):
+        most = 0.0
+        for name, result in methods.items():
+            ax.plot(result.predicted_deg, result.actual_deg, "o-", label=name)
+            most = max(most, *result.predicted_deg, *result.actual_deg)
+        ax.plot([0, most], [0, most], color="0.6", linestyle="--", label="as predicted")
+        ax.set(xlabel="predicted standard deviation, deg", ylabel="actual RMS error, deg")
+    _legend(figure, axes)
+    _save(figure, path)
+
+
+def _panels(titles: list[str]) -> tuple[Figure, list[Any]]:
+    """A figure with a panel for each title, side by side."""
+    require_matplotlib("drawing")
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(PANEL_IN * len(titles) + 0.5, PANEL_IN), layout="constrained")
+    axes = list(figure.subplots(1, len(titles), squeeze=False)[0])
+    for ax, title in zip(axes, titles, strict=True):
+        ax.set_title(title)
+    return figure, axes
+
+
+def _legend(figure: Figure, axes: list[Any]) -> None:
+    """One legend for all panels, below them."""
+    handles, labels = axes[0].get_legend_handles_labels()
+    columns = 2 if len(axes) > 1 else 1
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize="small")
+
+
+def _save(figure: Figure, path: Path) -> None:
+    try:
+        save_picture(figure, path, dpi=DPI)
+    except EdgeposeError as error:
+        raise EdgeposeError(f"{path}: cannot be written: {reason(error)}") from error

@@ -1,0 +1,251 @@
+"""The networks of DIP 3.4 as they are trained, with `torch.nn.LSTM`, and what their numbers mean.
+
+`edgepose_export.networks.lstm` has the form in which the same weights run.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from edgepose.inference.features import ACCELERATIONS, local_rotations, nearest_rotation, rotation_from_6d
+from edgepose.placements import BONES, PLACEMENTS, ROOT
+from edgepose.skeleton import PARENTS, PREDICTED, UNOBSERVED
+from edgepose_export.networks.normalisation import tilt_of
+
+SIGMA_FLOOR = 0.02
+"""Smallest standard deviation a network may claim, in normalised units.
+
+Without it, joints that never move take all gradient.
+"""
+
+
+class NetworkShape(NamedTuple):
+    """What decides the weights' shapes, the meaning of the outputs and what is done with them.
+
+    Attributes:
+        kind: "birnn" or "rnn" (DIP 3.4), "feed-forward" or "wavenet" (DIP appendix A).
+        hidden: units of the dense layer and of each LSTM direction, or of the widest layer; 512 in the paper.
+        targets: "local-matrix" (the paper: 9 numbers of each local rotation) or "global-6d" (6 numbers of
+            each rotation in the root's frame).
+        measured: "predicted" (the paper: all 15 joints come from the network) or "passed" (bones that carry a
+            sensor take its orientation; the network predicts the other 10). "passed" needs "global-6d".
+        normalisation: of the inputs, one of `normalisation.SCHEMES`.
+        acceleration: whether accelerations are inputs (without: DIP appendix D).
+        smoothing: of a recurrent network, both poles of a low-pass over its rotations, 0 (none) to 0.99: each
+            of two stages keeps this share of what it gave in the last frame. It is there in training too, so
+            that the network learns to make up for its delay. It works on rotations as seen from a level
+            pelvis (`normalisation.tilt_of`). Seen from the pelvis itself a bone at rest moves whenever the
+            pelvis shakes, and smoothing would leave it that; seen from the room the body would stay behind
+            in every turn, of which the inputs tell nothing. Needs "global-6d".
+    """
+
+    kind: str = "birnn"
+    hidden: int = 512
+    targets: str = "local-matrix"
+    measured: str = "predicted"
+    normalisation: str = "root"
+    acceleration: bool = True
+    smoothing: float = 0.0
+
+    @property
+    def inputs(self) -> int:
+        """Numbers of the input: 60 in the paper."""
+        sensors = len(PLACEMENTS) - (self.normalisation in ("root", "tilt"))
+        own = 3 + 3 * self.acceleration if self.normalisation == "tilt" else 0
+        return sensors * (9 + 3 * self.acceleration) + own
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        """SMPL joints that the network predicts."""
+        return UNOBSERVED if self.measured == "passed" else PREDICTED
+
+    @property
+    def numbers(self) -> int:
+        """Numbers a joint."""
+        return 9 if self.targets == "local-matrix" else 6
+
+    @property
+    def pose_outputs(self) -> int:
+        """Numbers of the pose part of the output."""
+        return len(self.joints) * self.numbers
+
+
+class PoseNetwork(nn.Module):
+    """Dense layer with ReLU, two LSTM layers, heads for means and standard deviations (DIP figure 12)."""
+
+    def __init__(self, shape: NetworkShape) -> None:
+        """Random weights for a shape."""
+        super().__init__()
+        self.shape = shape
+        both = shape.kind == "birnn"
+        width = shape.hidden * (2 if both else 1)
+        outputs = shape.pose_outputs + ACCELERATIONS
+        self.dense = nn.Linear(shape.inputs, shape.hidden)
+        self.lstm1 = nn.LSTM(shape.hidden, shape.hidden, batch_first=True, bidirectional=both)
+        self.lstm2 = nn.LSTM(width, shape.hidden, batch_first=True, bidirectional=both)
+        self.mean = nn.Linear(width, outputs)
+        self.deviation = nn.Linear(width, outputs)
+
+    def forward(self, x: Tensor, future: int = 0) -> tuple[Tensor, Tensor]:
+        """Normalised means and standard deviations of z-scored inputs.
+
+        Args:
+            x: (B, T, inputs).
+            future: of a bidirectional network: run it as a stream runs, in which a frame knows so many frames
+                after it; 0 for whole sequences.
+
+        Returns:
+            Twice (B, T, outputs); of a stream (B, T - future, outputs), the frames whose future is known.
+        """
+        x = torch.relu(self.dense(x))
+        if future == 0:
+            x, _ = self.lstm1(x)
+            x, _ = self.lstm2(x)
+        else:
+            x = self._streamed(x, future)
+        return self.mean(x), nn.functional.softplus(self.deviation(x)) + SIGMA_FLOOR
+
+    def _streamed(self, x: Tensor, future: int) -> Tensor:
+        """Outputs (B, T - future, 2 hidden) of the recurrent layers as `recurrent.BirnnArchive.stream` gives
+        them: forward states go on, backward passes run over a frame and its future only.
+        """
+        forward1 = _direction(self.lstm1, x, "")
+        backward1 = _direction(self.lstm1, _ahead(x, future), "_reverse")
+        ahead = torch.cat([_ahead(forward1, future), backward1], dim=-1)
+        frames = (len(x), -1)
+        forward2 = _direction(self.lstm2, ahead[:, 0].unflatten(0, frames), "")
+        backward2 = _direction(self.lstm2, ahead, "_reverse")[:, 0].unflatten(0, frames)
+        return torch.cat([forward2, backward2], dim=-1)
+
+
+def smoothed(pose: Tensor, root: Tensor, smoothing: float) -> Tensor:
+    """Low-pass over the frames of "global-6d" numbers (B, T, 6 N) as seen from a level pelvis: weighted means
+    of each frame and all before it, which `recurrent.Ends.smoothed` carries on but for their scale.
+
+    Args:
+        pose: numbers in the targets' own units.
+        root: (B, T, 3, 3) orientation of the pelvis sensor's bone.
+        smoothing: see `NetworkShape`.
+    """
+    frame = torch.arange(pose.shape[1], device=pose.device, dtype=pose.dtype)
+    age = (frame[:, None] - frame).clamp_min(0.0)
+    weights = ((age + 1.0) * smoothing**age).tril()  # what two equal poles answer to an impulse
+    weights = weights * (weights > 1e-20)  # numbers that are smaller still make products slow
+    weights = weights / weights.sum(dim=1, keepdim=True)
+    tilt = tilt_of(root)
+    return turned(weights @ turned(pose, tilt), tilt.transpose(-1, -2))
+
+
+def turned(pose: Tensor, rotation: Tensor) -> Tensor:
+    """Numbers (..., 3 N), N vectors, turned by rotations (..., 3, 3)."""
+    return torch.matmul(pose.unflatten(-1, (-1, 3)), rotation.transpose(-1, -2)).flatten(-2)
+
+
+def _ahead(x: Tensor, future: int) -> Tensor:
+    """Each frame of (B, T, units) with its future: (B (T - future), 1 + future, units)."""
+    return x.unfold(1, future + 1, 1).transpose(-1, -2).flatten(0, 1)
+
+
+def _direction(lstm: nn.LSTM, x: Tensor, suffix: str) -> Tensor:
+    """Outputs (B, T, hidden) of one direction of a layer: "" forwards, "_reverse" from last to first."""
+    names = ("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0")
+    weights = [getattr(lstm, name + suffix) for name in names]
+    zero = x.new_zeros(1, len(x), lstm.hidden_size)
+    order = x.flip(1) if suffix else x
+    result = torch.lstm(order, (zero, zero), weights, True, 1, 0.0, lstm.training, False, True)[0]
+    return result.flip(1) if suffix else result
+
+
+class PoseDecoder(nn.Module):
+    """Network outputs to SMPL's 24 local rotations; differentiable, scriptable."""
+
+    def __init__(
+        self,
+        shape: NetworkShape,
+        target_mean: Tensor,
+        target_std: Tensor,
+        std_scale: Tensor | None = None,
+    ) -> None:
+        """Decoder of a network's outputs, whose pose part was normalised by these statistics.
+
+        Args:
+            shape: of the network.
+            target_mean: (pose outputs,) means of the targets.
+            target_std: (pose outputs,) their standard deviations.
+            std_scale: (24,) factors of the joints' standard deviations; ones when None.
+        """
+        super().__init__()
+        self.local = shape.targets == "local-matrix"
+        self.passed = shape.measured == "passed"
+        self.joints = len(shape.joints)
+        self.numbers = shape.numbers
+        self.register_buffer("target_mean", target_mean)
+        self.register_buffer("target_std", target_std)
+        self.register_buffer("source", torch.tensor(_sources(shape)))
+        self.register_buffer("parents", torch.tensor(PARENTS[1:]))
+        scale = torch.ones(len(PARENTS)) if std_scale is None else std_scale
+        self.register_buffer("variances", _variances(shape, target_std, scale))
+
+    def forward(self, orientation: Tensor, mean: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
+        """Poses of frames.
+
+        Args:
+            orientation: (..., 6, 3, 3) calibrated bone orientations R_TB.
+            mean: (..., pose outputs + 15) means in normalised units.
+            deviation: the same shape, standard deviations.
+
+        Returns:
+            (..., 24, 3, 3) local rotations, joint 0 the pelvis sensor's orientation; (..., 24) standard
+            deviations, radians.
+        """
+        size = self.joints * self.numbers
+        pose = mean[..., :size] * self.target_std + self.target_mean
+        return self.rotations(orientation, pose), self.deviations(deviation[..., :size])
+
+    @torch.jit.export
+    def deviations(self, deviation: Tensor) -> Tensor:
+        """Standard deviations (..., 24), radians, of those (..., pose outputs) in normalised units."""
+        return torch.sqrt(torch.matmul(deviation.square(), self.variances))
+
+    @torch.jit.export
+    def rotations(self, orientation: Tensor, pose: Tensor) -> Tensor:
+        """Local rotations (..., 24, 3, 3) of the pose part (..., pose outputs) in the targets' own units."""
+        y = pose.unflatten(-1, (self.joints, self.numbers))
+        root = orientation[..., -1, :, :]
+        identity = torch.eye(3, dtype=y.dtype).expand_as(root).unsqueeze(-3)
+        if self.local:
+            rotations = nearest_rotation(y.unflatten(-1, (3, 3)))
+            local = torch.cat([identity, rotations], dim=-3).index_select(-3, self.source)
+            return torch.cat([root.unsqueeze(-3), local[..., 1:, :, :]], dim=-3)
+        known = [identity, rotation_from_6d(y)]
+        if self.passed:
+            known.append(torch.matmul(root.unsqueeze(-3).transpose(-1, -2), orientation[..., :-1, :, :]))
+        relative = torch.cat(known, dim=-3).index_select(-3, self.source)
+        return local_rotations(relative, root, self.parents)
+
+
+def _sources(shape: NetworkShape) -> list[int]:
+    """For each of the 24 joints the row of [identity, predicted..., measured...] that holds its rotation."""
+    rows = {joint: 1 + i for i, joint in enumerate(shape.joints)}
+    if shape.measured == "passed":
+        rows |= {bone: 1 + len(shape.joints) + i for i, bone in enumerate(BONES[:ROOT])}
+    result = [0]
+    for joint in range(1, 24):
+        # Feet, toes, wrists and hands rest: locally the identity, globally their parent's rotation.
+        rest = 0 if shape.targets == "local-matrix" else result[PARENTS[joint]]
+        result.append(rows.get(joint, rest))
+    return result
+
+
+def _variances(shape: NetworkShape, target_std: Tensor, std_scale: Tensor) -> Tensor:
+    """What each output's variance in normalised units adds to each joint's in rad^2, (pose outputs, 24)."""
+    # A small rotation by d moves a matrix's entries by sqrt(2) d, those of its first two columns by
+    # sqrt(4/3) d on average.
+    spread = 2.0 if shape.targets == "local-matrix" else 4.0 / 3.0
+    joint = torch.tensor(shape.joints).repeat_interleave(shape.numbers)
+    result = torch.zeros(len(joint), len(PARENTS))
+    result[torch.arange(len(joint)), joint] = ((target_std * std_scale[joint]).square() / spread).float()
+    return result

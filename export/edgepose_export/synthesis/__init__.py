@@ -1,0 +1,1 @@
+"""Virtual sensors, and what makes them like real ones."""

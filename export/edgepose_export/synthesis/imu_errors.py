@@ -1,0 +1,67 @@
+"""What an IMU chip makes of ideal rates and forces: noise, bias, and no orientation."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from edgepose.calibration import GRAVITY
+from edgepose.formats.recordings.csv_npz import SensorData
+from edgepose.rotations import Array, quat_conjugate, quat_rotate
+
+
+class Chip(NamedTuple):
+    """Errors of one kind of chip; biases are one standard deviation from chip to chip.
+
+    Attributes:
+        gyr_noise: rad/s/sqrt(Hz).
+        gyr_bias: rad/s.
+        acc_noise: m/s^2/sqrt(Hz).
+        acc_bias: m/s^2.
+        mag_noise: uT, each sample.
+    """
+
+    gyr_noise: float
+    gyr_bias: float
+    acc_noise: float
+    acc_bias: float
+    mag_noise: float
+
+
+BMI270 = Chip(
+    gyr_noise=np.radians(0.007), gyr_bias=np.radians(0.5),
+    acc_noise=160e-6 * GRAVITY, acc_bias=20e-3 * GRAVITY, mag_noise=0.5,
+)  # fmt: skip
+"""Bosch BST-BMI270-DS000, revision 1.3: noise densities, zero-rate and zero-g offset, all typical. The
+magnetometer, which it has none of, is of the size of common ones.
+"""
+
+FIELD_UT = (0.0, 20.0, -40.0)
+"""Magnetic field in the inertial frame, about that of central Europe."""
+
+
+def raw(data: SensorData, chip: Chip, seed: int, magnetometer: bool) -> SensorData:
+    """What a chip would have measured of an ideal sensor: the same without orientation, with its errors.
+
+    Raises:
+        ValueError: there is no rate, no force, or no orientation to make the magnetic field of.
+    """
+    if data.gyr is None or data.acc is None or (magnetometer and data.mag is None and data.quat is None):
+        raise ValueError("it has no rates and forces to add errors to")
+    rng = np.random.default_rng(seed)
+    # The biases come first: they are the chip's, whatever it records.
+    gyr_bias, acc_bias = rng.normal(0.0, chip.gyr_bias, 3), rng.normal(0.0, chip.acc_bias, 3)
+    # White noise up to half the rate of the samples.
+    bandwidth = np.sqrt(0.5 / np.median(np.diff(data.time_s)))
+
+    def spoilt(rows: Array, noise: float, bias: Array | float) -> Array:
+        return rows + bias + rng.normal(0.0, noise, rows.shape)
+
+    gyr = spoilt(data.gyr, chip.gyr_noise * bandwidth, gyr_bias)
+    acc = spoilt(data.acc, chip.acc_noise * bandwidth, acc_bias)
+    mag = None
+    if magnetometer:
+        ideal = data.mag if data.mag is not None else quat_rotate(quat_conjugate(data.quat), FIELD_UT)
+        mag = spoilt(ideal, chip.mag_noise, 0.0)
+    return SensorData(data.time_s, None, acc, gyr, mag)

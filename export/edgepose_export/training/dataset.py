@@ -1,0 +1,186 @@
+"""Synthetic recordings on disk to tensors for training and evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import accumulate
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from edgepose import rotations as rot
+from edgepose.calibration import GRAVITY
+from edgepose.errors import EdgeposeError
+from edgepose.placements import BONES, PLACEMENTS
+from edgepose.skeleton import PARENTS, forward_kinematics
+from edgepose.utils.safe_npz import BROKEN, open_npz
+from edgepose_export.synthesis.virtual_imus import INERTIAL_FROM_BODY
+from edgepose_export.training.splits import part_of
+
+SEATED = ".seated"
+"""Ends the names of takes whose legs were made by `edgepose_export.synthesis.sitting`."""
+
+RATE = 60.0
+"""Frames a second that the networks are made for."""
+
+
+class Take(NamedTuple):
+    """One synthetic recording.
+
+    Attributes:
+        name: file name without folder and ending.
+        orientation: (T, 6, 3, 3) float32 bone orientations R_TB.
+        acceleration: (T, 6, 3) float32 accelerations in T without gravity, m/s^2.
+        pose: (T, 24, 3, 3) float32 true local rotations.
+        license: the licence of the motion it was made from.
+    """
+
+    name: str
+    orientation: NDArray[np.float32]
+    acceleration: NDArray[np.float32]
+    pose: NDArray[np.float32]
+    license: str
+
+
+def read_take(path: Path) -> Take:
+    """A recording that `edgepose synthesize` wrote with sensors aligned with the bones.
+
+    Raises:
+        EdgeposeError: not such a file.
+    """
+    try:
+        with open_npz(path) as data:
+            quats = np.stack([data[f"{name}_quat"] for name in PLACEMENTS], axis=1)
+            force = np.stack([data[f"{name}_acc"] for name in PLACEMENTS], axis=1)
+            poses = data["poses"].reshape(-1, 24, 3)
+            rate, license_note = float(data["mocap_framerate"]), str(data["license"])
+        if not len(poses) == len(quats) == len(force):
+            raise ValueError("sensors and poses differ in length")
+    except (OSError, *BROKEN) as error:
+        raise EdgeposeError(
+            f"{path}: not a recording with true poses ({error}); make it with edgepose synthesize"
+        ) from error
+    if rate != RATE:
+        raise EdgeposeError(
+            f"{path}: has {rate:g} frames a second; networks need edgepose synthesize --rate 60"
+        )
+    inertial = rot.quat_to_matrix(quats)
+    orientation = INERTIAL_FROM_BODY.T @ inertial
+    local = rot.rotvec_to_matrix(poses)
+    bones = forward_kinematics(local[0], np.zeros((24, 3)))[0][list(BONES)]
+    if not (rot.angle_between(orientation[0], bones) < 0.01).all():
+        raise EdgeposeError(
+            f"{path}: the sensors are not aligned with the bones; use edgepose synthesize without --mounting"
+        )
+    force_inertial = np.einsum("tsij,tsj->tsi", inertial, force.astype(float))
+    # A frame of a run holds the mean over the time since the frame before, see `FrameClock`.
+    force_inertial[1:] = 0.5 * (force_inertial[1:] + force_inertial[:-1])
+    acceleration = (force_inertial - [0.0, 0.0, GRAVITY]) @ INERTIAL_FROM_BODY
+    return Take(
+        path.stem,
+        orientation.astype(np.float32),
+        acceleration.astype(np.float32),
+        local.astype(np.float32),
+        license_note,
+    )
+
+
+def take_paths(folder: Path, part: str) -> list[Path]:
+    """Files of all takes of one part of the split below a folder, by name; the part "all" is every take.
+
+    Raises:
+        EdgeposeError: none found.
+    """
+    paths = sorted(
+        (p for p in folder.rglob("*.npz") if part in ("all", part_of(p.stem))), key=lambda p: p.stem
+    )
+    if not paths:
+        raise EdgeposeError(
+            f"{folder}: no {'recordings' if part == 'all' else f'recording of the part {part!r}'}; "
+            f"make them with edgepose synthesize --out {folder}"
+        )
+    return paths
+
+
+def training_paths(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Files of takes to train on and of takes that tell when to stop.
+
+    Where no name belongs to the validation part (a user's own recordings), every tenth take goes there.
+
+    Raises:
+        EdgeposeError: fewer than two takes, or none to train on.
+    """
+    paths = take_paths(folder, "train")
+    if any(part_of(path.stem) == "validation" for path in folder.rglob("*.npz")):
+        return paths, take_paths(folder, "validation")
+    if len(paths) < 2:
+        raise EdgeposeError(f"{folder}: one recording is not enough: another must tell when to stop training")
+    return [path for i, path in enumerate(paths) if i % 10], paths[::10]
+
+
+class Tape(NamedTuple):
+    """Takes one after the other, as tensors.
+
+    Attributes:
+        orientation: (N, 6, 3, 3) R_TB.
+        acceleration: (N, 6, 3) in T, m/s^2.
+        relative: (N, 24, 3, 3) true global rotations in the root's frame.
+        starts: first frame of each take; one more entry holds N.
+        names: of the takes.
+        licenses: of each take's motion.
+    """
+
+    orientation: Tensor
+    acceleration: Tensor
+    relative: Tensor
+    starts: Tensor
+    names: list[str]
+    licenses: list[str]
+
+    @property
+    def free(self) -> list[bool]:
+        """Whether each take is CMU's, free for all use."""
+        return [text.startswith("CMU") for text in self.licenses]
+
+    @property
+    def seated(self) -> list[bool]:
+        """Whether each take's legs were made by `edgepose_export.synthesis.sitting`."""
+        return [name.endswith(SEATED) for name in self.names]
+
+
+def tape(takes: list[Take]) -> Tape:
+    """Joins takes; none give an empty tape."""
+    lengths = [len(take.pose) for take in takes]
+    return Tape(
+        torch.cat([torch.zeros(0, 6, 3, 3), *(torch.from_numpy(take.orientation) for take in takes)]),
+        torch.cat([torch.zeros(0, 6, 3), *(torch.from_numpy(take.acceleration) for take in takes)]),
+        torch.cat(
+            [torch.zeros(0, 24, 3, 3), *(root_relative_pose(torch.from_numpy(take.pose)) for take in takes)]
+        ),
+        torch.tensor([0, *accumulate(lengths)]),
+        [take.name for take in takes],
+        [take.license for take in takes],
+    )
+
+
+def root_relative_pose(local: Tensor) -> Tensor:
+    """Global rotations (..., 24, 3, 3) in the root's frame of local ones."""
+    result = [torch.eye(3, dtype=local.dtype).expand((*local.shape[:-3], 3, 3))]
+    for joint in range(1, 24):
+        result.append(result[PARENTS[joint]] @ local[..., joint, :, :])
+    return torch.stack(result, dim=-3)
+
+
+def describe(licenses: Iterable[str], takes: int, frames: int) -> dict[str, Any]:
+    """What an archive's card says of the motion that it was trained on."""
+    licenses = sorted(set(licenses))
+    return {
+        "summary": " and ".join(text.split(",")[0].split(" (")[0] for text in licenses),
+        "licenses": licenses,
+        "takes": takes,
+        "hours": frames / RATE / 3600.0,
+    }

@@ -1,0 +1,99 @@
+"""Takes packed into files that are mapped into memory, so that training needs little of it.
+
+A packed tape is a folder with one file of raw float32 numbers for each of a tape's tensors, and `tape.json`,
+written last, with what else there is to know. It is made once and used again as long as the takes are the
+same files.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from edgepose.errors import EdgeposeError
+from edgepose_export.training.dataset import Tape, read_take, root_relative_pose
+
+FRAME = {"orientation": (6, 3, 3), "acceleration": (6, 3), "relative": (24, 3, 3)}
+"""Shape of one frame in each file."""
+
+_INDEX = "tape.json"
+
+
+def packed_tape(
+    paths: list[Path], folder: Path, progress: Callable[[list[Path]], Iterable[Path]] = iter
+) -> Tape:
+    """The takes of some files as a tape whose tensors are mapped from a folder.
+
+    Args:
+        paths: recordings that `edgepose synthesize` wrote.
+        folder: where the packed tape is, or is made with one take in memory at a time.
+        progress: shows how many takes have been packed.
+
+    Raises:
+        EdgeposeError: a recording cannot be read, or the folder cannot be written.
+    """
+    try:
+        sources = [[str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns] for path in paths]
+        about = _read_index(folder)
+        if about is None or about["sources"] != sources:
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / _INDEX).unlink(missing_ok=True)
+            about = {"sources": sources, **_pack(paths, folder, progress)}
+            (folder / _INDEX).write_text(json.dumps(about), encoding="utf-8")
+    except OSError as error:
+        raise EdgeposeError(f"{folder}: cannot pack takes there: {error.strerror or error}") from error
+    return Tape(
+        **{name: _mapped(folder, name, sum(about["lengths"])) for name in FRAME},
+        starts=torch.tensor([0, *accumulate(about["lengths"])]),
+        names=about["names"],
+        licenses=about["licenses"],
+    )
+
+
+def _file(folder: Path, name: str) -> Path:
+    return folder / f"{name}.f32"
+
+
+def _pack(
+    paths: list[Path], folder: Path, progress: Callable[[list[Path]], Iterable[Path]]
+) -> dict[str, Any]:
+    names, licenses, lengths = [], [], []
+    with ExitStack() as stack:
+        files = {name: stack.enter_context(_file(folder, name).open("wb")) for name in FRAME}
+        for path in progress(paths):
+            take = read_take(path)
+            relative = root_relative_pose(torch.from_numpy(take.pose)).numpy()
+            for name, array in zip(FRAME, (take.orientation, take.acceleration, relative), strict=True):
+                files[name].write(np.ascontiguousarray(array, "<f4").data)
+            names.append(take.name)
+            licenses.append(take.license)
+            lengths.append(len(take.pose))
+    return {"names": names, "licenses": licenses, "lengths": lengths}
+
+
+def _read_index(folder: Path) -> dict[str, Any] | None:
+    """What is packed in a folder; None if that is nothing, or not complete."""
+    try:
+        about = json.loads((folder / _INDEX).read_text(encoding="utf-8"))
+        frames = sum(about["lengths"])
+        sizes = {name: _file(folder, name).stat().st_size for name in FRAME}
+        if not len(about["lengths"]) == len(about["names"]) == len(about["licenses"]):
+            return None
+    except (FileNotFoundError, ValueError, TypeError, KeyError):
+        return None
+    whole = all(sizes[name] == 4 * frames * np.prod(shape) for name, shape in FRAME.items())
+    return about if whole else None
+
+
+def _mapped(folder: Path, name: str, frames: int) -> torch.Tensor:
+    if frames == 0:
+        return torch.zeros(0, *FRAME[name])
+    # Copy-on-write, because torch wants arrays that it could write to; the file is never changed.
+    return torch.from_numpy(np.memmap(_file(folder, name), "<f4", "c", shape=(frames, *FRAME[name])))

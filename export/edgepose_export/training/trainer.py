@@ -1,0 +1,507 @@
+"""Training of the networks (DIP 3.4): loss, batches, steps, checkpoints that can be resumed."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from collections.abc import Callable, Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from edgepose.errors import EdgeposeError
+from edgepose.inference.features import ACCELERATIONS, rotation_to_6d
+from edgepose.placements import ROOT
+from edgepose.skeleton import PARENTS
+from edgepose.utils.durable_files import reason, write_whole
+from edgepose_export.archive.torchscript import Statistics, new_network
+from edgepose_export.networks.normalisation import network_inputs, seen_from_first
+from edgepose_export.networks.shape import NetworkShape, smoothed
+from edgepose_export.synthesis.augmentation import augment
+from edgepose_export.synthesis.posture_variation import AFTER, BEFORE, Batch, other_postures
+from edgepose_export.training.config import TrainConfig, config_from, config_values
+from edgepose_export.training.dataset import Tape, describe
+from edgepose_export.training.distributed import ALONE, Processes
+
+CHECKPOINT = "checkpoint.pt"
+
+
+# --- targets and loss ---------------------------------------------------------------------------------------
+
+
+def pose_targets(relative: Tensor, shape: NetworkShape) -> Tensor:
+    """Numbers (..., pose outputs) that the network shall give, before z-scoring, of root-relative rotations
+    (..., 24, 3, 3).
+    """
+    joints = list(shape.joints)
+    if shape.targets == "global-6d":
+        return rotation_to_6d(relative[..., joints, :, :]).flatten(-2)
+    parents = relative[..., [PARENTS[j] for j in joints], :, :].transpose(-1, -2)
+    return torch.matmul(parents, relative[..., joints, :, :]).flatten(-3)
+
+
+def inputs_of(orientation: Tensor, acceleration: Tensor, shape: NetworkShape) -> Tensor:
+    """Inputs (..., T, inputs) of sequences, before z-scoring."""
+    if shape.normalisation == "sequence":
+        orientation, acceleration = seen_from_first(orientation, acceleration)
+    return network_inputs(orientation, acceleration, shape.normalisation, shape.acceleration)
+
+
+def statistics_of(tape: Tape, shape: NetworkShape, processes: Processes = ALONE) -> Statistics:
+    """Means and deviations over the training tapes of all processes (DIP 4.4).
+
+    Local matrices are z-scored entry by entry as in the paper. Global rotations get one deviation for all
+    entries, so that a degree weighs the same at every joint.
+    """
+    moments = torch.zeros(2, shape.inputs + shape.pose_outputs, dtype=torch.float64)
+    # Take by take: a tape may be larger than the memory.
+    for start, end in pairwise(tape.starts.tolist()):
+        x = inputs_of(tape.orientation[start:end], tape.acceleration[start:end], shape)
+        numbers = torch.cat([x, pose_targets(tape.relative[start:end], shape)], dim=-1).double()
+        moments += torch.stack([numbers.sum(0), numbers.square().sum(0)])
+    count = float(processes.total(tape.starts[-1]))
+    mean, square = processes.total(moments) / count
+    deviation = ((square - mean.square()).clamp_min(0.0) * (count / (count - 1.0))).sqrt()
+    input_mean, target_mean = mean.float().split([shape.inputs, shape.pose_outputs])
+    input_std, target_std = deviation.float().split([shape.inputs, shape.pose_outputs])
+    target_std = target_std.clamp_min(1e-2)
+    if shape.targets == "global-6d":
+        target_std = target_std.square().mean().sqrt().expand_as(target_std)
+    return Statistics(input_mean.clone(), input_std.clamp_min(1e-3), target_mean.clone(), target_std.clone())
+
+
+def likelihood_loss(mean: Tensor, deviation: Tensor, target: Tensor, beta: float) -> Tensor:
+    """Negative Gaussian log-likelihood (DIP eq. 4 and 5), each term weighted by deviation^(2 beta) without
+    gradient; a scalar.
+    """
+    loss = torch.log(deviation) + 0.5 * ((target - mean) / deviation).square()
+    if beta:
+        loss = loss * deviation.detach() ** (2.0 * beta)
+    return loss.mean()
+
+
+def tremble_loss(mean: Tensor, target: Tensor) -> Tensor:
+    """Mean square of the second differences in time of the error of (B, T, numbers); a scalar.
+
+    Of two poses that are as wrong it prefers that whose error changes slowly, so that motion stays as smooth
+    as it was.
+    """
+    error = mean - target
+    return (error[:, 2:] - 2.0 * error[:, 1:-1] + error[:, :-2]).square().mean()
+
+
+# --- batches ------------------------------------------------------------------------------------------------
+
+
+Starts = tuple[Tensor, Tensor]
+"""First frames of windows: of other takes, of CMU's."""
+
+
+def window_starts(
+    tape: Tape, window: int, joined: bool, chosen: Callable[[int], bool] = lambda take: True
+) -> Starts:
+    """First frames of all windows that the chosen takes of a tape hold."""
+    groups: tuple[list[Tensor], list[Tensor]] = ([], [])
+    last = int(tape.starts[-1]) - window
+    for i, free in enumerate(tape.free):
+        if not chosen(i):
+            continue
+        start, end = int(tape.starts[i]), int(tape.starts[i + 1])
+        end = min(end - 1, last) if joined else end - window
+        if end >= start:
+            groups[free].append(torch.arange(start, end + 1))
+    empty = torch.zeros(0, dtype=torch.long)
+    return torch.cat([empty, *groups[0]]), torch.cat([empty, *groups[1]])
+
+
+def windows_with_sitting(tape: Tape, window: int) -> Tensor:
+    """Whether the windows from each frame (T,) of a tape on hold frames of takes with made sitting."""
+    frames = torch.zeros(int(tape.starts[-1]) + 1, dtype=torch.int32)
+    for i in (i for i, seated in enumerate(tape.seated) if seated):
+        frames[int(tape.starts[i]) + 1 : int(tape.starts[i + 1]) + 1] = 1
+    before = frames.cumsum(0)
+    first = torch.arange(len(before) - 1)
+    return before[(first + window).clamp(max=len(before) - 1)] > before[first]
+
+
+def draw(starts: Starts, count: int, free_share: float, generator: torch.Generator) -> Tensor:
+    """First frames (count,) of random windows with the wanted share of CMU's."""
+    other, cmu = starts
+    if free_share == 0.0 or len(other) == 0 or len(cmu) == 0:
+        pool = torch.cat([other, cmu])
+        return pool[torch.randint(len(pool), (count,), generator=generator)]
+    free = round(count * free_share)
+    return torch.cat(
+        [
+            cmu[torch.randint(len(cmu), (free,), generator=generator)],
+            other[torch.randint(len(other), (count - free,), generator=generator)],
+        ]
+    )
+
+
+def windows(tape: Tape, starts: Tensor, length: int) -> Batch:
+    """Orientations, accelerations and true rotations of windows, each (len(starts), length, ...)."""
+    index = starts[:, None] + torch.arange(length)
+    return tape.orientation[index], tape.acceleration[index], tape.relative[index]
+
+
+def describe_tape(tape: Tape, processes: Processes = ALONE) -> dict[str, Any]:
+    """What an archive's card says of the takes of all processes."""
+    shares = processes.everywhere((tape.licenses, int(tape.starts[-1])))
+    licenses = [text for texts, _ in shares for text in texts]
+    return describe(licenses, len(licenses), sum(frames for _, frames in shares))
+
+
+# --- the run ------------------------------------------------------------------------------------------------
+
+
+class Trainer:
+    """State of one run: network, averaged weights, optimiser, generator, step."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        train: Tape,
+        validation: Tape,
+        data: dict[str, Any],
+        processes: Processes = ALONE,
+    ) -> None:
+        """Starts a run at step 0.
+
+        Args:
+            config: of the run.
+            train: takes to train on, this process's share.
+            validation: takes that tell when to stop, this process's share.
+            data: what the training takes are, for the archive's card: summary, takes, hours, licenses.
+            processes: that train together.
+        """
+        if config.sequences % processes.size:
+            raise EdgeposeError(
+                f"{config.sequences} sequences a step cannot be shared by {processes.size} processes equally"
+            )
+        torch.manual_seed(config.seed)
+        self.config, self.train_tape, self.validation_tape = config, train, validation
+        self.data, self.processes = data, processes
+        seated = train.seated if config.seated_share else [False] * len(train.names)
+        self.starts = window_starts(train, config.window, config.joined, lambda take: not seated[take])
+        self.seated_starts = window_starts(train, config.window, config.joined, seated.__getitem__)
+        self.sits = windows_with_sitting(train, config.window)
+        counts = processes.everywhere(len(torch.cat(self.starts)))
+        if not all(counts):
+            at = f"process {counts.index(0)} has " if processes.size > 1 else ""
+            raise EdgeposeError(f"{at}no training take is as long as the window of {config.window} frames")
+        if not any(processes.everywhere(len(self._validation_starts()))):
+            raise EdgeposeError(f"no validation take is as long as the window of {config.window} frames")
+        self.statistics = self._placed(statistics_of(train, config.network, processes))
+        self.network = new_network(config.network).to(processes.device)
+        self.averaged = new_network(config.network).to(processes.device)
+        self.averaged.load_state_dict(self.network.state_dict())
+        self.parallel = processes.wrapped(self.network)
+        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate)
+        self._seed(0)
+        self.step = 0
+        self.best = math.inf
+        self.worse = 0
+
+    def _seed(self, step: int) -> None:
+        """Random numbers of this process from a step on."""
+        number = self.config.seed + step * self.processes.size + self.processes.rank
+        self.generator = torch.Generator().manual_seed(number + 1)
+        if self.processes.rank:
+            torch.manual_seed(number)
+
+    def _placed(self, statistics: Statistics) -> Statistics:
+        return Statistics(*(numbers.to(self.processes.device) for numbers in statistics))
+
+    def _loss(
+        self,
+        network: nn.Module,
+        batch: Batch,
+        dropout: float = 0.0,
+        smoothness: float = 0.0,
+    ) -> Tensor:
+        config, s = self.config, self.statistics
+        orientation, acceleration, relative = (part.to(self.processes.device) for part in batch)
+        x = (inputs_of(orientation, acceleration, config.network) - s.input_mean) / s.input_std
+        target = (pose_targets(relative, config.network) - s.target_mean) / s.target_std
+        if config.acceleration_loss:
+            target = torch.cat([target, x[..., -ACCELERATIONS:]], dim=-1)
+        with torch.autocast(x.device.type, torch.bfloat16, enabled=config.bf16):
+            seen = nn.functional.dropout(x, dropout, training=dropout > 0)
+            mean, deviation = network(seen, config.streamed) if config.streamed else network(seen)
+        target = target[:, : mean.shape[1]]  # as a stream, the network leaves out frames without a future
+        numbers, pose = target.shape[-1], config.network.pose_outputs
+        mean = mean[..., :numbers].float()
+        if config.network.smoothing:
+            root = orientation[:, : mean.shape[1], ROOT]
+            smooth = smoothed(mean[..., :pose] * s.target_std + s.target_mean, root, config.network.smoothing)
+            mean = torch.cat([(smooth - s.target_mean) / s.target_std, mean[..., pose:]], dim=-1)
+        loss = likelihood_loss(mean, deviation[..., :numbers].float(), target, config.beta)
+        if smoothness:
+            loss = loss + smoothness * tremble_loss(mean[..., :pose], target[..., :pose])
+        return loss
+
+    def train_step(self) -> float:
+        """One optimiser step; gives its loss."""
+        config = self.config
+        rate = config.learning_rate * (
+            0.96 ** (self.step / 2000)
+            if config.schedule == "exponential"
+            else 0.5 * (1.0 + math.cos(math.pi * self.step / config.steps))
+        )
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate * min(1.0, (self.step + 1) / (config.warm_up + 1))
+        count = config.sequences // self.processes.size
+        seated = round(count * config.seated_share) if len(torch.cat(self.seated_starts)) else 0
+        starts = draw(self.starts, count - seated, config.free_share, self.generator)
+        if seated:
+            starts = torch.cat([starts, draw(self.seated_starts, seated, 0.0, self.generator)])
+        batch = self._batch(starts)
+        loss = self._loss(self.parallel, batch, config.input_dropout, config.smoothness)
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        self.optimiser.step()
+        self.step += 1
+        # The average starts as the plain mean, so that it forgets the random first weights soon.
+        decay = min(config.averaging, self.step / (self.step + 10.0))
+        with torch.no_grad():
+            for mean, new in zip(self.averaged.parameters(), self.network.parameters(), strict=True):
+                mean.lerp_(new, 1.0 - decay)
+        return self.processes.total(loss.detach()).item() / self.processes.size
+
+    def _batch(self, starts: Tensor) -> Batch:
+        """Disturbed windows from some first frames on, those with made sitting last."""
+        how = self.config.augmentation
+        # The pelvis' pitch is what tells sitting from standing.
+        kinds = ((~self.sits[starts], how), (self.sits[starts], how._replace(pelvis_pitch_deg=0.0)))
+        parts = [
+            augment(self._windows(starts[kind]), its, self.generator) for kind, its in kinds if kind.any()
+        ]
+        orientation, acceleration, relative = map(torch.cat, zip(*parts, strict=True))
+        return orientation, acceleration, relative
+
+    def _windows(self, starts: Tensor) -> Batch:
+        """Windows from some first frames on, in other postures if that is wanted."""
+        tape, window, size = self.train_tape, self.config.window, self.config.augmentation.posture
+        if not size:
+            return windows(tape, starts, window)
+        index = starts[:, None] + torch.arange(-BEFORE, window + AFTER)
+        take = torch.searchsorted(tape.starts, index, right=True)
+        index = index.clamp(0, len(tape.relative) - 1)
+        batch = tape.orientation[index], tape.acceleration[index], tape.relative[index]
+        return other_postures(batch, take, size, self.generator)
+
+    def _validation_starts(self) -> Tensor:
+        window = self.config.window
+        return torch.cat(window_starts(self.validation_tape, window, False))[:: max(1, window // 2)]
+
+    @torch.no_grad()
+    def validate(self) -> float:
+        """Likelihood loss of the averaged weights on undisturbed validation windows."""
+        starts, total = self._validation_starts(), torch.zeros(2)
+        for part in starts.split(128) if len(starts) else ():
+            batch = windows(self.validation_tape, part, self.config.window)
+            total += torch.stack([self._loss(self.averaged, batch).cpu(), torch.tensor(1.0)]) * len(part)
+        loss, count = self.processes.total(total)
+        return float(loss / count)
+
+    def state(self) -> dict[str, Any]:
+        """Everything that `load` needs, as tensors and plain values; all processes have to ask together."""
+        generators = self.processes.everywhere((self.generator.get_state(), torch.get_rng_state()))
+        return {
+            "config": json.dumps(config_values(self.config)),
+            "statistics": {name: value.clone() for name, value in self.statistics._asdict().items()},
+            "network": self.network.state_dict(),
+            "averaged": self.averaged.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "generator": torch.stack([state for state, _ in generators]),
+            "torch_generator": torch.stack([state for _, state in generators]),
+            "step": self.step,
+            "best": self.best,
+            "worse": self.worse,
+            "data": self.data,
+        }
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Goes on where a checkpoint stopped, with the same random numbers if the processes are as many.
+
+        Raises:
+            EdgeposeError: the checkpoint is of another network, or holds weights only.
+        """
+        if "optimiser" not in state:
+            raise EdgeposeError("the checkpoint holds weights only; begin a new run from it with --init")
+        self._check_shape(state)
+        self.statistics = self._placed(Statistics(**state["statistics"]))
+        self.network.load_state_dict(state["network"])
+        self.averaged.load_state_dict(state["averaged"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        rank, states = self.processes.rank, torch.atleast_2d(state["generator"])
+        if len(states) == self.processes.size:
+            # Copies: torch crashes on a state that is a view into other memory.
+            self.generator.set_state(states[rank].clone())
+            torch.set_rng_state(torch.atleast_2d(state["torch_generator"])[rank].clone())
+        else:
+            self._seed(state["step"])
+        self.step, self.best, self.worse = state["step"], state["best"], state["worse"]
+        self.data = state["data"]
+
+    def start_from(self, state: dict[str, Any]) -> None:
+        """Fine-tuning (DIP 3.4.4): takes a checkpoint's averaged weights and statistics.
+
+        What it was trained on, and under which licences, is noted together with this run's takes.
+
+        Raises:
+            EdgeposeError: the checkpoint is of another network; only its `smoothing` may differ.
+        """
+        self._check_shape(state, smoothing=self.config.network.smoothing)
+        self.statistics = self._placed(Statistics(**state["statistics"]))
+        self.network.load_state_dict(state["averaged"])
+        self.averaged.load_state_dict(state["averaged"])
+        before = state["data"]
+        self.data = {
+            "summary": f"{before['summary']}, then {self.data['summary']}",
+            "licenses": sorted({*before["licenses"], *self.data["licenses"]}),
+            "takes": before["takes"] + self.data["takes"],
+            "hours": before["hours"] + self.data["hours"],
+        }
+
+    def _check_shape(self, state: dict[str, Any], **other: Any) -> None:
+        """The checkpoint's network is the config's, apart from `other` fields."""
+        shape = _shape_of(state)
+        if shape._replace(**other) != self.config.network:
+            raise EdgeposeError(f"the checkpoint holds {shape}, the config asks for {self.config.network}")
+
+
+def save_checkpoint(state: dict[str, Any], path: Path) -> None:
+    """Writes a checkpoint so that a crash leaves the old one or the new one, never half of one.
+
+    Raises:
+        EdgeposeError: it cannot be written (disk full).
+    """
+    content = io.BytesIO()
+    torch.save(state, content)
+    try:
+        write_whole(path, content.getbuffer(), "the checkpoint")
+    except EdgeposeError as error:
+        raise EdgeposeError(f"{path}: cannot be written: {reason(error)}") from error
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """A checkpoint's state, read without running pickled code.
+
+    Raises:
+        EdgeposeError: missing or not a checkpoint.
+    """
+    try:
+        state = torch.load(path, weights_only=True, map_location="cpu")
+    except OSError as error:
+        raise EdgeposeError(f"{path}: {error.strerror or error}") from error
+    except Exception as error:
+        raise EdgeposeError(f"{path}: not a checkpoint of edgepose train ({type(error).__name__})") from error
+    if not isinstance(state, dict) or not set(_WEIGHTS_ONLY) <= set(state):
+        raise EdgeposeError(f"{path}: not a checkpoint of edgepose train (entries are missing)")
+    try:
+        network = new_network(_shape_of(state))
+        network.load_state_dict(state["averaged"])
+        Statistics(**state["statistics"])
+    except (TypeError, ValueError, RuntimeError, AttributeError) as error:
+        reason = str(error).splitlines()[0]
+        raise EdgeposeError(f"{path}: not a checkpoint that this edgepose reads ({reason})") from error
+    return state
+
+
+RELATED = 0.9
+"""Least cosine between the weights of checkpoints that have a mean. Those that began from one another have
+0.97 and more, trainings of one seed from scratch up to 0.77, those of two seeds 0.02; their mean is nothing.
+"""
+
+
+def mean_of(states: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+    """The first of some checkpoints by name, with the mean of their averaged weights (Wortsman et al. 2022).
+
+    What the longest of them was trained on, and the licences of all, are noted.
+
+    Raises:
+        EdgeposeError: they did not begin from one another: networks, but for `smoothing`, or statistics
+            differ, or weights are unlike.
+    """
+    (name, first), *others = states.items()
+    for other, state in others:
+        if not _related(first, state):
+            raise EdgeposeError(
+                f"{other}: did not begin from {name}, nor the reverse (train --init); they have no mean"
+            )
+    weights = [state["averaged"] for state in states.values()]
+    mean = {key: torch.stack([one[key] for one in weights]).mean(dim=0) for key in weights[0]}
+    about = [state["data"] for state in states.values()]
+    licenses = sorted({text for data in about for text in data["licenses"]})
+    data = max(about, key=lambda data: float(data["hours"])) | {"licenses": licenses}
+    return first | {"averaged": mean, "data": data}
+
+
+def _related(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    shape = _shape_of(one)
+    if _shape_of(other)._replace(smoothing=shape.smoothing) != shape:
+        return False
+    numbers = zip(one["statistics"].values(), other["statistics"].values(), strict=True)
+    a, b = (torch.cat([w.flatten() for w in state["averaged"].values()]) for state in (one, other))
+    return all(torch.equal(x, y) for x, y in numbers) and bool(torch.cosine_similarity(a, b, dim=0) > RELATED)
+
+
+def _shape_of(state: dict[str, Any]) -> NetworkShape:
+    return config_from(json.loads(state["config"])).network
+
+
+_WEIGHTS_ONLY = ("config", "statistics", "averaged", "step", "data")
+"""Entries of `best.pt`: what `export` and fine-tuning need."""
+
+
+def fit(
+    trainer: Trainer,
+    folder: Path,
+    on_step: Callable[[int, float], None],
+    on_validation: Callable[[int, float, float], None],
+) -> None:
+    """Trains to the config's end, writing `checkpoint.pt` and, at the best validation loss, `best.pt` and a
+    line of `log.jsonl`.
+    """
+    config, total, count = trainer.config, 0.0, 0
+    while trainer.step < config.steps:
+        loss = trainer.train_step()
+        if not math.isfinite(loss):
+            raise EdgeposeError(
+                f"the loss is {loss} at step {trainer.step}; "
+                "go on from the last checkpoint with a lower learning rate"
+            )
+        total, count = total + loss, count + 1
+        on_step(trainer.step, loss)
+        if trainer.step % config.validate_every == 0 or trainer.step == config.steps:
+            validation = trainer.validate()
+            if not math.isfinite(validation):
+                raise EdgeposeError(
+                    f"the validation loss is {validation} at step {trainer.step}; "
+                    "go on from the last checkpoint with a lower learning rate"
+                )
+            better = validation < trainer.best
+            trainer.best, trainer.worse = (validation, 0) if better else (trainer.best, trainer.worse + 1)
+            state = trainer.state()
+            if trainer.processes.rank == 0:
+                line = {"step": trainer.step, "train": total / count, "validation": validation}
+                _write(state, better, line, folder)
+            on_validation(trainer.step, total / count, validation)
+            total, count = 0.0, 0
+            if config.patience and trainer.worse >= config.patience:
+                return
+
+
+def _write(state: dict[str, Any], better: bool, line: dict[str, float], folder: Path) -> None:
+    save_checkpoint(state, folder / CHECKPOINT)
+    if better:
+        save_checkpoint({k: state[k] for k in _WEIGHTS_ONLY}, folder / "best.pt")
+    with (folder / "log.jsonl").open("a") as log:
+        log.write(json.dumps(line) + "\n")
