@@ -30,7 +30,7 @@ from edgepose.formats.recordings.csv_npz import (
 from edgepose.formats.recordings.mvnx import read_mvnx
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
-from edgepose.sinks import Sink
+from edgepose.sinks.base import Sink
 from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.csv import CsvSink
 from edgepose.skeleton import default_body

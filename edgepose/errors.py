@@ -1,4 +1,4 @@
-"""The one exception that the command line turns into a line on stderr and exit code 1."""
+"""Kinds of error. The command line turns each into one line on standard error and an exit code."""
 
 from __future__ import annotations
 
@@ -12,6 +12,26 @@ class EdgeposeError(Exception):
     The message is for the user: what is wrong, where (file, row, sensor, byte), and what to do. It has no
     trailing full stop and no line break.
     """
+
+
+class ConfigError(EdgeposeError):
+    """A flag, a key or a value of the configuration is missing, unknown or not valid."""
+
+
+class DeviceError(EdgeposeError):
+    """A port, bus or address cannot be opened, or a device says nothing usable."""
+
+
+class FileFormatError(EdgeposeError):
+    """A file is damaged, or not of the kind that it should be."""
+
+
+class CalibrationError(EdgeposeError):
+    """A wearer cannot be calibrated from what the sensors say, or a calibration does not fit."""
+
+
+class ModelError(EdgeposeError):
+    """A model archive is missing, damaged, not trusted, or cannot run here."""
 
 
 def as_told(error: Exception) -> EdgeposeError:

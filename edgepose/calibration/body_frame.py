@@ -8,7 +8,7 @@ import numpy as np
 
 from edgepose import rotations as rot
 from edgepose.calibration.checks import tilt_deg
-from edgepose.errors import EdgeposeError
+from edgepose.errors import CalibrationError
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 
@@ -21,14 +21,14 @@ def check_body_frame(text: str) -> str:
     """`text` if it is `head`, `SENSOR:AXIS` or `heading:DEG`.
 
     Raises:
-        EdgeposeError: it is none of them.
+        CalibrationError: it is none of them.
     """
     name, _, value = text.partition(":")
     axis_given = (
         name in PLACEMENTS and len(value.lstrip("+-")) == 1 and value[-1] in "xyz" and len(value) <= 2
     )
     if text != "head" and not axis_given and (name != "heading" or _finite(value) is None):
-        raise EdgeposeError(
+        raise CalibrationError(
             f"body frame {text!r} is none of: head, heading:DEG, SENSOR:AXIS "
             f"(such as pelvis:-z; sensors: {', '.join(PLACEMENTS)})"
         )
@@ -53,7 +53,7 @@ def body_from_inertial(orientation: Array, body_frame: str) -> Array:
             faces this angle from X of I towards Y.
 
     Raises:
-        EdgeposeError: the named sensor is not worn so that this way works.
+        CalibrationError: the named sensor is not worn so that this way works.
     """
     name, _, value = check_body_frame(body_frame).partition(":")
     if name == "head":
@@ -65,7 +65,7 @@ def body_from_inertial(orientation: Array, body_frame: str) -> Array:
     forward = -axis if value[0] == "-" else axis
     from_vertical = min(tilt_deg(forward), 180.0 - tilt_deg(forward))
     if from_vertical < FRAME_TILT_LIMIT_DEG:
-        raise EdgeposeError(
+        raise CalibrationError(
             f"body frame {body_frame}: this axis is {from_vertical:.0f} deg from vertical; "
             "name an axis that points to the wearer's front, or with - to the back"
         )
@@ -75,7 +75,7 @@ def body_from_inertial(orientation: Array, body_frame: str) -> Array:
 def _frame_of_head(r_is: Array) -> Array:
     tilt = tilt_deg(r_is[:, 1])
     if tilt > FRAME_TILT_LIMIT_DEG:
-        raise EdgeposeError(
+        raise CalibrationError(
             f"body frame head: the head sensor's Y axis points {tilt:.0f} deg from up; "
             "wear it with X to the left, Y up, Z forward, or choose another --body-frame"
         )

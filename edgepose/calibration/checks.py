@@ -16,7 +16,7 @@ from edgepose.calibration.static_pose import (
     named,
     unit_or_zero,
 )
-from edgepose.errors import EdgeposeError
+from edgepose.errors import CalibrationError
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 
@@ -32,7 +32,7 @@ GRAVITY_SCALE_LIMIT = 0.05
 GRAVITY_TILT_LIMIT_DEG = 10.0
 
 
-class MovedError(EdgeposeError):
+class MovedError(CalibrationError):
     """A hold with movement in it: holding still once more helps."""
 
 
@@ -63,12 +63,12 @@ def check_hold(hold: Hold, advice: str = "stand still and repeat") -> HoldSummar
 
     Raises:
         MovedError: sensors moved; names all of them and how much.
-        EdgeposeError: any other fault of the hold; names the sensors and what to do.
+        CalibrationError: any other fault of the hold; names the sensors and what to do.
     """
     check_reported(hold)
     few = [f"{name} {len(s.quat)}" for name, s in named(hold) if len(s.quat) < MIN_SAMPLES]
     if few:
-        raise EdgeposeError(
+        raise CalibrationError(
             f"too few samples in the hold ({', '.join(few)}; at least {MIN_SAMPLES}): "
             "check the rate and the link, or hold longer"
         )
@@ -76,7 +76,7 @@ def check_hold(hold: Hold, advice: str = "stand still and repeat") -> HoldSummar
         f"{name} ({bad} of {len(s.quat)})" for name, s in named(hold) if (bad := _not_rotations(s.quat))
     ]
     if broken:
-        raise EdgeposeError(
+        raise CalibrationError(
             f"quaternions that are not rotations (not of length 1): {', '.join(broken)}; "
             "check the protocol and the sensor's settings"
         )
@@ -87,7 +87,7 @@ def check_hold(hold: Hold, advice: str = "stand still and repeat") -> HoldSummar
         if (apart := two_sensors(quat)) is not None
     ]
     if shared:
-        raise EdgeposeError(
+        raise CalibrationError(
             "two sensors report as one placement: "
             + ", ".join(f"{name} ({apart:.0f} deg apart)" for name, apart in shared)
             + "; give every sensor a placement of its own"
@@ -167,7 +167,7 @@ def _gravity(hold: Hold, quats: list[Array]) -> tuple[Array, list[str]]:
                 f"{name} measures {size:.2f} m/s^2 at rest, not {GRAVITY:.2f}: check its units and scale"
             )
     if wrong:
-        raise EdgeposeError(
+        raise CalibrationError(
             f"at rest the acceleration in the inertial frame must point up along +Z: {', '.join(wrong)}; "
             "the frame or sign convention of the orientation or the acceleration is wrong"
         )

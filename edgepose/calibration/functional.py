@@ -15,7 +15,7 @@ import numpy as np
 from edgepose import rotations as rot
 from edgepose.calibration.headings import HeadingReset
 from edgepose.calibration.static_pose import Hold, check_reported
-from edgepose.errors import EdgeposeError
+from edgepose.errors import CalibrationError
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 
@@ -27,7 +27,7 @@ ONE_WAY = 0.4
 """Least surplus of lean to one side, as a share: without it forward cannot be told from back."""
 
 
-class WeakMotionError(EdgeposeError):
+class WeakMotionError(CalibrationError):
     """Motion that shows no heading: moving once more, more clearly, helps."""
 
 

@@ -17,7 +17,7 @@ from edgepose.calibration.checks import check_hold, tilt_deg
 from edgepose.calibration.mounting import rotation_of
 from edgepose.calibration.sensor_to_segment import POSES, Calibration
 from edgepose.calibration.static_pose import Hold
-from edgepose.errors import EdgeposeError
+from edgepose.errors import CalibrationError
 from edgepose.placements import PLACEMENTS, ROOT
 from edgepose.rotations import Array
 
@@ -53,12 +53,12 @@ def heading_offsets(still: Hold) -> HeadingReset:
     """Heading reset (DIP 4.5) from all six sensors lying side by side in one orientation.
 
     Raises:
-        EdgeposeError: a sensor moved or does not lie as the pelvis sensor does; names it.
+        CalibrationError: a sensor moved or does not lie as the pelvis sensor does; names it.
     """
     mean = check_hold(still, "leave the sensors alone and repeat the heading reset").orientation
     reset = turn_about_z(mean, mean[ROOT])
     if crooked := _over(reset.error_deg, RESET_TILT_LIMIT_DEG):
-        raise EdgeposeError(
+        raise CalibrationError(
             f"not lying as the {PLACEMENTS[ROOT]} sensor does: {crooked}; "
             "lay all six side by side, same face up, same edge forward, and repeat the heading reset"
         )
@@ -73,12 +73,12 @@ def headings_from_mounting(orientation: Array, mounting: Sequence[str]) -> Headi
         mounting: six times where the axes point, such as "x up, z back".
 
     Raises:
-        EdgeposeError: gravity says that a sensor sits otherwise; names it.
+        CalibrationError: gravity says that a sensor sits otherwise; names it.
     """
     sits = np.stack([rotation_of(words) for words in mounting])
     reset = turn_about_z(orientation, rot.matrix_to_quat(_facing_x().T @ sits))
     if wrong := _over(reset.error_deg, MOUNTING_TILT_LIMIT_DEG):
-        raise EdgeposeError(
+        raise CalibrationError(
             f"not mounted as the map of sensors says: {wrong} off by gravity; "
             "is it upside down, or swapped with another one?"
         )
@@ -89,13 +89,13 @@ def headings_from_axis(orientation: Array, axis: str) -> HeadingReset:
     """Heading reset from one axis, such as "z" or "-x", with which each sensor faces forward in the pose.
 
     Raises:
-        EdgeposeError: that axis is steep on a sensor, and gives no direction; names it.
+        CalibrationError: that axis is steep on a sensor, and gives no direction; names it.
     """
     towards = -1.0 if axis.startswith("-") else 1.0
     forward = towards * rot.quat_to_matrix(orientation)[:, :, "xyz".index(axis[-1])]
     slope = np.array([abs(90.0 - tilt_deg(v)) for v in forward])
     if steep := _over(slope, AXIS_LIMIT_DEG):
-        raise EdgeposeError(
+        raise CalibrationError(
             f"axis {axis} does not face forward: {steep} from level; "
             "name the axis that does, or give each sensor its mounting in the map of sensors"
         )

@@ -14,7 +14,7 @@ import numpy as np
 from edgepose.calibration.body_frame import check_body_frame
 from edgepose.calibration.mounting import mounting
 from edgepose.calibration.sensor_to_segment import POSES, Calibration
-from edgepose.errors import EdgeposeError
+from edgepose.errors import CalibrationError, EdgeposeError
 from edgepose.imu import FILTERS
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
@@ -55,11 +55,11 @@ def from_json(text: str, where: str = "calibration") -> Calibration:
     """The calibration of a JSON text, every value checked; `where` names the text in messages.
 
     Raises:
-        EdgeposeError: not a calibration of this version, or a sensor or value is missing or impossible.
+        CalibrationError: not a calibration of this version, or a sensor or value is missing or impossible.
     """
 
     def fail(what: str) -> EdgeposeError:
-        return EdgeposeError(f"{where}: {what}")
+        return CalibrationError(f"{where}: {what}")
 
     try:
         document = json.loads(text, object_pairs_hook=_no_duplicates, parse_constant=_no_constant)
@@ -110,7 +110,7 @@ def save(calibration: Calibration, path: str | Path, overwrite: bool = True) -> 
     """Writes the calibration as JSON; the file is whole or as it was before.
 
     Raises:
-        EdgeposeError: it cannot be written, or is there already and not to be overwritten.
+        CalibrationError: it cannot be written, or is there already and not to be overwritten.
     """
     write_whole(path, to_json(calibration), "the calibration", overwrite)
 
@@ -120,9 +120,9 @@ def load_calibration(path: str | Path) -> Calibration:
     try:
         text = read_text(Path(path))
     except OSError as error:
-        raise EdgeposeError(f"{path}: cannot read the calibration ({error.strerror or error})") from error
+        raise CalibrationError(f"{path}: cannot read the calibration ({error.strerror or error})") from error
     except UnicodeDecodeError as error:
-        raise EdgeposeError(
+        raise CalibrationError(
             f"{path}: not valid JSON (not UTF-8 text); make it anew with `edgepose calibrate`"
         ) from error
     return from_json(text, str(path))

@@ -13,7 +13,7 @@ import numpy as np
 
 from edgepose import rotations as rot
 from edgepose.calibration import Calibration, HeadingReset, headings_from_pose
-from edgepose.errors import EdgeposeError
+from edgepose.errors import CalibrationError, EdgeposeError
 from edgepose.imu import ImuFrame
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
@@ -136,11 +136,11 @@ def _from_hold(calibration: Calibration, frames: list[ImuFrame]) -> HeadingReset
     """Heading reset from frames of the held pose.
 
     Raises:
-        EdgeposeError: the wearer moved, or gravity says that it is another pose; names the sensors.
+        CalibrationError: the wearer moved, or gravity says that it is another pose; names the sensors.
     """
     # What a short loss repeats is no other pose.
     if silent := _names(np.mean([frame.held for frame in frames], axis=0) > HELD_LIMIT):
-        raise EdgeposeError(f"nothing new from {silent}")
+        raise CalibrationError(f"nothing new from {silent}")
     orientation = np.stack([frame.orientation for frame in frames])
     mean = np.stack([rot.mean_rotation(own) for own in orientation.swapaxes(0, 1)])
     away = np.linalg.norm(
@@ -148,10 +148,10 @@ def _from_hold(calibration: Calibration, frames: list[ImuFrame]) -> HeadingReset
     )
     spread = np.degrees(np.sqrt(np.mean(away**2, axis=0)))
     if moved := _names(spread > SPREAD_LIMIT_DEG, spread):
-        raise EdgeposeError(f"moved: {moved}; hold still")
+        raise CalibrationError(f"moved: {moved}; hold still")
     found = headings_from_pose(calibration, mean)
     if crooked := _names(found.error_deg > TILT_LIMIT_DEG, found.error_deg):
-        raise EdgeposeError(
+        raise CalibrationError(
             f"another tilt than in the calibration: {crooked}; "
             "take its pose, or calibrate again if a sensor has slipped"
         )

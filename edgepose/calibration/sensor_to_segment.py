@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from edgepose import rotations as rot
 from edgepose.calibration.body_frame import body_from_inertial
 from edgepose.calibration.checks import GRAVITY, HoldSummary
-from edgepose.errors import EdgeposeError
+from edgepose.errors import CalibrationError
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 
@@ -102,7 +102,7 @@ def calibrate(
         north: whether all headings count from one north.
     """
     if pose not in POSES:
-        raise EdgeposeError(f"pose {pose!r} is none of: {', '.join(POSES)}")
+        raise CalibrationError(f"pose {pose!r} is none of: {', '.join(POSES)}")
     offset = np.zeros(len(PLACEMENTS)) if heading_offset is None else np.asarray(heading_offset, float)
     orientation = rot.quat_multiply(rot.about_z(offset), summary.orientation)
     r_ti = body_from_inertial(orientation, body_frame)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import CalibrationError
 from edgepose.formats.recordings.csv_npz import Recording
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS, ROOT
@@ -86,7 +86,7 @@ def stillest_start(hold: Hold, seconds: float) -> float:
     is within half a degree of the best one.
 
     Raises:
-        EdgeposeError: no window of that length has samples of all sensors.
+        CalibrationError: no window of that length has samples of all sensors.
     """
     check_reported(hold)
     first, last = max(s.time_s.min() for s in hold), min(s.time_s.max() for s in hold)
@@ -106,7 +106,7 @@ def stillest_start(hold: Hold, seconds: float) -> float:
         enough = max(MIN_SAMPLES, count.max(initial=0) / 2)
         spread = np.maximum(spread, np.where(count < enough, np.inf, angle))
     if not np.isfinite(spread).any():
-        raise EdgeposeError(
+        raise CalibrationError(
             f"no {seconds:g} s in which all six sensors reported: "
             f"they overlap for {max(last - first, 0.0):.1f} s from {first:.1f} s"
         )
@@ -122,10 +122,10 @@ def check_reported(hold: Hold) -> None:
     """Raises EdgeposeError unless every sensor sent orientations."""
     silent = [name for name, s in named(hold) if not len(s.quat)]
     if silent:
-        raise EdgeposeError(f"nothing from {', '.join(silent)}: check power, link and placement of each")
+        raise CalibrationError(f"nothing from {', '.join(silent)}: check power, link and placement of each")
     raw = [name for name, s in named(hold) if np.isnan(s.quat).all()]
     if raw:
-        raise EdgeposeError(
+        raise CalibrationError(
             f"no orientation from {', '.join(raw)}: set each to send quaternions, "
             "or make it here of gyroscope and accelerometer: --filter kalman"
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from itertools import chain
 from pathlib import Path
@@ -9,11 +10,12 @@ from typing import NamedTuple
 
 from edgepose import calibration
 from edgepose.calibration import HeadingReset, Hold, HoldSummary
-from edgepose.cli.options.source import Orientations, SourceFlags
 from edgepose.cli.prompts import Guide, all_reporting, held, moved, wait_for_enter
+from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.csv_npz import read_recording, samples
-from edgepose.sources import Device
+from edgepose.orientation.stage import OrientationStage
+from edgepose.sources import Device, open_source
 from edgepose.sources.replay import is_recording
 
 ROUTINE_S = 30.0
@@ -59,10 +61,10 @@ class Measured(NamedTuple):
     devices: Mapping[int, Device]
 
 
-def live(source: SourceFlags, plan: Plan, orient: Orientations, say: Guide) -> Measured:
+def live(source: SourceConfig, plan: Plan, orient: OrientationStage, say: Guide) -> Measured:
     """The hold and the heading reset of a wearer in front of a live source."""
     reset = _side_by_side(source, plan, orient, say)
-    with source.open() as opened:
+    with open_source(**source.arguments()) as opened:
         batches = all_reporting(((now_s, orient(came)) for now_s, came in opened), say)
         if plan.heading_reset == "live":
             reset = held(batches, "lying", plan.countdown_s, plan.hold_s, say, calibration.heading_offsets)
@@ -76,7 +78,7 @@ def live(source: SourceFlags, plan: Plan, orient: Orientations, say: Guide) -> M
     return Measured(summary, reset or _mounted(plan, summary), None, opened.devices)
 
 
-def recorded(source: SourceFlags, plan: Plan, orient: Orientations, say: Guide) -> Measured:
+def recorded(source: SourceConfig, plan: Plan, orient: OrientationStage, say: Guide) -> Measured:
     """The hold and the heading reset in a recording."""
     reset = _side_by_side(source, plan, orient, say)
     everything, damage, devices = _read(source, orient)
@@ -97,7 +99,9 @@ def recorded(source: SourceFlags, plan: Plan, orient: Orientations, say: Guide) 
     return Measured(summary, reset or _mounted(plan, summary), start_s, devices)
 
 
-def _side_by_side(source: SourceFlags, plan: Plan, orient: Orientations, say: Guide) -> HeadingReset | None:
+def _side_by_side(
+    source: SourceConfig, plan: Plan, orient: OrientationStage, say: Guide
+) -> HeadingReset | None:
     """Heading reset from a recording of the sensors lying side by side, if there is one.
 
     Raises:
@@ -107,7 +111,7 @@ def _side_by_side(source: SourceFlags, plan: Plan, orient: Orientations, say: Gu
         return None
     say(f"Heading reset from {plan.lying}.")
     own = orient.anew()
-    everything, damage, _ = _read(source._replace(file=plan.lying, port=None, can=None), own)
+    everything, damage, _ = _read(dataclasses.replace(source, file=plan.lying, port=None, can=None), own)
     if not own.north:
         raise EdgeposeError(
             "the filter's headings begin anew in each recording, so another one cannot reset them: "
@@ -128,7 +132,7 @@ def _mounted(plan: Plan, summary: HoldSummary) -> HeadingReset | None:
     return calibration.headings_from_axis(summary.orientation, axis)
 
 
-def _check_north(orient: Orientations, plan: Plan) -> None:
+def _check_north(orient: OrientationStage, plan: Plan) -> None:
     """Raises EdgeposeError if a filter has begun with any headings and nothing will bring them together."""
     if orient.mixed:
         raise EdgeposeError(
@@ -145,7 +149,7 @@ def _check_north(orient: Orientations, plan: Plan) -> None:
 # --- recordings ---------------------------------------------------------------------------------------------
 
 
-def _read(source: SourceFlags, orient: Orientations) -> tuple[Hold, str | None, Mapping[int, Device]]:
+def _read(source: SourceConfig, orient: OrientationStage) -> tuple[Hold, str | None, Mapping[int, Device]]:
     """Everything in a recording or a raw capture, what is wrong with its end, and what sent it."""
     path = source.file
     assert path is not None
@@ -157,7 +161,7 @@ def _read(source: SourceFlags, orient: Orientations) -> tuple[Hold, str | None, 
             else calibration.hold_from_samples(orient(list(samples(recording))))
         )
         return everything, recording.damage, {}
-    with source._replace(realtime=False).open() as opened:
+    with open_source(**dataclasses.replace(source, realtime=False).arguments()) as opened:
         everything = calibration.hold_from_samples(chain.from_iterable(orient(came) for _, came in opened))
         return everything, opened.damage, opened.devices
 

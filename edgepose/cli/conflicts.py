@@ -1,4 +1,4 @@
-"""What wearers of one run cannot share, and what no output may take the place of."""
+"""Conflicts: lines that two wearers cannot share, inputs that an output must not replace."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from edgepose.errors import EdgeposeError, named
 from edgepose.utils.output_targets import has_reader
 
 if TYPE_CHECKING:
-    from edgepose.cli.options.wearer import RigFlags
+    from edgepose.config import WearerConfig
     from edgepose.sources.sensor_map import SensorMap
 
 
-def check_lines(rigs: Sequence[RigFlags]) -> None:
+def check_lines(rigs: Sequence[WearerConfig]) -> None:
     """Raises EdgeposeError where two wearers listen to one line, unless it is a bus on which each has ids."""
     for (rig, lines), (other, others) in combinations([(rig, _lines(rig)) for rig in rigs], 2):
         for line in lines.keys() & others.keys():
@@ -31,7 +31,7 @@ def check_lines(rigs: Sequence[RigFlags]) -> None:
                 )
 
 
-def check_all_files(rigs: Sequence[RigFlags], model: Path) -> None:
+def check_all_files(rigs: Sequence[WearerConfig], model: Path) -> None:
     """Raises click.UsageError where a file to write is one to read, or would hold up or meet another's.
 
     Args:
@@ -59,7 +59,7 @@ def check_all_files(rigs: Sequence[RigFlags], model: Path) -> None:
                 )
 
 
-def _inputs(rig: RigFlags) -> dict[str, Path | None]:
+def _inputs(rig: WearerConfig) -> dict[str, Path | None]:
     """Files that are read for a wearer, by flag."""
     source, sensor_map = rig.source, _map(rig)
     spoken = [source.protocol]
@@ -74,7 +74,7 @@ def _inputs(rig: RigFlags) -> dict[str, Path | None]:
     }
 
 
-def _lines(rig: RigFlags) -> dict[str, list[int | None]]:
+def _lines(rig: WearerConfig) -> dict[str, list[int | None]]:
     """The lines that a wearer listens to, and the ids of his sensors on them as far as a map tells."""
     from edgepose.sources.line_config import links
 
@@ -95,7 +95,7 @@ def _lines(rig: RigFlags) -> dict[str, list[int | None]]:
     return lines
 
 
-def _map(rig: RigFlags) -> SensorMap | None:
+def _map(rig: WearerConfig) -> SensorMap | None:
     from edgepose.sources.sensor_map import read_map
 
     return None if rig.source.sensors is None else read_map(rig.source.sensors)

@@ -17,7 +17,7 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import ModelError
 from edgepose.inference.quantisation import quantized_quietly
 from edgepose.placements import PLACEMENTS
 
@@ -63,10 +63,10 @@ def trust_file() -> Path:
     """The user's own list of trusted sums, in the format of `sha256sum`.
 
     Raises:
-        EdgeposeError: the user has no home.
+        ModelError: the user has no home.
     """
     if not has_home():
-        raise EdgeposeError("you have no home folder for a list of trusted archives: set XDG_CONFIG_HOME")
+        raise ModelError("you have no home folder for a list of trusted archives: set XDG_CONFIG_HOME")
     return Path(_settings()) / "edgepose" / "trusted-archives"
 
 
@@ -79,7 +79,7 @@ def find(name: str) -> Path:
     """The shipped archive of that name, or the file at that path.
 
     Raises:
-        EdgeposeError: there is neither.
+        ModelError: there is neither.
     """
     for path in shipped():
         if path.stem == name:
@@ -87,9 +87,7 @@ def find(name: str) -> Path:
     if Path(name).is_file():
         return Path(name)
     names = ", ".join(path.stem for path in shipped()) or "none"
-    raise EdgeposeError(
-        f"{name}: no such model; shipped are {names}, anything else is the path of an archive"
-    )
+    raise ModelError(f"{name}: no such model; shipped are {names}, anything else is the path of an archive")
 
 
 def _sums(path: Path) -> set[str]:
@@ -99,34 +97,34 @@ def _sums(path: Path) -> set[str]:
     except FileNotFoundError:
         return set()
     except OSError as error:
-        raise EdgeposeError(f"{path}: {error.strerror}") from error
+        raise ModelError(f"{path}: {error.strerror}") from error
 
 
 def inspect(path: Path) -> ArchiveInfo:
     """Reads an archive's metadata and sum; runs nothing of it.
 
     Raises:
-        EdgeposeError: not an archive of edgepose, damaged, or of a newer format.
+        ModelError: not an archive of edgepose, damaged, or of a newer format.
     """
     try:
         content = path.read_bytes()
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             entries = [e for e in archive.infolist() if e.filename.endswith(f"/extra/{METADATA_FILE}")]
             if len(entries) != 1 or entries[0].file_size > _METADATA_LIMIT:
-                raise EdgeposeError(
+                raise ModelError(
                     f"{path}: not a model archive of edgepose (it has no {METADATA_FILE}); "
                     "make one with edgepose export"
                 )
             metadata = json.loads(archive.read(entries[0]))
     except (zipfile.BadZipFile, EOFError) as error:
-        raise EdgeposeError(
+        raise ModelError(
             f"{path}: not a model archive (no complete zip file); make one with edgepose export"
         ) from error
     except OSError as error:
-        raise EdgeposeError(f"{path}: {error.strerror or error}") from error
+        raise ModelError(f"{path}: {error.strerror or error}") from error
     # zipfile gives RuntimeError for passwords, NotImplementedError for odd compression, json RecursionError.
     except (ValueError, RuntimeError, zlib.error) as error:
-        raise EdgeposeError(f"{path}: the archive's metadata cannot be read ({error})") from error
+        raise ModelError(f"{path}: the archive's metadata cannot be read ({error})") from error
     _check(path, metadata)
     sha256 = hashlib.sha256(content).hexdigest()
     known = _sums(MODELS / "SHA256SUMS")
@@ -137,22 +135,22 @@ def inspect(path: Path) -> ArchiveInfo:
 
 def _check(path: Path, metadata: Any) -> None:
     if not isinstance(metadata, dict) or not isinstance(metadata.get("format"), int):
-        raise EdgeposeError(f"{path}: the archive's metadata is not what edgepose export writes")
+        raise ModelError(f"{path}: the archive's metadata is not what edgepose export writes")
     if metadata["format"] > FORMAT:
-        raise EdgeposeError(
+        raise ModelError(
             f"{path}: archive format {metadata['format']} is newer than this edgepose reads ({FORMAT}); "
             "update edgepose"
         )
     if metadata.get("kind") not in KINDS:
-        raise EdgeposeError(f"{path}: unknown kind of network {metadata.get('kind')!r}")
+        raise ModelError(f"{path}: unknown kind of network {metadata.get('kind')!r}")
     if metadata.get("placements") != list(PLACEMENTS):
-        raise EdgeposeError(f"{path}: made for other sensor placements: {metadata.get('placements')}")
+        raise ModelError(f"{path}: made for other sensor placements: {metadata.get('placements')}")
     if not isinstance(metadata.get("rate_hz"), (int, float)) or not 1 <= metadata["rate_hz"] <= 1000:
-        raise EdgeposeError(f"{path}: the archive's frame rate {metadata.get('rate_hz')!r} is not a rate")
+        raise ModelError(f"{path}: the archive's frame rate {metadata.get('rate_hz')!r} is not a rate")
     for name in ("past", "future"):
         frames = metadata.get(name)
         if type(frames) is not int or not 0 <= frames <= _MOST_FRAMES:
-            raise EdgeposeError(f"{path}: the archive's number of {name} frames {frames!r} is not a number")
+            raise ModelError(f"{path}: the archive's number of {name} frames {frames!r} is not a number")
 
 
 def load(info: ArchiveInfo, trust: bool = False) -> torch.jit.ScriptModule:
@@ -163,10 +161,10 @@ def load(info: ArchiveInfo, trust: bool = False) -> torch.jit.ScriptModule:
         trust: the user vouches for the file.
 
     Raises:
-        EdgeposeError: the sum is not known and the user does not vouch, or torch cannot load the file.
+        ModelError: the sum is not known and the user does not vouch, or torch cannot load the file.
     """
     if not (info.trusted or trust):
-        raise EdgeposeError(
+        raise ModelError(
             f"{info.path}: loading a model archive runs its code, and this one's SHA-256 sum "
             f"{info.sha256[:16]}... is not known; if you made it or know who did, run with --trust, or once: "
             "edgepose models --trust PATH"
@@ -179,12 +177,12 @@ def load(info: ArchiveInfo, trust: bool = False) -> torch.jit.ScriptModule:
     try:
         content = info.path.read_bytes()
         if hashlib.sha256(content).hexdigest() != info.sha256:
-            raise EdgeposeError(f"{info.path}: the archive changed while it was being loaded; run again")
+            raise ModelError(f"{info.path}: the archive changed while it was being loaded; run again")
         with quantized_quietly():
             module: torch.jit.ScriptModule = torch.jit.load(io.BytesIO(content), map_location="cpu")
     except (RuntimeError, ValueError, OSError) as error:
         reason = str(error).strip().splitlines()
-        raise EdgeposeError(
+        raise ModelError(
             f"{info.path}: torch cannot load the archive ({reason[0] if reason else type(error).__name__})"
         ) from error
     return module
@@ -194,7 +192,7 @@ def trust(path: Path) -> ArchiveInfo:
     """Adds an archive's sum to the user's own list.
 
     Raises:
-        EdgeposeError: not an archive, or the list cannot be written.
+        ModelError: not an archive, or the list cannot be written.
     """
     info = inspect(path)
     if not info.trusted:
@@ -204,5 +202,5 @@ def trust(path: Path) -> ArchiveInfo:
                 # The line break in front is for a list that was edited and does not end in one.
                 file.write(f"\n{info.sha256}  {' '.join(path.name.split())}\n")
         except OSError as error:
-            raise EdgeposeError(f"{trust_file()}: {error.strerror}") from error
+            raise ModelError(f"{trust_file()}: {error.strerror}") from error
     return info._replace(trusted=True)

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import EdgeposeError, ModelError
 
 if TYPE_CHECKING:
     import torch
@@ -59,7 +59,7 @@ def _hwcap() -> int:
 def _check_fp16() -> None:
     """Raises EdgeposeError where fp16 weights would end the process."""
     if not has_fp16_products(platform.machine(), _hwcap()):
-        raise EdgeposeError("this processor has no products of fp16 numbers (asimdfhm)")
+        raise ModelError("this processor has no products of fp16 numbers (asimdfhm)")
 
 
 def pack(
@@ -80,12 +80,12 @@ def pack(
         The precision in which the module runs now.
 
     Raises:
-        EdgeposeError: it cannot run in the one that was chosen.
+        ModelError: it cannot run in the one that was chosen.
     """
     stored = info.metadata.get("precision", "f32")
     if stored != "f32":
         if choice not in ("auto", stored):
-            raise EdgeposeError(f"{info.path}: its weights are {stored}; export it again for {choice}")
+            raise ModelError(f"{info.path}: its weights are {stored}; export it again for {choice}")
         if stored == "fp16":
             with _about(info.path, "export it again in f32"):
                 _check_fp16()
@@ -119,7 +119,7 @@ def _about(path: Path, advice: str) -> Iterator[None]:
     try:
         yield
     except EdgeposeError as error:
-        raise EdgeposeError(f"{path}: {error}; {advice}") from error
+        raise ModelError(f"{path}: {error}; {advice}") from error
 
 
 def _tell_of_slow(precision: str, tell: Callable[[str], None]) -> None:
@@ -131,13 +131,13 @@ def pack_weights(module: torch.jit.ScriptModule, precision: str) -> None:
     """Calls the archive's `pack`.
 
     Raises:
-        EdgeposeError: there is no such precision on this machine or for this kind of network; the weights are
+        ModelError: there is no such precision on this machine or for this kind of network; the weights are
             as they were.
     """
     import torch
 
     if not hasattr(module, "pack"):
-        raise EdgeposeError("the archive was made by an older edgepose export")
+        raise ModelError("the archive was made by an older edgepose export")
     if precision == "fp16":
         _check_fp16()
     try:
@@ -145,7 +145,7 @@ def pack_weights(module: torch.jit.ScriptModule, precision: str) -> None:
             module.pack(precision)
     except (RuntimeError, torch.jit.Error) as error:
         reason = str(error).strip().splitlines()[-1].removeprefix("builtins.ValueError: ")
-        raise EdgeposeError(f"no {precision} weights here: {reason}") from error
+        raise ModelError(f"no {precision} weights here: {reason}") from error
 
 
 @contextmanager

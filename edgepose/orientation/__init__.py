@@ -1,10 +1,18 @@
-"""Raw samples to oriented ones, sensor by sensor, at the sensor's own rate."""
+"""Raw samples to oriented ones, sensor by sensor, at the sensor's own rate.
 
-from edgepose.orientation.estimator import Orienter, SensorStatus
-from edgepose.orientation.filter import OrientationFilter
-from edgepose.orientation.settings import FilterSettings
-from edgepose.orientation.smoother import smooth
-from edgepose.orientation.types import Event, Oriented
+Filters import filterpy and scipy, so the names below are imported when they are first used.
+"""
+
+from typing import TYPE_CHECKING
+
+from edgepose.utils.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from edgepose.orientation.estimator import Orienter, SensorStatus
+    from edgepose.orientation.filter import OrientationFilter
+    from edgepose.orientation.settings import FilterSettings
+    from edgepose.orientation.smoother import smooth
+    from edgepose.orientation.types import Event, Oriented
 
 __all__ = [
     "Event",
@@ -15,3 +23,16 @@ __all__ = [
     "SensorStatus",
     "smooth",
 ]
+
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "Event": "edgepose.orientation.types",
+        "FilterSettings": "edgepose.orientation.settings",
+        "OrientationFilter": "edgepose.orientation.filter",
+        "Oriented": "edgepose.orientation.types",
+        "Orienter": "edgepose.orientation.estimator",
+        "SensorStatus": "edgepose.orientation.estimator",
+        "smooth": "edgepose.orientation.smoother",
+    },
+)

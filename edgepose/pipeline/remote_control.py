@@ -1,12 +1,15 @@
-"""Wishes that come by UDP during a run: the text `rezero`, or the OSC message /edgepose/rezero."""
+"""Re-zero requests during a run: keys, and over UDP the text `rezero` or the OSC message /edgepose/rezero."""
 
 from __future__ import annotations
 
 import math
 import socket
 import struct
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import DeviceError
 from edgepose.utils.sockets import resolve
 
 MAX_DELAY_S = 60.0
@@ -25,20 +28,20 @@ class Control:
         """Binds it.
 
         Raises:
-            EdgeposeError: the address is not of this machine, or in use.
+            DeviceError: the address is not of this machine, or in use.
         """
         self.ignored = 0
         try:
             family, address = resolve(host, port, socket.SOCK_DGRAM)
             self._socket = socket.socket(family, socket.SOCK_DGRAM)
         except (OSError, UnicodeError) as error:
-            raise EdgeposeError(f"cannot find {host!r} to listen on: {error}") from error
+            raise DeviceError(f"cannot find {host!r} to listen on: {error}") from error
         self._socket.setblocking(False)
         try:
             self._socket.bind(address)
         except OSError as error:
             self._socket.close()
-            raise EdgeposeError(
+            raise DeviceError(
                 f"cannot listen on {host} port {port}: {error.strerror or error}; "
                 "give an address of this machine and a free port"
             ) from error
@@ -90,3 +93,58 @@ def parse(datagram: bytes) -> float | None:
         return None
     (delay_s,) = struct.unpack(form, rest[4:])
     return float(delay_s) if math.isfinite(delay_s) and 0.0 <= delay_s <= MAX_DELAY_S else None
+
+
+KEY_DELAY_S = 3.0
+"""Time from a key to the hold: somebody has to walk away from the keyboard, or let go of it."""
+
+
+class RezeroRequests:
+    """Requests to re-zero the headings, from the keyboard or over UDP."""
+
+    def __init__(
+        self, stack: ExitStack, control: tuple[str, int] | None, by_key: Callable[[], list[float]]
+    ) -> None:
+        """Listen until the stack is closed.
+
+        Args:
+            stack: closes the socket.
+            control: host and port to listen on; None for none.
+            by_key: requests from the keyboard, one of `key_requests`.
+
+        Raises:
+            DeviceError: the address cannot be listened on.
+        """
+        self._control = None if control is None else stack.enter_context(Control(*control))
+        self._by_key = by_key
+
+    def poll(self) -> list[float]:
+        """Delay of each new request, seconds."""
+        return self._by_key() + ([] if self._control is None else self._control.requests())
+
+    def summary_lines(self) -> list[str]:
+        """What there is to say at the end."""
+        if self._control is None or not self._control.ignored:
+            return []
+        return [f"control  {self._control.ignored} datagrams that ask for nothing known"]
+
+
+def key_requests(count: int, pressed: Callable[[], str]) -> list[Callable[[], list[float]]]:
+    """One callable for each wearer that returns the requests since its last call.
+
+    Every key press goes to all wearers.
+
+    Args:
+        count: number of wearers.
+        pressed: the keys pressed since its last call.
+    """
+    unheard: list[list[float]] = [[] for _ in range(count)]
+
+    def by_key(wearer: int) -> list[float]:
+        wishes = [KEY_DELAY_S for key in pressed() if key in "rR\r\n"]
+        for own in unheard:
+            own += wishes
+        own, unheard[wearer] = unheard[wearer], []
+        return own
+
+    return [partial(by_key, wearer) for wearer in range(count)]

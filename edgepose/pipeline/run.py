@@ -21,7 +21,7 @@ from edgepose.pipeline.dropout_monitor import Silences
 from edgepose.pipeline.frame_synchronizer import FrameClock
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseFrame
-from edgepose.sinks import Sink
+from edgepose.sinks.base import Sink
 
 LATENCIES = 216_000
 """Latencies that are kept: those of the last hour at 60 Hz. A run may last for weeks."""

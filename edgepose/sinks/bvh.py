@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from edgepose.errors import EdgeposeError
 from edgepose.pose import PoseFrame
 from edgepose.rotations import matrix_to_euler_zxy
-from edgepose.sinks import Sink
+from edgepose.sinks.base import Sink, SinkContext
+from edgepose.sinks.spooled import SpooledSink
 from edgepose.skeleton import JOINTS, PARENTS, Body, default_body, standing_place
 from edgepose.utils.growing_files import FLUSH_S, GrowingFile
 from edgepose.utils.output_targets import is_stream
@@ -182,3 +183,10 @@ class BvhSink(Sink):
         table = np.concatenate([100.0 * np.array(places, float), values], axis=1)
         line = " ".join(["%.4f"] * table.shape[1]) + "\n"
         return "".join(line % tuple(row) for row in table.tolist()).encode()
+
+
+def open_sink(target: str, context: SinkContext) -> Sink:
+    """A `BvhSink`; a device or pipe gets the file when it is whole."""
+    if target != "-" and is_stream(target):
+        return SpooledSink(target, lambda part: BvhSink(part, context.rate, context.body), context.stopped)
+    return BvhSink(target, context.rate, context.body, overwrite=context.overwrite)

@@ -9,7 +9,7 @@ from pathlib import Path
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.csv_columns import FORMS, numbers, pose_columns
 from edgepose.pose import PoseFrame
-from edgepose.sinks import Sink
+from edgepose.sinks.base import Sink, SinkContext
 from edgepose.utils.growing_files import FLUSH_S, GrowingFile
 
 
@@ -108,3 +108,12 @@ class CsvSink(Sink):
         self._flushed = time.monotonic()
         if rows:
             self._file.write(rows)
+
+
+def open_sink(target: str, context: SinkContext) -> Sink:
+    """A `CsvSink`."""
+    return CsvSink(
+        *(target, context.rotations, context.std, context.translation),
+        overwrite=context.overwrite,
+        stopped=context.stopped,
+    )

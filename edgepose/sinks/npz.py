@@ -9,10 +9,11 @@ from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.npz_writer import write_npz
 from edgepose.formats.poses.reading import read_blocks
 from edgepose.pose import PoseFrame
-from edgepose.sinks import Sink
+from edgepose.sinks.base import Sink, SinkContext
 from edgepose.sinks.csv import CsvSink
+from edgepose.sinks.spooled import SpooledSink
 from edgepose.utils.durable_files import replace_file
-from edgepose.utils.output_targets import find_target
+from edgepose.utils.output_targets import find_target, is_stream
 
 
 class NpzSink(Sink):
@@ -100,3 +101,11 @@ class NpzSink(Sink):
             except EdgeposeError as error:
                 raise EdgeposeError(f"{error}; all poses are in {self._part}") from error
         self._part.unlink()
+
+
+def open_sink(target: str, context: SinkContext) -> Sink:
+    """An `NpzSink`; a device or pipe gets the file when it is whole."""
+    rate, translation = context.rate, context.translation
+    if target != "-" and is_stream(target):
+        return SpooledSink(target, lambda part: NpzSink(part, rate, translation), context.stopped)
+    return NpzSink(target, rate, translation, overwrite=context.overwrite)

@@ -7,7 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from edgepose.pose import PoseFrame
-from edgepose.sinks import Sink
+from edgepose.sinks.base import Sink
 from edgepose.utils.output_streams import copy_to_stream
 
 

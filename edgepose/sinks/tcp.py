@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from edgepose.errors import EdgeposeError
 from edgepose.pose import PoseFrame
 from edgepose.rotations import matrix_to_rotvec
-from edgepose.sinks import Sink
+from edgepose.sinks.base import Sink, SinkContext
 from edgepose.utils.sockets import resolve
 
 CLIENTS = 16
@@ -85,6 +85,14 @@ class TcpSink(Sink):
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._viewers.append(_Viewer(connection))
 
+    def summary_lines(self) -> list[str]:
+        """How many poses viewers missed."""
+        return (
+            [f"tcp      {self.missed} poses were missed by viewers that read too slowly"]
+            if self.missed
+            else []
+        )
+
     def _offer(self, viewer: _Viewer, text: bytes) -> bool:
         """Send what was begun, then the text if all of that has left; False where nobody is there."""
         try:
@@ -98,3 +106,8 @@ class TcpSink(Sink):
             viewer.socket.close()
             return False
         return True
+
+
+def open_sink(target: tuple[str, int], context: SinkContext) -> Sink:
+    """A `TcpSink` at a host and port."""
+    return TcpSink(*target)

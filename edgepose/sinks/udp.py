@@ -8,16 +8,15 @@ import struct
 from abc import abstractmethod
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
 from edgepose.errors import EdgeposeError
 from edgepose.pose import PoseFrame, status_bits, status_text
 from edgepose.rotations import matrix_to_quat, matrix_to_rotvec, quat_to_matrix, rotvec_to_matrix
-from edgepose.sinks import Sink
+from edgepose.sinks.base import Sink, SinkContext
 from edgepose.skeleton import JOINTS
-from edgepose.utils.sockets import resolve
+from edgepose.utils.sockets import Destination, resolve
 
 MAGIC = b"EPOS"
 VERSION = 1
@@ -25,55 +24,6 @@ VERSION = 1
 _JSON = '{"frame":%d,"time_s":%.6f,"status":%s,"pose":[' + ",".join(["%.6f"] * 72) + "]}\n"
 # Magic, version, flags, held sensors, joints, time, frame, quaternions: each at a multiple of its size.
 _BINARY = struct.Struct("<4sBBBBdI96f")
-
-
-class Destination(NamedTuple):
-    """Where datagrams go: host name or address, port, format "json" or "binary"."""
-
-    host: str
-    port: int
-    format: str
-
-
-def parse_address(text: str) -> tuple[str, int]:
-    """Host and port written as "HOST:PORT", an IPv6 address in brackets.
-
-    Raises:
-        EdgeposeError: not such a text.
-    """
-    host, colon, port = text.rpartition(":")
-    if not colon or not port or text.endswith("]"):
-        raise EdgeposeError(f"no port in {text!r}: write HOST:PORT, for example 127.0.0.1:9000")
-    if host.startswith("[") and host.endswith("]"):
-        host = host[1:-1]
-    elif ":" in host:
-        raise EdgeposeError(f"cannot tell address from port in {text!r}: write an IPv6 address as [::1]:9000")
-    if not host or any(c in "[]" or c.isspace() for c in host):
-        raise EdgeposeError(f"no host in {text!r}: write HOST:PORT, for example 127.0.0.1:9000")
-    if not (port.isascii() and port.isdigit() and len(port) <= 5 and 1 <= int(port) <= 65535):
-        raise EdgeposeError(f"port {port!r} in {text!r} is not a number from 1 to 65535")
-    return host, int(port)
-
-
-def parse_destination(text: str) -> Destination:
-    """Destination written as "HOST:PORT[,format=json|binary]"; JSON by default, see `parse_address`.
-
-    Raises:
-        EdgeposeError: not such a text.
-    """
-    address, *options = text.split(",")
-    host, port = parse_address(address)
-    form = "json"
-    for option in options:
-        key, _, value = option.partition("=")
-        if key != "format":
-            raise EdgeposeError(
-                f"unknown option {option!r} in {text!r}: the only one is format=json or format=binary"
-            )
-        if value not in ("json", "binary"):
-            raise EdgeposeError(f"unknown format {value!r} in {text!r}: choose json or binary")
-        form = value
-    return Destination(host, port, form)
 
 
 def encode_json(pose: PoseFrame) -> bytes:
@@ -144,6 +94,8 @@ class DatagramSink(Sink):
     A run goes on whether or not anybody listens: datagrams that could not be sent are counted in `unsent`.
     """
 
+    NAME = "udp"
+
     def __init__(self, host: str, port: int) -> None:
         """Resolve the host, once.
 
@@ -155,6 +107,7 @@ class DatagramSink(Sink):
             EdgeposeError: unknown host or no network to reach it.
         """
         self.unsent = 0
+        self._where = f"{host}:{port}"
         try:
             family, address = resolve(host, port, socket.SOCK_DGRAM)
         except (OSError, UnicodeError) as error:
@@ -185,6 +138,13 @@ class DatagramSink(Sink):
         """Close the socket."""
         self._socket.close()
 
+    def summary_lines(self) -> list[str]:
+        """How many datagrams did not arrive."""
+        if not self.unsent:
+            return []
+        asked = f"is anything listening at {self._where}?"
+        return [f"{self.NAME}      {self.unsent} datagrams did not arrive; {asked}"]
+
     def _send(self, datagram: bytes) -> None:
         try:
             self._socket.send(datagram)
@@ -210,3 +170,8 @@ class UdpSink(DatagramSink):
 @lru_cache(maxsize=64)
 def _quoted(text: str) -> str:
     return json.dumps(text)
+
+
+def open_sink(target: Destination, context: SinkContext) -> Sink:
+    """A `UdpSink` to a destination."""
+    return UdpSink(*target)

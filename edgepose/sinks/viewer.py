@@ -8,6 +8,8 @@ import sys
 from importlib.util import find_spec
 
 from edgepose.errors import EdgeposeError
+from edgepose.pose import PoseFrame
+from edgepose.sinks.base import Sink, SinkContext
 from edgepose.sinks.udp import UdpSink
 
 STOP_S = 5.0
@@ -20,11 +22,11 @@ def check_viewer() -> None:
         raise EdgeposeError("the viewer needs viser: install it with pip install 'edgepose[view]'")
 
 
-class ViewSink(UdpSink):
+class ViewSink(Sink):
     """Starts `edgepose view` and sends it each pose as a datagram, of which it shows the newest."""
 
     def __init__(self, height_m: float) -> None:
-        """Start the viewer; it tells on standard error where the page is.
+        """Start the viewer; it prints on standard error where the page is.
 
         Args:
             height_m: stature of the figure, metres.
@@ -40,14 +42,23 @@ class ViewSink(UdpSink):
         self._viewer = subprocess.Popen(
             [*command, "--height", str(height_m)], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
         )
-        super().__init__("127.0.0.1", port, "binary")
+        self._datagrams = UdpSink("127.0.0.1", port, "binary")
+
+    def write(self, pose: PoseFrame) -> None:
+        """Send a pose. Whether it is shown does not matter: the viewer may have been closed."""
+        self._datagrams.write(pose)
 
     def close(self) -> None:
         """End the viewer; a second call does nothing."""
-        super().close()
+        self._datagrams.close()
         self._viewer.terminate()
         try:
             self._viewer.wait(STOP_S)
         except subprocess.TimeoutExpired:
             self._viewer.kill()
             self._viewer.wait()
+
+
+def open_sink(target: bool, context: SinkContext) -> Sink:
+    """A `ViewSink`."""
+    return ViewSink(context.height)

@@ -12,6 +12,7 @@ import numpy as np
 
 from edgepose.pose import PoseFrame
 from edgepose.rotations import matrix_to_quat
+from edgepose.sinks.base import Sink, SinkContext
 from edgepose.sinks.udp import DatagramSink
 from edgepose.skeleton import JOINTS, Body, default_body, standing_place
 
@@ -77,6 +78,8 @@ _HALF = (len(BONES) + 1) // 2
 class VmcSink(DatagramSink):
     """Sends each pose as two bundles to one address; see `DatagramSink`."""
 
+    NAME = "osc"
+
     def __init__(self, host: str, port: int, body: Body | None = None) -> None:
         """Resolve the host.
 
@@ -106,3 +109,8 @@ class VmcSink(DatagramSink):
         # Relative, because single precision keeps no fractions of a second of Unix time.
         time_s = _TIME + struct.pack(">f", pose.time_s - self._start_s)
         return _bundle([_OK, time_s, _ROOT, *bones[:_HALF]]), _bundle([time_s, *bones[_HALF:]])
+
+
+def open_sink(target: tuple[str, int], context: SinkContext) -> Sink:
+    """A `VmcSink` to a host and port."""
+    return VmcSink(*target, context.body)

@@ -11,7 +11,7 @@ from typing import Any
 
 import can
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import DeviceError, FileFormatError
 from edgepose.sources import POLL_S
 from edgepose.sources.live import Gone
 
@@ -80,18 +80,18 @@ class CanBus:
             fd: take CAN FD frames too.
 
         Raises:
-            EdgeposeError: no such interface or channel, or it cannot be opened.
+            DeviceError: no such interface or channel, or it cannot be opened.
         """
         interface, _, channel = name.partition(":")
         if interface not in can.VALID_INTERFACES:
             known = ", ".join(sorted(can.VALID_INTERFACES))
-            raise EdgeposeError(f"{name}: no CAN interface {interface!r}; python-can has {known}")
+            raise DeviceError(f"{name}: no CAN interface {interface!r}; python-can has {known}")
         flags: dict[str, Any] = {"fd": True} if fd else {}
         try:
             self._bus = can.Bus(channel or None, interface, bitrate=bitrate, **flags)
         # Every maker's library fails in its own way.
         except Exception as error:
-            raise EdgeposeError(f"{name}: {_opening_problem(interface, channel, error)}") from None
+            raise DeviceError(f"{name}: {_opening_problem(interface, channel, error)}") from None
         self._port: Buffered | None = None
         if interface == "slcan":
             bus: Any = self._bus
@@ -177,7 +177,7 @@ def read_log(path: Path) -> Iterator[tuple[str, float, list[can.Message] | None]
     """Channel, time in seconds, and message, of a log, in its order; None for one whose time or id cannot be.
 
     Raises:
-        EdgeposeError: it cannot be read, at once or up to its end.
+        FileFormatError: it cannot be read, at once or up to its end.
     """
     try:
         with _open_log(path) as messages:
@@ -190,8 +190,8 @@ def read_log(path: Path) -> Iterator[tuple[str, float, list[can.Message] | None]
                 else:
                     yield channel, 0.0, None
     except OSError as error:
-        raise EdgeposeError(f"{path}: cannot read it: {error.strerror or error}") from None
+        raise FileFormatError(f"{path}: cannot read it: {error.strerror or error}") from None
     # The readers of the formats fail in many ways.
     except Exception as error:
         text = (str(error).splitlines() or [""])[0] or type(error).__name__
-        raise EdgeposeError(f"{path}: cannot read it as a log of a CAN bus: {text}") from None
+        raise FileFormatError(f"{path}: cannot read it as a log of a CAN bus: {text}") from None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import ConfigError
 from edgepose.sources.line_decoder import Places
 from edgepose.sources.live import Handle, Link
 from edgepose.sources.protocol_detection import candidates
@@ -30,7 +30,7 @@ def links(
     """Ports and buses to listen to; the arguments are those of `open_source`.
 
     Raises:
-        EdgeposeError: there are none, a name is wrong, or the map names another one.
+        ConfigError: there are none, a name is wrong, or the map names another one.
     """
     ports = _names("--port", port)
     buses = _names("--can", can)
@@ -40,21 +40,21 @@ def links(
         known = {*ports, *map(channel, buses)}
         for name, device in sensor_map.devices.items():
             if device.line is not None and device.line not in known:
-                raise EdgeposeError(
+                raise ConfigError(
                     f"{sensor_map.path}: {name}: {device.port or device.can} is none of "
                     f"{', '.join([*ports, *buses])}, which --port and --can name"
                 )
         for name in sensor_map.ports:
             if name not in ports and name not in buses:
-                raise EdgeposeError(
+                raise ConfigError(
                     f"{sensor_map.path}: ports.{name}: no such line, only {', '.join([*ports, *buses])}"
                 )
     count = len(ports) + len(buses)
     if not count:
-        raise EdgeposeError("give one input: --port, --can or --file")
+        raise ConfigError("give one input: --port, --can or --file")
     for bus in buses:
         if ":" not in bus:
-            raise EdgeposeError(f"{bus}: give --can as INTERFACE:CHANNEL, such as socketcan:can0")
+            raise ConfigError(f"{bus}: give --can as INTERFACE:CHANNEL, such as socketcan:can0")
 
     def places(line: str, index: int) -> Callable[[Protocol], Places]:
         if sensor_map is not None:
@@ -77,7 +77,7 @@ def serial_link(name: str, protocol: str, baud: int | None, places: Callable[[Pr
     """One serial port.
 
     Raises:
-        EdgeposeError: no such protocol.
+        ConfigError: no such protocol.
     """
     protocols = candidates(protocol, "bytes", live=True)
     named = protocols[0] if len(protocols) == 1 else None
@@ -86,7 +86,7 @@ def serial_link(name: str, protocol: str, baud: int | None, places: Callable[[Pr
     if named is not None and named.request is not None:
         requests = [named.request(sensor) for sensor in places(named) if sensor is not None]
         if not requests:
-            raise EdgeposeError(
+            raise ConfigError(
                 f"{name}: devices of {named.name} are asked by id; give their ids with --sensors"
             )
 
@@ -106,7 +106,7 @@ def can_link(
     """One CAN bus.
 
     Raises:
-        EdgeposeError: no such protocol.
+        ConfigError: no such protocol.
     """
     protocols = candidates(protocol, "can", live=True)
     speed = bitrate or (protocols[0].speed if len(protocols) == 1 else BITRATE)
@@ -128,7 +128,7 @@ def _names(flag: str, text: str | None) -> Sequence[str]:
     names = [] if text is None else [name.strip() for name in text.split(",")]
     for i, name in enumerate(names):
         if not name:
-            raise EdgeposeError(f"{flag} {text}: an empty name between commas")
+            raise ConfigError(f"{flag} {text}: an empty name between commas")
         if name in names[:i]:
-            raise EdgeposeError(f"{flag} {text}: {name} is there twice")
+            raise ConfigError(f"{flag} {text}: {name} is there twice")
     return names

@@ -13,7 +13,7 @@ from queue import Empty, SimpleQueue
 from types import TracebackType
 from typing import Any, NamedTuple, Protocol
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import DeviceError, EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import POLL_S, Batches, Counters, Device, total
@@ -269,7 +269,7 @@ class LiveSource:
         """Open all lines.
 
         Raises:
-            EdgeposeError: one is not there, in use, or not allowed.
+            DeviceError: one is not there, in use, or not allowed.
         """
         claimed: dict[int, str] = {}
         with ExitStack() as stack:
@@ -293,7 +293,7 @@ class LiveSource:
         """Batches as they come, without end.
 
         Raises:
-            EdgeposeError: nothing usable comes at the start, or a line cannot be read.
+            DeviceError: nothing usable comes at the start, or a line cannot be read.
         """
         start_s = checked_s = now_s = _now()
         for line in self._lines:
@@ -378,7 +378,7 @@ def _told(link: Link, error: BaseException) -> EdgeposeError:
     if isinstance(error, EdgeposeError):
         return error
     text = (str(error).splitlines() or [""])[0]
-    told = EdgeposeError(
+    told = DeviceError(
         f"{link.name}: reading it failed ({type(error).__name__}: {text}); edgepose --debug shows where"
     )
     told.__cause__ = error
@@ -389,16 +389,16 @@ def _check_start(line: _Line, now_s: float, start_s: float) -> None:
     stream, link = line.stream, line.link
     if stream.first_s is None:
         if now_s - start_s > SILENCE_S and line.handle is not None:
-            raise EdgeposeError(f"{link.name}: nothing came for {SILENCE_S:g} s; check {link.check[0]}")
+            raise DeviceError(f"{link.name}: nothing came for {SILENCE_S:g} s; check {link.check[0]}")
     elif now_s - stream.first_s > NOISE_S and not stream.counters.packets:
         if stream.unknown_ids:
             ids = ", ".join(map(str, stream.unknown_ids))
-            raise EdgeposeError(
+            raise DeviceError(
                 f"{link.name}: packets come only of sensor ids {ids}; give the sensors the ids {stream.ids}, "
                 "or say with --sensors which is where"
             )
         what = "" if stream.protocol is None else f"{stream.protocol.name} "
-        raise EdgeposeError(
+        raise DeviceError(
             f"{link.name}: {stream.amount} {link.unit} in {NOISE_S:g} s and not one valid {what}packet; "
             f"check {link.check[1]}"
         )

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import ConfigError
 from firmware_protocols.registry import PROTOCOLS, Decoder, Protocol
 from firmware_protocols.sample import Sample
 
@@ -37,12 +37,12 @@ def protocol_named(name: str) -> Protocol:
     """A protocol of the table, or the text lines that a TOML file describes.
 
     Raises:
-        EdgeposeError: there is none, or it does not fit.
+        ConfigError: there is none, or it does not fit.
     """
     if name.endswith(".toml"):
         return _text_lines(Path(name))
     if name not in PROTOCOLS:
-        raise EdgeposeError(f"unknown protocol {name!r}; known are auto, {', '.join(PROTOCOLS)}")
+        raise ConfigError(f"unknown protocol {name!r}; known are auto, {', '.join(PROTOCOLS)}")
     return PROTOCOLS[name]
 
 
@@ -55,14 +55,14 @@ def candidates(name: str, transport: Literal["bytes", "can"], live: bool) -> lis
         live: the line has devices on it; those that want to be asked are not found by listening.
 
     Raises:
-        EdgeposeError: no such protocol, it is one of another transport, or a package for it is missing.
+        ConfigError: no such protocol, it is one of another transport, or a package for it is missing.
     """
     if name != "auto":
         protocol = protocol_named(name)
         if protocol.transport != transport:
             where = "CAN" if protocol.transport == "can" else "serial lines"
             flag = "--can" if protocol.transport == "can" else "--port"
-            raise EdgeposeError(f"protocol {name} is one of {where}; use it with {flag} or a log of one")
+            raise ConfigError(f"protocol {name} is one of {where}; use it with {flag} or a log of one")
         return [protocol]
     # Two names can stand for one decoder.
     first = {
@@ -88,7 +88,7 @@ class Detector:
             protocols: the candidates.
 
         Raises:
-            EdgeposeError: a package for the only candidate is missing.
+            ConfigError: a package for the only candidate is missing.
         """
         self._name = name
         self._protocols: list[Protocol] = []
@@ -99,7 +99,7 @@ class Detector:
                 decoder = protocol.decoder()
             except RuntimeError as error:  # an optional package
                 if len(protocols) == 1:
-                    raise EdgeposeError(str(error)) from None
+                    raise ConfigError(str(error)) from None
                 continue
             self._protocols.append(protocol)
             self.decoders.append(decoder)
@@ -119,7 +119,7 @@ class Detector:
             now: decide on weak evidence too.
 
         Raises:
-            EdgeposeError: two fit equally well.
+            ConfigError: two fit equally well.
         """
         heard = [i for i, samples in enumerate(self._heard) if samples]
         most = max((self.decoders[i].counters.packets for i in heard), default=0)
@@ -136,7 +136,7 @@ class Detector:
             return None
         for other in close[1:]:
             if self._quantities(other) == self._quantities(best):
-                raise EdgeposeError(
+                raise ConfigError(
                     f"{self._name}: it could be {self._protocols[best].name} ({packets} good packets) or "
                     f"{self._protocols[other].name} ({self.decoders[other].counters.packets}); "
                     "say which with --protocol"
@@ -155,7 +155,7 @@ def _text_lines(path: Path) -> Protocol:
     try:
         pattern = text.pattern_from_table(read_toml(path))
     except ValueError as error:
-        raise EdgeposeError(f"{path}: {error}") from None
+        raise ConfigError(f"{path}: {error}") from None
 
     def decoder() -> Any:
         return text.Decoder(pattern)

@@ -8,7 +8,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import ConfigError
 from edgepose.placements import PLACEMENTS
 from edgepose.sources.line_decoder import Places
 from edgepose.utils.text_files import read_toml
@@ -87,11 +87,11 @@ class SensorMap(NamedTuple):
         """Placements by id, of a line whose name is not known.
 
         Raises:
-            EdgeposeError: two devices can only be told apart by their lines.
+            ConfigError: two devices can only be told apart by their lines.
         """
         result = {device.id: i for i, device in enumerate(self.devices.values())}
         if len(result) < len(self.devices):
-            raise EdgeposeError(
+            raise ConfigError(
                 f"{self.path}: it tells sensors apart by their ports, and a capture holds one port; "
                 "record samples instead (edgepose record walk.csv)"
             )
@@ -113,13 +113,13 @@ def default_places(line: str, protocol: Protocol, index: int, count: int) -> Pla
         count: how many lines there are.
 
     Raises:
-        EdgeposeError: nothing can be assumed.
+        ConfigError: nothing can be assumed.
     """
     if protocol.alone and count == len(PLACEMENTS):
         return {None: index}
     if protocol.ids:
         return {sensor: i for i, sensor in enumerate(protocol.ids)}
-    raise EdgeposeError(
+    raise ConfigError(
         f"{line}: which sensor is where? {protocol.name} has one sensor on a line: give six ports in the "
         f"order {', '.join(PLACEMENTS)},\nor --sensors MAP.toml with a row for each, such as  "
         f'{PLACEMENTS[0]} = {{ port = "{line}" }}'
@@ -130,26 +130,24 @@ def read_map(path: Path) -> SensorMap:
     """The map in a file.
 
     Raises:
-        EdgeposeError: it cannot be read, or an entry means nothing.
+        ConfigError: it cannot be read, or an entry means nothing.
     """
     content = read_toml(path)
     tables = content.pop("ports", {})
     if not isinstance(tables, dict):
-        raise EdgeposeError(f'{path}: ports must be tables, such as  [ports."/dev/ttyUSB0"]')
+        raise ConfigError(f'{path}: ports must be tables, such as  [ports."/dev/ttyUSB0"]')
     unknown = [name for name in content if name not in PLACEMENTS]
     if unknown:
-        raise EdgeposeError(
-            f"{path}: unknown placement {unknown[0]!r}; placements are {', '.join(PLACEMENTS)}"
-        )
+        raise ConfigError(f"{path}: unknown placement {unknown[0]!r}; placements are {', '.join(PLACEMENTS)}")
     missing = [name for name in PLACEMENTS if name not in content]
     if missing:
-        raise EdgeposeError(f"{path}: no entry for {', '.join(missing)}; all six sensors need one")
+        raise ConfigError(f"{path}: no entry for {', '.join(missing)}; all six sensors need one")
     devices = {name: _device(f"{path}: {name}", content[name]) for name in PLACEMENTS}
     for (other, before), (name, device) in combinations(devices.items(), 2):
         lines = {device.line, before.line}
         same_line = len(lines) == 1 or None in lines
         if same_line and (device.id == before.id or (len(lines) == 1 and None in (device.id, before.id))):
-            raise EdgeposeError(
+            raise ConfigError(
                 f"{path}: {name} and {other} are the same device; give each a port or id of its own"
             )
     return SensorMap(str(path), devices, {n: _port(f"{path}: ports.{n}", t) for n, t in tables.items()})
@@ -162,15 +160,15 @@ def _device(where: str, entry: object) -> Device:
         _check_type(where, table, key, str, "text in quotes")
     _check_type(where, table, "id", int, "a whole number")
     if device.id is not None and device.id < 0:
-        raise EdgeposeError(f"{where}: id must be 0 or more, not {device.id}")
+        raise ConfigError(f"{where}: id must be 0 or more, not {device.id}")
     if device.port is not None and device.can is not None:
-        raise EdgeposeError(f"{where}: give port or can, not both")
+        raise ConfigError(f"{where}: give port or can, not both")
     if device.port is None and device.can is None and device.id is None:
-        raise EdgeposeError(f"{where}: say where its samples come from: port, can or id")
+        raise ConfigError(f"{where}: say where its samples come from: port, can or id")
     if device.mounting is not None:
         words = _MOUNTING.fullmatch(device.mounting)
         if words is None or _AXIS[words[1]] == _AXIS[words[2]]:
-            raise EdgeposeError(
+            raise ConfigError(
                 f'{where}: mounting must be as calibrate prints it, such as "x up, z back", '
                 f"not {device.mounting!r}"
             )
@@ -182,20 +180,20 @@ def _port(where: str, entry: object) -> PortSettings:
     _check_type(where, table, "protocol", str, "text in quotes")
     _check_type(where, table, "baud", int, "a whole number")
     if table.get("baud", 1) < 1:
-        raise EdgeposeError(f"{where}: baud must be 1 or more, not {table['baud']}")
+        raise ConfigError(f"{where}: baud must be 1 or more, not {table['baud']}")
     return PortSettings(**table)
 
 
 def _table(where: str, entry: object, keys: tuple[str, ...]) -> dict[str, Any]:
     if not isinstance(entry, dict):
-        raise EdgeposeError(f'{where}: must be a table, such as  {{ port = "/dev/ttyUSB0" }}')
+        raise ConfigError(f'{where}: must be a table, such as  {{ port = "/dev/ttyUSB0" }}')
     for key in entry:
         if key not in keys:
-            raise EdgeposeError(f"{where}: unknown key {key!r}; keys are {', '.join(keys)}")
+            raise ConfigError(f"{where}: unknown key {key!r}; keys are {', '.join(keys)}")
     return entry
 
 
 def _check_type(where: str, table: Mapping[str, Any], key: str, kind: type, what: str) -> None:
     # A bool is an int to isinstance.
     if key in table and type(table[key]) is not kind:
-        raise EdgeposeError(f"{where}: {key} must be {what}, not {table[key]!r}")
+        raise ConfigError(f"{where}: {key} must be {what}, not {table[key]!r}")

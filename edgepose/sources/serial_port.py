@@ -9,7 +9,7 @@ from itertools import cycle
 import serial
 from serial.tools import list_ports
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import DeviceError
 from edgepose.sources import POLL_S
 from edgepose.sources.live import Gone
 
@@ -41,14 +41,14 @@ class SerialPort:
                 devices speak on their own.
 
         Raises:
-            EdgeposeError: it is not there, in use, or not allowed.
+            DeviceError: it is not there, in use, or not allowed.
         """
         try:
             self._serial = serial.Serial(name, baud, timeout=POLL_S, exclusive=True)
         except OverflowError:
-            raise EdgeposeError(f"{name}: no port has a speed of {baud} bit/s; check --baud") from None
+            raise DeviceError(f"{name}: no port has a speed of {baud} bit/s; check --baud") from None
         except (OSError, ValueError, _TerminalError) as error:
-            raise EdgeposeError(f"{name}: {_opening_problem(error)}") from None
+            raise DeviceError(f"{name}: {_opening_problem(error)}") from None
         self._requests = cycle(requests) if requests else None
         if requests:
             longest = max(len(request) + answer for request, answer in requests)

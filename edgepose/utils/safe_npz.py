@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.lib.npyio import NpzFile
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import FileFormatError
 
 MAX_BYTES = 2 << 30
 """That a file may take in memory: hours of poses or samples."""
@@ -40,10 +40,10 @@ def check_size(path: Path, size: int) -> None:
     """Hold a file of any kind to what a true one becomes in memory, `size` bytes.
 
     Raises:
-        EdgeposeError: it is far too large, in itself or for a file as small as this.
+        FileFormatError: it is far too large, in itself or for a file as small as this.
     """
     if size > MAX_BYTES or size > max(_FREE_BYTES, _MAX_RATIO * path.stat().st_size):
-        raise EdgeposeError(
+        raise FileFormatError(
             f"{path}: unpacks to {size >> 20} MB; files are read up to {MAX_BYTES >> 20} MB, and up to "
             f"{_MAX_RATIO} times their own size"
         )
@@ -60,7 +60,7 @@ def open_npz(path: Path) -> Iterator[NpzFile]:
     """The arrays of a file, none of which is unpacked yet.
 
     Raises:
-        EdgeposeError: together they are too large, see `check_size`.
+        FileFormatError: together they are too large, see `check_size`.
         OSError: it cannot be read; all of `BROKEN`: it is no such file, here or where an array is taken out.
     """
     # A file of ours, because numpy leaves its own open where there is no archive in it.

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import EdgeposeError, FileFormatError
 
 MOST_STEPS = 5_000_000
 """Instructions of a pickle that are followed; a file of arrays has some hundred. About five seconds."""
@@ -161,7 +161,7 @@ class _Unpickler(_PythonUnpickler):
             return self.functions[module, name]
         if self.inert(module, name):
             return type(name, (Inert,), {})
-        raise EdgeposeError(f"{self.path}: the file asks for {module}.{name}, {self.advice}")
+        raise FileFormatError(f"{self.path}: the file asks for {module}.{name}, {self.advice}")
 
     def _tuple_of(self, items: list[Any]) -> _Tuple:
         made = _Tuple(items)
@@ -238,7 +238,7 @@ def read_pickle(
         inert: whether a class, by module and name, is known and becomes an `Inert`.
 
     Raises:
-        EdgeposeError: the file asks for code, is broken, or is no dictionary.
+        FileFormatError: the file asks for code, is broken, or is no dictionary.
         OSError: it cannot be read.
     """
     data = path.read_bytes()
@@ -248,9 +248,9 @@ def read_pickle(
         raise
     except Exception as error:  # a broken pickle can fail in any way
         reason = str(error).partition("\n")[0]
-        raise EdgeposeError(f"{path}: not a readable {what}: {reason}") from error
+        raise FileFormatError(f"{path}: not a readable {what}: {reason}") from error
     if not isinstance(content, dict):
-        raise EdgeposeError(f"{path}: {what} holds a dictionary, this one a {type(content).__name__}")
+        raise FileFormatError(f"{path}: {what} holds a dictionary, this one a {type(content).__name__}")
     return content
 
 
@@ -258,11 +258,11 @@ def numbers(value: Any, name: str, path: Path) -> np.ndarray:
     """Finite numbers of whatever a pickle has under a name: an array, or chumpy's wrapper of one.
 
     Raises:
-        EdgeposeError: it is something else.
+        FileFormatError: it is something else.
     """
     array = array_of(value, name, path)
     if not np.all(np.isfinite(array)):
-        raise EdgeposeError(f"{path}: {name} contains NaN or infinity")
+        raise FileFormatError(f"{path}: {name} contains NaN or infinity")
     return array
 
 
@@ -286,7 +286,7 @@ def array_of(value: Any, name: str, path: Path) -> np.ndarray:
     try:
         array = value.build() if isinstance(value, _Array) else np.asarray(_bounded(value))
     except (TypeError, ValueError) as error:
-        raise EdgeposeError(f"{path}: {name} is not an array of numbers") from error
+        raise FileFormatError(f"{path}: {name} is not an array of numbers") from error
     if array.dtype.kind not in "fiu":
-        raise EdgeposeError(f"{path}: {name} is not an array of numbers")
+        raise FileFormatError(f"{path}: {name} is not an array of numbers")
     return array

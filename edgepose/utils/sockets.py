@@ -1,9 +1,11 @@
-"""Where sockets go: the address of a name."""
+"""Addresses of sockets, as users write them and as the system wants them."""
 
 from __future__ import annotations
 
 import socket
-from typing import Any
+from typing import Any, NamedTuple
+
+from edgepose.errors import ConfigError
 
 
 def resolve(host: str, port: int, kind: socket.SocketKind) -> tuple[socket.AddressFamily, Any]:
@@ -18,3 +20,52 @@ def resolve(host: str, port: int, kind: socket.SocketKind) -> tuple[socket.Addre
     found = socket.getaddrinfo(host, port, type=kind)
     family, _, _, _, address = min(found, key=lambda entry: entry[0] != socket.AF_INET)
     return family, address
+
+
+class Destination(NamedTuple):
+    """Where datagrams go: host name or address, port, format "json" or "binary"."""
+
+    host: str
+    port: int
+    format: str
+
+
+def parse_address(text: str) -> tuple[str, int]:
+    """Host and port written as "HOST:PORT", an IPv6 address in brackets.
+
+    Raises:
+        ConfigError: not such a text.
+    """
+    host, colon, port = text.rpartition(":")
+    if not colon or not port or text.endswith("]"):
+        raise ConfigError(f"no port in {text!r}: write HOST:PORT, for example 127.0.0.1:9000")
+    if host.startswith("[") and host.endswith("]"):
+        host = host[1:-1]
+    elif ":" in host:
+        raise ConfigError(f"cannot tell address from port in {text!r}: write an IPv6 address as [::1]:9000")
+    if not host or any(c in "[]" or c.isspace() for c in host):
+        raise ConfigError(f"no host in {text!r}: write HOST:PORT, for example 127.0.0.1:9000")
+    if not (port.isascii() and port.isdigit() and len(port) <= 5 and 1 <= int(port) <= 65535):
+        raise ConfigError(f"port {port!r} in {text!r} is not a number from 1 to 65535")
+    return host, int(port)
+
+
+def parse_destination(text: str) -> Destination:
+    """Destination written as "HOST:PORT[,format=json|binary]"; JSON by default, see `parse_address`.
+
+    Raises:
+        ConfigError: not such a text.
+    """
+    address, *options = text.split(",")
+    host, port = parse_address(address)
+    form = "json"
+    for option in options:
+        key, _, value = option.partition("=")
+        if key != "format":
+            raise ConfigError(
+                f"unknown option {option!r} in {text!r}: the only one is format=json or format=binary"
+            )
+        if value not in ("json", "binary"):
+            raise ConfigError(f"unknown format {value!r} in {text!r}: choose json or binary")
+        form = value
+    return Destination(host, port, form)

@@ -8,7 +8,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import ConfigError
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -26,14 +26,14 @@ def read_text(path: Path, most: int = MOST_BYTES) -> str:
     """A text file in UTF-8 of so many bytes at most.
 
     Raises:
-        EdgeposeError: it is larger.
+        ConfigError: it is larger.
         OSError: it cannot be read.
         UnicodeDecodeError: it is no text.
     """
     with path.open("rb") as file:
         data = file.read(most + 1)
     if len(data) > most:
-        raise EdgeposeError(f"{path}: larger than {most >> 10} kB, as no such file is; is it another one?")
+        raise ConfigError(f"{path}: larger than {most >> 10} kB, as no such file is; is it another one?")
     return data.decode()
 
 
@@ -41,7 +41,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     """Content of a TOML file.
 
     Raises:
-        EdgeposeError: it cannot be read, or is none.
+        ConfigError: it cannot be read, or is none.
     """
     text = ""
     try:
@@ -50,13 +50,13 @@ def read_toml(path: Path) -> dict[str, Any]:
             raise ValueError(f"a key has more than {MOST_KEY_PARTS} parts")
         return tomllib.loads(text)
     except OSError as error:
-        raise EdgeposeError(f"{path}: cannot read it: {error.strerror}") from None
+        raise ConfigError(f"{path}: cannot read it: {error.strerror}") from None
     except RecursionError:
-        raise EdgeposeError(f"{path}: not valid TOML: brackets within brackets without end") from None
+        raise ConfigError(f"{path}: not valid TOML: brackets within brackets without end") from None
     except ValueError as error:  # also not UTF-8
         # The parser does not name what is there twice.
         keys = Counter(re.findall(r"^\s*(?:\[\s*)?([\w-]+)\s*[=\]]", text, re.MULTILINE))
         twice = [key for key, count in keys.items() if count > 1]
         if twice and re.search("twice|overwrite|mutate", str(error)):
-            raise EdgeposeError(f"{path}: {twice[0]} is there twice") from None
-        raise EdgeposeError(f"{path}: not valid TOML: {error}") from None
+            raise ConfigError(f"{path}: {twice[0]} is there twice") from None
+        raise ConfigError(f"{path}: not valid TOML: {error}") from None

@@ -1,7 +1,7 @@
 """What --filter does to the samples of a run, and what it tells."""
 
-from edgepose.cli.options.source import Orientations
 from edgepose.imu import ImuSample
+from edgepose.orientation.stage import OrientationStage
 
 LEVEL = (0.0, 0.0, 9.81)
 
@@ -11,7 +11,7 @@ def raw(sensor: int, k: int, **other) -> ImuSample:
 
 
 def test_samples_that_cannot_be_oriented_are_left_out() -> None:
-    orient = Orientations("kalman", magnetometer=True)
+    orient = OrientationStage("kalman", magnetometer=True)
     field = ImuSample(5, 0.105, mag=(20.0, 0.0, -40.0))
     without_rate = ImuSample(5, 0.11, acc=LEVEL)
     never_a_rate = ImuSample(4, 0.11, acc=LEVEL)
@@ -24,19 +24,19 @@ def test_samples_that_cannot_be_oriented_are_left_out() -> None:
 
 def test_without_a_filter_all_pass() -> None:
     samples = [ImuSample(5, 0.1, mag=(20.0, 0.0, -40.0)), raw(5, 11)]
-    assert Orientations("none", magnetometer=True)(samples) is samples
+    assert OrientationStage("none", magnetometer=True)(samples) is samples
 
 
 def test_some_with_a_magnetometer_and_some_without() -> None:
-    orient = Orientations("kalman", magnetometer=True)
+    orient = OrientationStage("kalman", magnetometer=True)
     orient([raw(sensor, 0, mag=(20.0, 0.0, -40.0)) for sensor in range(3)] + [raw(s, 0) for s in range(3, 6)])
     assert orient.mixed
     assert not orient.north
-    assert not Orientations("kalman", magnetometer=False).mixed
+    assert not OrientationStage("kalman", magnetometer=False).mixed
 
 
 def test_gaps_are_told_at_the_end() -> None:
-    orient = Orientations("kalman", magnetometer=False)
+    orient = OrientationStage("kalman", magnetometer=False)
     orient([raw(2, k) for k in [*range(100), *range(150, 250)]])
-    assert orient.remarks() == ["filter   left_lower_leg: 1 gap"]
-    assert Orientations("none", magnetometer=True).remarks() == []
+    assert orient.summary_lines() == ["filter   left_lower_leg: 1 gap"]
+    assert OrientationStage("none", magnetometer=True).summary_lines() == []

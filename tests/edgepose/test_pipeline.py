@@ -18,7 +18,7 @@ from edgepose.inference.engine import StreamEngine
 from edgepose.pipeline.frame_synchronizer import FrameClock
 from edgepose.pipeline.run import LATENCIES, RunSummary, Walk, run, status
 from edgepose.placements import PLACEMENTS
-from edgepose.sinks import Sink
+from edgepose.sinks.base import Sink
 from edgepose.sinks.csv import CsvSink
 from edgepose.sources import open_source
 

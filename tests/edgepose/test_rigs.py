@@ -428,10 +428,10 @@ def test_a_key_is_for_all_wearers():
     code = """
 import time
 from edgepose.cli.terminal.keys import Keys
-from edgepose.cli.rezero_requests import heard_by
+from edgepose.pipeline.remote_control import key_requests
 with Keys() as keys:
     print('ready', keys.listening, flush=True)
-    anna, ben = heard_by(2, keys)
+    anna, ben = key_requests(2, keys.pressed)
     while not (wishes := anna()):
         time.sleep(0.01)
     print('anna', wishes, anna(), 'ben', ben(), ben(), flush=True)

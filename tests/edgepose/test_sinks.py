@@ -20,9 +20,9 @@ from edgepose.pose import PoseFrame
 from edgepose.rotations import matrix_to_euler_zxy
 from edgepose.sinks import csv as csv_file
 from edgepose.sinks.csv import CsvSink, pose_columns
-from edgepose.sinks.udp import UdpSink, decode_binary, encode_binary, encode_json, parse_destination
+from edgepose.sinks.udp import UdpSink, decode_binary, encode_binary, encode_json
 from edgepose.skeleton import JOINTS
-from edgepose.utils.sockets import resolve
+from edgepose.utils.sockets import parse_destination, resolve
 
 DOCS = Path(__file__).parents[2] / "docs" / "outputs.md"
 STATUSES = ("ok", "held head", "held left_forearm pelvis; filling window", "filling window")

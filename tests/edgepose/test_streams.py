@@ -14,9 +14,9 @@ from edgepose.errors import EdgeposeError
 from edgepose.pose import PoseFrame
 from edgepose.sinks import vmc
 from edgepose.sinks.tcp import CLIENTS, TcpSink
-from edgepose.sinks.udp import parse_address
 from edgepose.sinks.vmc import VmcSink
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics
+from edgepose.utils.sockets import parse_address
 
 
 def pose(index: int = 0, where: np.ndarray | None = None, **turns: tuple[str, float]) -> PoseFrame:

@@ -14,7 +14,7 @@ from edgepose.pipeline.frame_synchronizer import FrameClock
 from edgepose.pipeline.multi_wearer import Wearer, run_together
 from edgepose.pipeline.run import Walk
 from edgepose.pose import PoseFrame
-from edgepose.sinks import Sink
+from edgepose.sinks.base import Sink
 from edgepose.sources import Source, open_source
 from edgepose.sources.live import Link, LiveSource
 from edgepose_export.networks.shape import NetworkShape

@@ -16,10 +16,12 @@ from edgepose import __version__, calibration
 from edgepose.calibration import Calibration, HeadingReset, HoldSummary
 from edgepose.cli.calibration_session import ROUTINE_S, Plan, finds_forward, live, recorded
 from edgepose.cli.options.outputs import check_files, overwrite_option
-from edgepose.cli.options.source import Orientations, SourceFlags, filter_options, source_options
+from edgepose.cli.options.source import filter_options, source_options
 from edgepose.cli.prompts import Guide
 from edgepose.cli.terminal import messages as terminal
+from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
+from edgepose.orientation.stage import OrientationStage
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 from edgepose.sources.sensor_map import read_map
@@ -124,7 +126,7 @@ def _span(ctx: click.Context, param: click.Parameter, value: str | None) -> tupl
     help="Time before each live hold, seconds.",
 )
 def calibrate(
-    source: SourceFlags,
+    source: SourceConfig,
     filter: str,
     no_mag: bool,
     out: str,
@@ -157,7 +159,7 @@ def calibrate(
     said = None if source.sensors is None else read_map(source.sensors)
     mounted = {} if said is None else {name: device.mounting for name, device in said.devices.items()}
     plan = Plan(pose, heading_reset, _words(heading_reset, mounted), motion, hold, from_s, countdown)
-    orient = Orientations(filter, magnetometer=not no_mag)
+    orient = OrientationStage(filter, magnetometer=not no_mag)
     say = Guide(err=out == "-")
     metadata: dict[str, Any] = {
         "program": f"edgepose {__version__}",
@@ -202,7 +204,7 @@ def calibrate(
 
 
 def _check_use(
-    source: SourceFlags,
+    source: SourceConfig,
     heading_reset: str | None,
     motion: tuple[float, float] | None,
     pose: str,

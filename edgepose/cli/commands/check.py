@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from edgepose.cli.options.source import SourceFlags, source_options
+from edgepose.cli.options.source import source_options
 from edgepose.cli.terminal.live_page import Page, is_coloured, is_terminal
 from edgepose.cli.terminal.messages import printable, say, show
 from edgepose.cli.terminal.stop_signal import Stop
+from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ class State(NamedTuple):
 @click.option("--json", "as_json", is_flag=True, help="Write the result as JSON.")
 @click.pass_context
 def check(
-    ctx: click.Context, source: SourceFlags, seconds: float | None, calibration: Path | None, as_json: bool
+    ctx: click.Context, source: SourceConfig, seconds: float | None, calibration: Path | None, as_json: bool
 ) -> None:
     """Show how each sensor does, and what to do where something is wrong: docs/check.md has the words.
 
@@ -96,7 +97,7 @@ def check(
     with ExitStack() as stack:
         page = stack.enter_context(Page()) if is_terminal() and source.live and not as_json else None
         warnings = stack.enter_context(_warnings(hidden=page is not None))
-        opened = stack.enter_context(open_source(**source._asdict(), lenient=True))
+        opened = stack.enter_context(open_source(**source.arguments(), lenient=True))
         stop = stack.enter_context(Stop())
 
         def watch(now: Callable[[], State]) -> None:

@@ -13,9 +13,10 @@ import click
 
 from edgepose import __version__
 from edgepose.cli.options.outputs import overwrite_option
-from edgepose.cli.options.source import SourceFlags, source_options
+from edgepose.cli.options.source import source_options
 from edgepose.cli.terminal.messages import end_status, has_terminal, say, status
 from edgepose.cli.terminal.stop_signal import Stop
+from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     help="Length of the recording from the first sample on.  [default: until Ctrl-C or the end of --file]",
 )
 @overwrite_option
-def record(source: SourceFlags, out: str, seconds: float | None, overwrite: bool) -> None:
+def record(source: SourceConfig, out: str, seconds: float | None, overwrite: bool) -> None:
     """Write what arrives to OUT until Ctrl-C; at most the last second is lost when the power goes.
 
     The ending of OUT says what is written: .csv and .npz samples; .bin the bytes of one port as they come,
@@ -48,6 +49,7 @@ def record(source: SourceFlags, out: str, seconds: float | None, overwrite: bool
       edgepose record walk.blf --can socketcan:can0
     """
     from edgepose import record as recorder
+    from edgepose.sources import open_source
 
     kind = recorder.kind(out)
     if kind == "port" and (source.port is None or "," in source.port or source.can is not None):
@@ -59,7 +61,9 @@ def record(source: SourceFlags, out: str, seconds: float | None, overwrite: bool
     raw: list[tuple[float, Any]] = []
     with ExitStack() as stack:
         recorder.check_free(out, overwrite)
-        opened = stack.enter_context(source.open(raw if kind != "samples" else None))
+        opened = stack.enter_context(
+            open_source(**source.arguments(), raw=raw if kind != "samples" else None)
+        )
         stop = stack.enter_context(Stop())
         output = recorder.open_output(out, _metadata(source), overwrite)
         say(f"recording to {out}; Ctrl-C ends it. Samples are counted in the order {', '.join(PLACEMENTS)}")
@@ -78,7 +82,7 @@ def record(source: SourceFlags, out: str, seconds: float | None, overwrite: bool
         raise EdgeposeError(opened.damage)
 
 
-def _metadata(source: SourceFlags) -> dict[str, str]:
+def _metadata(source: SourceConfig) -> dict[str, str]:
     return {
         "program": f"edgepose {__version__}",
         "source": source.name,

@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from edgepose.cli.conflicts import check_all_files
-from edgepose.cli.opened import OpenRig, calibration_of
-from edgepose.cli.options.wearer import RigFlags, rig_options
-from edgepose.cli.rezero_requests import heard_by
+from edgepose.cli.options.wearer import rig_options
 from edgepose.cli.terminal.keys import Keys
 from edgepose.cli.terminal.messages import end_status, has_terminal, say, status
 from edgepose.cli.terminal.stop_signal import Stop
@@ -23,7 +21,9 @@ from edgepose.inference.quantisation import CHOICES, pack
 if TYPE_CHECKING:
     import torch
 
+    from edgepose.config import WearerConfig
     from edgepose.inference.engine import BatchEngine, Engine
+    from edgepose.pipeline.build import OpenWearer
     from edgepose.pipeline.run import RunSummary, Walk
 
 
@@ -67,7 +67,7 @@ if TYPE_CHECKING:
     "alone, about 0.2 deg from f32.",
 )
 def run(
-    rigs: list[RigFlags],
+    rigs: list[WearerConfig],
     model: str,
     trust: bool,
     online: str,
@@ -91,6 +91,8 @@ def run(
       edgepose run --rig anna.toml --rig ben.toml --model rnn
     """
     from edgepose.inference import archive
+    from edgepose.pipeline.build import OpenWearer, load_wearer_calibration
+    from edgepose.pipeline.remote_control import key_requests
 
     path = archive.find(model)
     check_all_files(rigs, path)
@@ -100,7 +102,7 @@ def run(
             f"{rigs[0].name} and {other[0]}: beside sensors that send, a recording needs  realtime = true"
         )
 
-    calibrations = [calibration_of(rig) for rig in rigs]
+    calibrations = [load_wearer_calibration(rig, say) for rig in rigs]
     info = archive.inspect(path)
     kind, rate = info.metadata["kind"], float(info.metadata["rate_hz"])
     past = info.metadata["past"] if past is None else past
@@ -114,8 +116,10 @@ def run(
         # Sources are opened before the model is loaded: a wrong port is told at once.
         keys = Keys()
         opened = [
-            OpenRig(stack, rig, calibration, by_key, waits=not several)
-            for rig, calibration, by_key in zip(rigs, calibrations, heard_by(len(rigs), keys), strict=True)
+            OpenWearer(stack, rig, calibration, by_key, not several, say)
+            for rig, calibration, by_key in zip(
+                rigs, calibrations, key_requests(len(rigs), keys.pressed), strict=True
+            )
         ]
         if live:
             stack.enter_context(keys)
@@ -148,7 +152,7 @@ def _engine(
     module: torch.jit.ScriptModule,
     past: int,
     future: int,
-    rigs: list[RigFlags],
+    rigs: list[WearerConfig],
     windows: bool,
     precision: str,
 ) -> Engine | BatchEngine:
@@ -169,7 +173,7 @@ def _engine(
 
 
 def _walks(
-    opened: list[OpenRig], engine: Engine | BatchEngine, rate: float, live: bool, stop: Stop
+    opened: list[OpenWearer], engine: Engine | BatchEngine, rate: float, live: bool, stop: Stop
 ) -> list[Walk]:
     """The wearers' walks, to their ends."""
     from edgepose.inference.engine import BatchEngine

@@ -18,7 +18,7 @@ from edgepose.utils.output_targets import check_output
 
 if TYPE_CHECKING:
     from edgepose.rotations import Array
-    from edgepose.sinks import Sink
+    from edgepose.sinks.base import Sink
     from edgepose.sip.energy import Weights
     from edgepose.sip.measurements import Measurements
     from edgepose.sip.solve import Method, OnProgress, Solution
@@ -153,7 +153,7 @@ def solve(
         check_picture(Path(plot), "--plot", overwrite)
 
     from edgepose.calibration import load_calibration
-    from edgepose.sinks.files import bvh_sink, csv_sink, npz_sink
+    from edgepose.sinks.base import SinkContext, sink_factory
     from edgepose.sip import inputs as reading
     from edgepose.sip import residuals as report
     from edgepose.sip.bodies import sensor_points
@@ -177,16 +177,14 @@ def solve(
         # Opened before the work: a wrong name is told at once.
         sinks: list[Sink] = []
 
-        def add(sink: Sink) -> None:
-            sinks.append(stack.enter_context(sink))
-
         interrupted = False
-        if npz is not None:
-            add(npz_sink(npz, rate, True, overwrite=overwrite, stopped=lambda: interrupted))
-        if bvh is not None:
-            add(bvh_sink(bvh, rate, wearer, overwrite=overwrite, stopped=lambda: interrupted))
-        if csv is not None:
-            add(csv_sink(csv, rotations, translation=True, overwrite=overwrite, stopped=lambda: interrupted))
+        context = SinkContext(
+            body=wearer, rate=rate, rotations=rotations, translation=True, overwrite=overwrite,
+            stopped=lambda: interrupted,
+        )  # fmt: skip
+        for name, target in {"npz": npz, "bvh": bvh, "csv": csv}.items():
+            if target is not None:
+                sinks.append(stack.enter_context(sink_factory(name)(target, context)))
         for sink in sinks:
             sink.start()
         solutions, interrupted = _collect(solve_all(measurements, settings, jobs, _progress()))

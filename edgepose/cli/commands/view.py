@@ -93,7 +93,7 @@ def _open(host: str, port: int, body: Body) -> Viewer:
 
 
 def _listen(udp: str) -> socket.socket:
-    from edgepose.sinks.udp import parse_address
+    from edgepose.utils.sockets import parse_address
 
     host, port = parse_address(udp)
     try:

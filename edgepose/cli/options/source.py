@@ -2,74 +2,28 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import click
 
-from edgepose.errors import EdgeposeError
-from edgepose.imu import FILTERS, ImuSample
+from edgepose.config import SourceConfig, checked_protocol
+from edgepose.errors import ConfigError
+from edgepose.imu import FILTERS
 from edgepose.placements import PLACEMENTS
-from edgepose.sources.protocol_detection import protocol_named
 from firmware_protocols.registry import PROTOCOLS
-
-if TYPE_CHECKING:
-    from edgepose.orientation import Orienter
-    from edgepose.sources import Source
 
 BITS_PER_SECOND = click.IntRange(1)
 
 
-class SourceFlags(NamedTuple):
-    """Where samples come from; the fields are the arguments of `edgepose.sources.open_source`."""
-
-    port: str | None
-    baud: int | None
-    can: str | None
-    bitrate: int | None
-    fd: bool
-    file: Path | None
-    realtime: bool
-    protocol: str
-    sensors: Path | None
-
-    @property
-    def live(self) -> bool:
-        """Whether samples come at their own pace."""
-        return self.file is None or self.realtime
-
-    @property
-    def name(self) -> str:
-        """The source, for people."""
-        return ",".join(
-            str(name) for name in (self.file, self.port, self.can, self.sensors) if name is not None
-        )
-
-    def open(self, raw: list[tuple[float, Any]] | None = None, waits: bool = True) -> Source:
-        """The source; nothing is opened before it is entered.
-
-        Args:
-            raw: filled with what comes over live lines.
-            waits: see `edgepose.sources.open_source`.
-
-        Raises:
-            EdgeposeError: a flag or the map of sensors means nothing.
-        """
-        from edgepose.sources import open_source
-
-        return open_source(**self._asdict(), raw=raw, waits=waits)
-
-
 def _protocol(ctx: click.Context, param: click.Parameter, value: str) -> str:
-    # The file of a pattern is read later.
-    if value != "auto" and not value.endswith(".toml"):
-        try:
-            protocol_named(value)
-        except EdgeposeError as error:
-            raise click.BadParameter(str(error)) from None
-    return value
+    try:
+        return checked_protocol(value)
+    except ConfigError as error:
+        raise click.BadParameter(str(error)) from None
 
 
 protocol_option = click.option(
@@ -134,89 +88,16 @@ def source_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(command)
     def with_source(**words: Any) -> Any:
-        source = SourceFlags(*(words.pop(name) for name in SourceFlags._fields))
-        _check(source)
+        own = {each.name: words.pop(each.name) for each in dataclasses.fields(SourceConfig)}
+        try:
+            source = SourceConfig(**own)
+        except ConfigError as error:
+            raise click.UsageError(str(error)) from None
         return command(source=source, **words)
 
     for flag in reversed(flags):
         with_source = flag(with_source)
     return with_source
-
-
-def _check(source: SourceFlags) -> None:
-    """Raises click.UsageError unless the flags name one source."""
-    lines = source.port is not None or source.can is not None
-    if (source.file is not None and lines) or not (lines or source.file or source.sensors):
-        raise click.UsageError("give one source: --port PORT, --can INTERFACE:CHANNEL or --file PATH")
-
-
-class Orientations:
-    """Turns samples into oriented ones as the flags of `filter_options` say."""
-
-    def __init__(self, filter: str, magnetometer: bool) -> None:
-        """No sample has come.
-
-        Args:
-            filter: one of FILTERS.
-            magnetometer: use magnetometers, where there are any.
-        """
-        self._filter, self._magnetometer = filter, magnetometer
-        self._with_north: set[int] = set()
-        self._made: set[int] = set()  # sensors that have been oriented
-        self._orienter: Orienter | None = None
-        if filter != "none":
-            from edgepose.orientation import Orienter
-
-            self._orienter = Orienter(filter, magnetometer)
-
-    @property
-    def passes(self) -> bool:
-        """Whether samples pass as they are."""
-        return self._orienter is None
-
-    def anew(self) -> Orientations:
-        """The same, with no sample seen, for another recording."""
-        return Orientations(self._filter, self._magnetometer)
-
-    @property
-    def north(self) -> bool:
-        """Whether all sensors have a heading that counts from north, as far as the samples have shown.
-
-        What devices with a filter of their own do is not known here: it is taken for granted.
-        """
-        return self._orienter is None or (self._magnetometer and len(self._with_north) == len(PLACEMENTS))
-
-    @property
-    def mixed(self) -> bool:
-        """Whether some sensors have sent a magnetic field and others none, all being wanted."""
-        return self._magnetometer and 0 < len(self._with_north) < len(PLACEMENTS)
-
-    def remarks(self) -> list[str]:
-        """What happened to the samples of each sensor, for the end of a run."""
-        status = {} if self._orienter is None else self._orienter.status()
-        return [
-            f"filter   {PLACEMENTS[sensor]}: "
-            + ", ".join(
-                f"{count} {str(event.name).lower().replace('_', ' ')}" for event, count in own.events.items()
-            )
-            for sensor, own in status.items()
-            if own.events
-        ]
-
-    def __call__(self, samples: list[ImuSample]) -> list[ImuSample]:
-        """The samples, oriented; without those of oriented sensors that cannot be."""
-        if self._orienter is None:
-            return samples
-        if len(self._with_north) < len(PLACEMENTS):
-            self._with_north.update(sample.sensor for sample in samples if sample.mag is not None)
-        oriented = self._orienter.orient(samples)
-        self._made.update(sample.sensor for sample in oriented if sample.quat is not None)
-        # What only brought a field, or lost its rate on the way, has no orientation to give.
-        return [
-            sample
-            for sample in oriented
-            if sample.quat is not None or (sample.acc is not None and sample.sensor not in self._made)
-        ]
 
 
 def filter_options(command: Callable[..., Any]) -> Callable[..., Any]:

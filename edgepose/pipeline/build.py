@@ -1,4 +1,4 @@
-"""A wearer of `edgepose run` from the opening of lines and files to what there is to say at the end."""
+"""One wearer of a run, from opening its source to its closing summary."""
 
 from __future__ import annotations
 
@@ -6,54 +6,66 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
-from edgepose.cli.options.source import Orientations
-from edgepose.cli.options.wearer import RigFlags
-from edgepose.cli.rezero_requests import Wishes
-from edgepose.cli.terminal.messages import say
-from edgepose.errors import EdgeposeError, named
+import numpy as np
+
+from edgepose.calibration import load_calibration
+from edgepose.calibration.misfit import Misfits
+from edgepose.calibration.rezero import Headings
+from edgepose.config import WearerConfig
+from edgepose.errors import CalibrationError, EdgeposeError, FileFormatError, named
+from edgepose.orientation.stage import OrientationStage
+from edgepose.pipeline.frame_synchronizer import FrameClock
+from edgepose.pipeline.remote_control import RezeroRequests
 from edgepose.pipeline.rig_comparison import other_devices
+from edgepose.pipeline.run import RunSummary, Walk
 from edgepose.placements import PLACEMENTS
+from edgepose.sinks.open import open_outputs
+from edgepose.sources import open_source
 
 if TYPE_CHECKING:
     from edgepose.calibration import Calibration
-    from edgepose.pipeline.run import RunSummary, Walk
-    from edgepose.sinks import Sink
+    from edgepose.sinks.base import Sink
+
+Notify = Callable[[str], None]
+"""Takes a line for the user."""
 
 
-class OpenRig:
+class OpenWearer:
     """A wearer whose source is open.
 
     Attributes:
         source: where the samples come from.
-        say: says things of the wearer on stderr.
+        say: reports something about the wearer.
     """
 
     def __init__(
         self,
         stack: ExitStack,
-        flags: RigFlags,
+        config: WearerConfig,
         calibration: Calibration,
         by_key: Callable[[], list[float]],
         waits: bool,
+        notify: Notify,
     ) -> None:
         """Opens the source.
 
         Args:
             stack: closes what is opened.
-            flags: the wearer's.
+            config: the wearer's.
             calibration: the wearer's, see `calibration_of`.
-            by_key: wishes to re-zero that come by key.
+            by_key: re-zero requests from the keyboard.
             waits: see `edgepose.sources.open_source`.
+            notify: takes lines for the user.
 
         Raises:
             EdgeposeError: the source cannot be opened, or a filter or address is not to be had here.
         """
-        self.say = voice(flags.name)
-        self._flags, self._calibration = flags, calibration
-        with named(flags.name):
-            self.source = stack.enter_context(flags.source.open(waits=waits))
-            self._wishes = Wishes(stack, flags.control, by_key)
-            self._orient = Orientations(flags.filter, magnetometer=calibration.north)
+        self.say = _prefixed(config.name, notify)
+        self._config, self._calibration = config, calibration
+        with named(config.name):
+            self.source = stack.enter_context(open_source(**config.source.arguments(), waits=waits))
+            self._requests = RezeroRequests(stack, config.control, by_key)
+            self._orient = OrientationStage(config.filter, magnetometer=calibration.north)
         self._sinks: list[Sink] = []
 
     def open_outputs(self, stack: ExitStack, rate: float, stopped: Callable[[], bool]) -> None:
@@ -62,13 +74,13 @@ class OpenRig:
         Args:
             stack: closes them.
             rate: poses a second.
-            stopped: whether the run is to end, see `OutputFlags.open`.
+            stopped: whether the run is to end, see `SinkContext`.
 
         Raises:
             EdgeposeError: one cannot be written to.
         """
-        with named(self._flags.name):
-            self._sinks = self._flags.outputs.open(stack, rate, stopped)
+        with named(self._config.name):
+            self._sinks = open_outputs(stack, self._config.outputs, rate, stopped)
 
     def walk(self, rate: float, several: bool, on_pose: Callable[[RunSummary], None]) -> Walk:
         """From samples to the outputs.
@@ -79,16 +91,12 @@ class OpenRig:
                 full.
             on_pose: called after each pose.
         """
-        from edgepose.calibration.misfit import Misfits
-        from edgepose.calibration.rezero import Headings
-        from edgepose.pipeline.frame_synchronizer import FrameClock
-        from edgepose.pipeline.run import Walk
 
-        source = self._flags.source
+        source = self._config.source
         headings = Headings(
             self._calibration,
             hold_first=source.live and _begins_anew(self._calibration),
-            requests=self._wishes.poll,
+            requests=self._requests.poll,
             tell=self.say,
         )
         return Walk(
@@ -125,19 +133,19 @@ class OpenRig:
         if summary.held:
             worst = sorted(zip(summary.held_by_sensor, PLACEMENTS, strict=True), reverse=True)
             self.say("held     " + ", ".join(f"{name} in {count} frames" for count, name in worst if count))
-        if summary.latencies_s and self._flags.source.live:
+        if summary.latencies_s and self._config.source.live:
             self.say(_latency(summary, rate, future))
-        remarks = (self._orient.remarks(), self._flags.outputs.remarks(self._sinks), self._wishes.remarks())
-        for line in (line for lines in remarks for line in lines):
+        lines = self._orient.summary_lines()
+        for sink in self._sinks:
+            lines += sink.summary_lines()
+        for line in lines + self._requests.summary_lines():
             self.say(line)
         if summary.error is None and self.source.damage:
-            return EdgeposeError(self.source.damage)
+            return FileFormatError(self.source.damage)
         return summary.error
 
 
 def _latency(summary: RunSummary, rate: float, future: int) -> str:
-    import numpy as np
-
     p50, p99, most = np.percentile(np.array(summary.latencies_s) * 1e3, [50, 99, 100])
     ahead = f" plus {future} frames of look-ahead, {future / rate * 1e3:.0f} ms" if future else ""
     return (
@@ -146,37 +154,35 @@ def _latency(summary: RunSummary, rate: float, future: int) -> str:
     )
 
 
-def calibration_of(rig: RigFlags) -> Calibration:
-    """The calibration that a wearer's flags name.
+def load_wearer_calibration(config: WearerConfig, notify: Notify) -> Calibration:
+    """The calibration of a wearer.
 
     Raises:
         EdgeposeError: it cannot be read, or orientations are not made as they were for it.
     """
-    from edgepose.calibration import load_calibration
-
-    calibration = load_calibration(rig.calibration)
-    with named(rig.name):
-        _check_filter(calibration, rig)
+    calibration = load_calibration(config.calibration)
+    with named(config.name):
+        _check_filter(calibration, config, notify)
     return calibration
 
 
-def _check_filter(calibration: Calibration, rig: RigFlags) -> None:
+def _check_filter(calibration: Calibration, config: WearerConfig, notify: Notify) -> None:
     """Raises EdgeposeError unless orientations are made as they were for the calibration.
 
     Not a warning: another filter has other headings, and all poses would be wrong without looking so.
     """
-    if rig.filter != calibration.filter:
-        raise EdgeposeError(
+    if config.filter != calibration.filter:
+        raise CalibrationError(
             f"the calibration was made with --filter {calibration.filter}, and this run has --filter "
-            f"{rig.filter}: headings would differ; use the same one, or calibrate again"
+            f"{config.filter}: headings would differ; use the same one, or calibrate again"
         )
-    if rig.no_mag and rig.filter != "none" and calibration.north:
-        raise EdgeposeError(
+    if config.no_mag and config.filter != "none" and calibration.north:
+        raise CalibrationError(
             "the calibration was made with magnetometers: leave --no-mag out, or calibrate again with it"
         )
     made_from = calibration.metadata.get("source")
-    if not rig.source.live and _begins_anew(calibration) and made_from != rig.source.name:
-        voice(rig.name)(
+    if not config.source.live and _begins_anew(calibration) and made_from != config.source.name:
+        _prefixed(config.name, notify)(
             f"warning: the calibration was made from {made_from}, and headings of a filter without "
             "magnetometers begin anew in each recording: calibrate from this one"
         )
@@ -187,6 +193,6 @@ def _begins_anew(calibration: Calibration) -> bool:
     return calibration.filter != "none" and not calibration.north
 
 
-def voice(name: str) -> Callable[[str], None]:
-    """Says things of a wearer on stderr; one without a name needs none."""
-    return lambda text: say(f"{name}: {text}" if name else text)
+def _prefixed(name: str, notify: Notify) -> Notify:
+    """Reports with the wearer's name in front, if there is one."""
+    return lambda text: notify(f"{name}: {text}" if name else text)

@@ -1,0 +1,312 @@
+"""What a run is asked to do: one configuration, filled from flags, from a TOML file or from Python.
+
+WearerConfig(source=SourceConfig(port="/dev/ttyUSB0"), calibration=Path("calib.json"),
+             outputs=OutputConfig(csv="poses.csv"))
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from edgepose.errors import ConfigError, EdgeposeError
+from edgepose.formats.poses.csv_columns import FORMS
+from edgepose.imu import FILTERS
+from edgepose.utils.output_targets import check_output
+from edgepose.utils.sockets import Destination, parse_address, parse_destination
+from edgepose.utils.text_files import read_toml
+
+ANY_OUTPUT = "give at least one output, such as --csv FILE, --udp HOST:PORT or --view"
+ONE_SOURCE = "give one source: --port PORT, --can INTERFACE:CHANNEL or --file PATH"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceConfig:
+    """Where samples come from; the fields are the arguments of `edgepose.sources.open_source`.
+
+    Attributes:
+        port: serial ports, separated by commas.
+        baud: their speed, bit/s; None is the protocol's usual one.
+        can: CAN bus, INTERFACE:CHANNEL.
+        bitrate: its speed, bit/s; None is the protocol's usual one.
+        fd: take CAN FD frames too.
+        file: recording, raw serial capture or log of a CAN bus; "-" is standard input.
+        realtime: replay the file at its own pace.
+        protocol: name of a wire format, a TOML file that describes text lines, or "auto".
+        sensors: TOML file that maps devices to placements.
+    """
+
+    port: str | None = None
+    baud: int | None = None
+    can: str | None = None
+    bitrate: int | None = None
+    fd: bool = False
+    file: Path | None = None
+    realtime: bool = False
+    protocol: str = "auto"
+    sensors: Path | None = None
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError unless the fields name one source and are in their ranges."""
+        for name in ("file", "sensors"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, Path(getattr(self, name)))
+        for name in ("baud", "bitrate"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ConfigError(f"{name}: {value} is not in the range x>=1")
+        lines = self.port is not None or self.can is not None
+        if (self.file is not None and lines) or not (lines or self.file or self.sensors):
+            raise ConfigError(ONE_SOURCE)
+
+    @property
+    def live(self) -> bool:
+        """Whether samples come at their own pace."""
+        return self.file is None or self.realtime
+
+    @property
+    def name(self) -> str:
+        """The source, for people."""
+        return ",".join(
+            str(name) for name in (self.file, self.port, self.can, self.sensors) if name is not None
+        )
+
+    def arguments(self) -> dict[str, Any]:
+        """The arguments of `edgepose.sources.open_source`."""
+        return {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputConfig:
+    """Where poses go; outputs that are None or false are not written.
+
+    Attributes:
+        csv: file; "-" is standard output.
+        rotations: representation of rotations in the CSV.
+        std: add the network's standard deviations to the CSV.
+        npz: file.
+        bvh: file.
+        udp: where datagrams go.
+        osc: host and port of a VMC receiver.
+        tcp: address to listen at for viewers.
+        view: show a figure in the browser.
+        height: the wearer's stature, metres.
+        overwrite: replace files that exist.
+        sinks: targets of outputs that other packages add (entry points `edgepose.sinks`), by their name.
+    """
+
+    csv: str | None = None
+    rotations: str = "axis-angle"
+    std: bool = False
+    npz: str | None = None
+    bvh: str | None = None
+    udp: Destination | None = None
+    osc: tuple[str, int] | None = None
+    tcp: tuple[str, int] | None = None
+    view: bool = False
+    height: float = 1.75
+    overwrite: bool = False
+    sinks: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError for an unknown representation of rotations."""
+        if self.rotations not in FORMS:
+            raise ConfigError(f"rotations: {self.rotations!r} is not one of {', '.join(map(repr, FORMS))}")
+
+    @property
+    def any(self) -> bool:
+        """Whether there is an output at all."""
+        named = (self.csv, self.npz, self.bvh, self.udp, self.osc, self.tcp)
+        return self.view or bool(self.sinks) or any(output is not None for output in named)
+
+    @property
+    def files(self) -> dict[str, str | None]:
+        """The files that are asked for, by flag."""
+        return {"--csv": self.csv, "--npz": self.npz, "--bvh": self.bvh}
+
+    def check(self) -> None:
+        """Make sure that no file is lost by what is asked for.
+
+        Raises:
+            EdgeposeError: a file exists already, or cannot be written.
+        """
+        for name, ending in ((self.csv, ".csv"), (self.npz, ".npz"), (self.bvh, ".bvh")):
+            if name is not None:
+                check_output(name, "poses", (ending,), self.overwrite)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WearerConfig:
+    """One wearer of a run.
+
+    Attributes:
+        source: where samples come from.
+        calibration: file that `edgepose calibrate` wrote.
+        outputs: where poses go.
+        filter: what makes orientations, one of `edgepose.imu.FILTERS`.
+        no_mag: leave magnetometers out of the filter.
+        control: address to listen at for re-zero requests.
+        name: what messages call the wearer; empty for a single one.
+        path: the TOML file that this came from, if it did.
+    """
+
+    source: SourceConfig
+    calibration: Path
+    outputs: OutputConfig
+    filter: str = "none"
+    no_mag: bool = False
+    control: tuple[str, int] | None = None
+    name: str = ""
+    path: Path | None = None
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError where fields do not go together."""
+        object.__setattr__(self, "calibration", Path(self.calibration))
+        if self.filter not in FILTERS:
+            raise ConfigError(f"filter: {self.filter!r} is not one of {', '.join(map(repr, FILTERS))}")
+        if not self.outputs.any:
+            raise ConfigError(ANY_OUTPUT)
+        if self.control is not None and not self.source.live:
+            raise ConfigError("--control needs sensors that send, or --realtime")
+
+    @classmethod
+    def from_toml(cls, path: Path) -> WearerConfig:
+        """The wearer of a TOML file, whose keys are the names of `edgepose run`'s flags.
+
+        Files are relative to the folder of the TOML file.
+
+        Raises:
+            ConfigError: the file cannot be read, or a key or value is not valid.
+        """
+        content = read_toml(path)
+        name = content.pop("name", path.stem)
+        if not isinstance(name, str) or not name.isprintable() or not name.strip():
+            raise ConfigError(f"{path}: name must be text in quotes on one line, not {name!r}")
+        try:
+            values = {
+                key.replace("-", "_"): _value(key, value, path.parent) for key, value in content.items()
+            }
+            return cls.from_values(values, name=name, path=path)
+        except EdgeposeError as error:
+            # Keys are the flags without their hyphens.
+            raise ConfigError(f"{path}: {str(error).replace('--', '')}") from None
+
+    @classmethod
+    def from_values(cls, values: Mapping[str, Any], **more: Any) -> WearerConfig:
+        """The wearer of flat values, by the names of the fields of all three classes.
+
+        Raises:
+            ConfigError: a value is not valid, or the calibration is missing.
+        """
+        values = dict(values)
+
+        def own(kind: type) -> dict[str, Any]:
+            return {
+                each.name: values.pop(each.name) for each in dataclasses.fields(kind) if each.name in values
+            }
+
+        source, outputs = SourceConfig(**own(SourceConfig)), OutputConfig(**own(OutputConfig))
+        if values.get("calibration") is None:
+            raise ConfigError("calibration is missing")
+        return cls(source=source, outputs=outputs, **values, **more)
+
+
+# --- TOML ---------------------------------------------------------------------------------------------------
+
+_TEXT, _SWITCH, _WHOLE, _NUMBER = "text in quotes", "true or false", "a whole number", "a number"
+
+_TYPES: dict[str, tuple[type, ...]] = {_TEXT: (str,), _SWITCH: (bool,), _WHOLE: (int,), _NUMBER: (int, float)}
+
+_FILES = ("file", "sensors", "calibration", "csv", "npz", "bvh")
+"""Keys whose values are files, relative to the TOML file; `protocol` may be one."""
+
+_KEYS = {
+    "port": _TEXT,
+    "baud": _WHOLE,
+    "can": _TEXT,
+    "bitrate": _WHOLE,
+    "fd": _SWITCH,
+    "file": _TEXT,
+    "realtime": _SWITCH,
+    "protocol": _TEXT,
+    "sensors": _TEXT,
+    "filter": _TEXT,
+    "no-mag": _SWITCH,
+    "calibration": _TEXT,
+    "csv": _TEXT,
+    "rotations": _TEXT,
+    "std": _SWITCH,
+    "npz": _TEXT,
+    "bvh": _TEXT,
+    "udp": _TEXT,
+    "osc": _TEXT,
+    "tcp": _TEXT,
+    "view": _SWITCH,
+    "height": _NUMBER,
+    "overwrite": _SWITCH,
+    "control": _TEXT,
+}
+
+
+def _value(key: str, value: object, folder: Path) -> Any:
+    """A value of the TOML file as the configuration has it.
+
+    Raises:
+        ConfigError: there is no such key, or the value is of another type or not valid.
+    """
+    if key == "sinks" and isinstance(value, dict) and all(isinstance(own, str) for own in value.values()):
+        return value
+    what = _KEYS.get(key)
+    if what is None:
+        raise ConfigError(f"unknown key {key!r}; keys are name, {', '.join([*_KEYS, 'sinks'])}")
+    if type(value) not in _TYPES[what]:  # a bool is an int to isinstance
+        raise ConfigError(f"{key} must be {what}, not {value!r}")
+    if not isinstance(value, str):
+        return float(value) if what == _NUMBER and isinstance(value, int | float) else value
+    if "\0" in value:
+        raise ConfigError(f"{key} must be text without NUL characters, not {value!r}")
+    return _text(key, value, folder)
+
+
+def _text(key: str, value: str, folder: Path) -> Any:
+    if key in _FILES and value != "-":
+        value = str(folder / value)
+    if key in ("file", "sensors", "calibration"):
+        return Path(value)
+    if key == "protocol":
+        return str(folder / value) if value.endswith(".toml") else checked_protocol(value)
+    parse = {"udp": parse_destination, "osc": parse_host_and_port, "tcp": parse_host_and_port}
+    parse["control"] = parse_host_and_port
+    if key not in parse:
+        return value
+    try:
+        return parse[key](value)
+    except EdgeposeError as error:
+        raise ConfigError(f"{key}: {error}") from None
+
+
+def parse_host_and_port(text: str) -> tuple[str, int]:
+    """Host and port of a text that is nothing else.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    if "," in text:
+        raise ConfigError(f"{text!r} is more than HOST:PORT")
+    return parse_address(text)
+
+
+def checked_protocol(name: str) -> str:
+    """The name of a wire format, "auto", or of a TOML file, which is read later.
+
+    Raises:
+        ConfigError: there is no such wire format.
+    """
+    from firmware_protocols.registry import PROTOCOLS
+
+    if name == "auto" or name.endswith(".toml") or name in PROTOCOLS:
+        return name
+    raise ConfigError(f"unknown protocol {name!r}; known are {', '.join(PROTOCOLS)}")

@@ -1,0 +1,129 @@
+"""The interface of outputs, and the table of those that there are."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from importlib import import_module
+from importlib.metadata import entry_points
+from types import TracebackType
+from typing import Any, NamedTuple, TypeVar
+
+from edgepose.errors import ConfigError
+from edgepose.pose import PoseFrame
+from edgepose.skeleton import Body
+
+Self = TypeVar("Self", bound="Sink")
+
+
+class Sink(ABC):
+    """An output of poses, open from its construction until `close`; use it in a `with` statement."""
+
+    def start(self) -> None:  # noqa: B027 - most outputs have nothing to do
+        """The run begins: a file may appear.
+
+        Raises:
+            EdgeposeError: it cannot.
+        """
+
+    @abstractmethod
+    def write(self, pose: PoseFrame) -> None:
+        """Take the next pose.
+
+        Raises:
+            EdgeposeError: the output can take no more; what it has taken so far is complete.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Finish the output; a second call does nothing."""
+
+    def discard(self) -> None:
+        """Finish the output after a failure: as `close`, but without a pose no file appears."""
+        self.close()
+
+    def summary_lines(self) -> list[str]:
+        """What there is to say at the end of a run, one line each."""
+        return []
+
+    def __enter__(self: Self) -> Self:
+        """The sink itself, open since its construction."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close, whatever happened."""
+        if kind is None:
+            self.close()
+        else:
+            self.discard()
+
+
+class SinkContext(NamedTuple):
+    """What sinks need besides their own target.
+
+    Attributes:
+        body: the wearer's, for bone lengths.
+        height: the wearer's stature, metres.
+        rate: poses per second.
+        rotations: representation of rotations in CSV, a key of `edgepose.formats.poses.csv_columns.FORMS`.
+        std: write standard deviations, where the format has room for them.
+        translation: poses have a translation.
+        overwrite: replace files that exist.
+        stopped: whether the run is to end. Then a reader that takes nothing is not waited for.
+    """
+
+    body: Body
+    height: float = 1.75
+    rate: float = 60.0
+    rotations: str = "axis-angle"
+    std: bool = False
+    translation: bool = False
+    overwrite: bool = False
+    stopped: Callable[[], bool] = lambda: False
+
+
+SinkFactory = Callable[[Any, SinkContext], Sink]
+"""Opens a sink, given its target (a file, an address) and the context.
+
+Raises:
+    EdgeposeError: it cannot be opened.
+"""
+
+SINKS = {
+    "udp": "edgepose.sinks.udp:open_sink",
+    "osc": "edgepose.sinks.vmc:open_sink",
+    "tcp": "edgepose.sinks.tcp:open_sink",
+    "npz": "edgepose.sinks.npz:open_sink",
+    "bvh": "edgepose.sinks.bvh:open_sink",
+    "csv": "edgepose.sinks.csv:open_sink",
+    "view": "edgepose.sinks.viewer:open_sink",
+}
+"""Factories by the name of their flag, in the order in which they are opened.
+
+A wrong address is reported before a pipe's reader is waited for; the viewer starts when all else is ready.
+"""
+
+ENTRY_POINTS = "edgepose.sinks"
+"""Group of entry points under which other packages name their factories."""
+
+
+def sink_factory(name: str) -> SinkFactory:
+    """The factory of a sink, from the table or from another package.
+
+    Raises:
+        ConfigError: there is none, or the other package cannot be imported.
+    """
+    if name in SINKS:
+        module, _, function = SINKS[name].partition(":")
+        factory: SinkFactory = getattr(import_module(module), function)
+        return factory
+    for point in entry_points(group=ENTRY_POINTS, name=name):
+        try:
+            loaded: SinkFactory = point.load()
+        except Exception as error:  # code of others
+            raise ConfigError(f"output {name!r}: {point.value} cannot be imported: {error}") from error
+        return loaded
+    known = ", ".join(sorted({point.name for point in entry_points(group=ENTRY_POINTS)})) or "none"
+    raise ConfigError(f"unknown output {name!r}; installed packages add: {known}")
