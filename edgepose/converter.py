@@ -66,12 +66,14 @@ class Options(NamedTuple):
         sensors: map of devices to placements, for captures, CAN logs and sessions.
         filter: what makes orientations, see `orient_recording`; "none" leaves them as they are.
         height_m: the wearer's stature, for the bones of BVH files, metres.
+        overwrite: whether a recording may take the place of a file.
     """
 
     protocol: str = "auto"
     sensors: Path | None = None
     filter: str = "none"
     height_m: float = 1.75
+    overwrite: bool = True
 
 
 _DEFAULTS = Options()
@@ -188,7 +190,7 @@ def convert(job: Job, options: Options = _DEFAULTS) -> Result:
             if options.filter != "none":
                 raise EdgeposeError(f"{job.source}: --filter is for recordings, not for poses; leave it out")
             _make(job.target.parent)
-            return Result(job, *convert_poses(job.source, job.target, options.height_m))
+            return Result(job, *convert_poses(job.source, job.target, options.height_m, options.overwrite))
         recording = _read(job.source, options.protocol, options.sensors)
         data = recording.sensors.values()
         if not data:
@@ -199,7 +201,9 @@ def convert(job: Job, options: Options = _DEFAULTS) -> Result:
             recording = orient_recording(recording, options.filter, name=str(job.source))
         _make(job.target.parent)
         write = WRITERS[job.target.suffix[1:]]
-        replace_file(job.target, lambda path: write(path, recording), "recording")
+        replace_file(
+            job.target, lambda path: write(path, recording), "recording", overwrite=options.overwrite
+        )
     except EdgeposeError as error:
         return Result(job, problem=str(error))
     except MemoryError:

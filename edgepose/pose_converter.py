@@ -27,13 +27,16 @@ def _write(path: Path, poses: Poses, height_m: float) -> None:
             sink.write(pose)
 
 
-def convert_poses(source: Path, target: Path, height_m: float) -> tuple[int, float, str | None]:
+def convert_poses(
+    source: Path, target: Path, height_m: float, overwrite: bool = True
+) -> tuple[int, float, str | None]:
     """Write what is good in a file of poses; the target appears when it is whole.
 
     Args:
         source: file that `edgepose.poses.read_poses` reads.
         target: .csv, .npz or .bvh file.
         height_m: the wearer's stature, for the bones of a BVH file, metres.
+        overwrite: whether it may take the place of a file.
 
     Returns:
         Number of poses, seconds from the first to the last, and one line on what was not good.
@@ -42,5 +45,5 @@ def convert_poses(source: Path, target: Path, height_m: float) -> tuple[int, flo
         EdgeposeError: nothing is good, or it cannot be written.
     """
     poses, damage = salvage_poses(source)
-    replace_file(target, lambda path: _write(path, poses, height_m), "poses")
+    replace_file(target, lambda path: _write(path, poses, height_m), "poses", overwrite=overwrite)
     return len(poses.frames), float(poses.time_s[-1] - poses.time_s[0]), damage

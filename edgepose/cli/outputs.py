@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import os
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from edgepose.errors import EdgeposeError
-from edgepose.output_targets import check_output, is_null
+from edgepose.output_targets import check_output, identity, is_null, is_stream, part_path
 
 if TYPE_CHECKING:
     from edgepose.sinks import Sink
@@ -42,8 +41,10 @@ class OutputFlags(NamedTuple):
 
     @property
     def files(self) -> dict[str, str | None]:
-        """The files that are asked for, by flag."""
-        return {"--csv": self.csv, "--npz": self.npz, "--bvh": self.bvh}
+        """The files that are written, by flag."""
+        # While a run goes on, poses for an NPZ file are in a CSV file beside it.
+        growing = None if self.npz is None or is_stream(self.npz) else str(part_path(self.npz))
+        return {"--csv": self.csv, "--npz": self.npz, "--bvh": self.bvh, "--npz (while it grows)": growing}
 
     def check(self) -> None:
         """Make sure that no file is lost by what is asked for.
@@ -126,14 +127,14 @@ class OutputFlags(NamedTuple):
 
 def check_files(outputs: Mapping[str, str | Path | None], inputs: Mapping[str, Path | None]) -> None:
     """Raises click.UsageError where a file to write, by flag, is one to read, or two flags name one file."""
-    written: dict[Path, str] = {}
+    written: dict[object, str] = {}
     for flag, output in outputs.items():
-        if output is None or str(output) == "-":
+        if output is None:
             continue
         for name, given in inputs.items():
             if given is not None and _is_same_file(Path(output), given):
                 raise click.UsageError(f"{flag} would overwrite {given}, which is {name}; name another file")
-        other = written.setdefault(Path(os.path.realpath(output)), flag)
+        other = written.setdefault(identity(output), flag)
         if other != flag and not is_null(output):
             raise click.UsageError(f"{other} and {flag} name the same file, {output}; name two")
 

@@ -13,7 +13,7 @@ import click
 
 from edgepose import __version__
 from edgepose.cli.options import SourceFlags, source_options
-from edgepose.cli.outputs import overwrite_option
+from edgepose.cli.outputs import check_files, overwrite_option
 from edgepose.cli.stop import Stop
 from edgepose.cli.terminal import end_status, has_terminal, say, status
 from edgepose.errors import EdgeposeError
@@ -58,6 +58,8 @@ def record(source: SourceFlags, out: str, seconds: float | None, overwrite: bool
         raise click.UsageError(f"{out} takes the frames of a CAN bus: give --can, or name it .csv or .npz")
     raw: list[tuple[float, Any]] = []
     with ExitStack() as stack:
+        written = {"OUT": out, "OUT (while it grows)": recorder.growing(out)}
+        check_files(written, {"--file": source.file, "--sensors": source.sensors})
         recorder.check_free(out, overwrite)
         opened = stack.enter_context(source.open(raw if kind != "samples" else None))
         stop = stack.enter_context(Stop())

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from edgepose.durable_files import replace_file
 from edgepose.errors import EdgeposeError
-from edgepose.output_targets import find_target
+from edgepose.output_targets import find_target, part_path
 from edgepose.pose import FILLING_WINDOW, PoseFrame, held_sensors, status_bits
 from edgepose.poses import Poses, read_blocks
 from edgepose.rotations import Z_UP_TO_T, matrix_to_rotvec
@@ -103,7 +103,7 @@ class NpzSink(Sink):
         target = find_target(path, "poses")
         if target.stream:
             raise EdgeposeError(f"cannot write poses to {path}: an NPZ file needs a file's name")
-        self._part = self._path.with_name(f"{self._path.stem}.part.csv")
+        self._part = part_path(path)
         if os.path.lexists(self._part):
             raise EdgeposeError(
                 f"{self._part} is there already, perhaps of a run that was cut off: keep its poses with "
@@ -158,7 +158,7 @@ class NpzSink(Sink):
                     self._path,
                     lambda path: write_npz(path, read_blocks(self._part), count, self._rate),
                     "poses",
-                    self._overwrite,
+                    overwrite=self._overwrite,
                 )
             except EdgeposeError as error:
                 raise EdgeposeError(f"{error}; all poses are in {self._part}") from error
