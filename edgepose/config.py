@@ -7,7 +7,7 @@ WearerConfig(source=SourceConfig(port="/dev/ttyUSB0"), calibration=Path("calib.j
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from typing import Any
 from edgepose.errors import ConfigError, EdgeposeError
 from edgepose.formats.poses.csv_columns import FORMS
 from edgepose.imu import FILTERS
-from edgepose.utils.output_targets import check_output
+from edgepose.utils.output_targets import check_output, is_stream, part_path
 from edgepose.utils.sockets import Destination, parse_address, parse_destination
 from edgepose.utils.text_files import read_toml
 
@@ -124,8 +124,10 @@ class OutputConfig:
 
     @property
     def files(self) -> dict[str, str | None]:
-        """The files that are asked for, by flag."""
-        return {"--csv": self.csv, "--npz": self.npz, "--bvh": self.bvh}
+        """The files that are written, by flag."""
+        # While a run goes on, poses for an NPZ file are in a CSV file beside it.
+        growing = None if self.npz is None or is_stream(self.npz) else str(part_path(self.npz))
+        return {"--csv": self.csv, "--npz": self.npz, "--bvh": self.bvh, "--npz (while it grows)": growing}
 
     def check(self) -> None:
         """Make sure that no file is lost by what is asked for.
@@ -276,10 +278,13 @@ def _text(key: str, value: str, folder: Path) -> Any:
         value = str(folder / value)
     if key in ("file", "sensors", "calibration"):
         return Path(value)
-    if key == "protocol":
-        return str(folder / value) if value.endswith(".toml") else checked_protocol(value)
-    parse = {"udp": parse_destination, "osc": parse_host_and_port, "tcp": parse_host_and_port}
-    parse["control"] = parse_host_and_port
+    parse: dict[str, Callable[[str], Any]] = {
+        "protocol": lambda name: str(folder / name) if name.endswith(".toml") else checked_protocol(name),
+        "udp": parse_destination,
+        "osc": parse_host_and_port,
+        "tcp": parse_host_and_port,
+        "control": parse_host_and_port,
+    }
     if key not in parse:
         return value
     try:

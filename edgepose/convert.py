@@ -72,12 +72,14 @@ class Options(NamedTuple):
         sensors: map of devices to placements, for captures, CAN logs and sessions.
         filter: what makes orientations, see `orient_recording`; "none" leaves them as they are.
         height_m: the wearer's stature, for the bones of BVH files, metres.
+        overwrite: whether a recording may take the place of a file.
     """
 
     protocol: str = "auto"
     sensors: Path | None = None
     filter: str = "none"
     height_m: float = 1.75
+    overwrite: bool = True
 
 
 _DEFAULTS = Options()
@@ -194,7 +196,7 @@ def convert(job: Job, options: Options = _DEFAULTS) -> Result:
             if options.filter != "none":
                 raise EdgeposeError(f"{job.source}: --filter is for recordings, not for poses; leave it out")
             _make(job.target.parent)
-            return Result(job, *convert_poses(job.source, job.target, options.height_m))
+            return Result(job, *convert_poses(job.source, job.target, options.height_m, options.overwrite))
         recording = _read(job.source, options.protocol, options.sensors)
         data = recording.sensors.values()
         if not data:
@@ -205,7 +207,9 @@ def convert(job: Job, options: Options = _DEFAULTS) -> Result:
             recording = orient_recording(recording, options.filter, name=str(job.source))
         _make(job.target.parent)
         write = WRITERS[job.target.suffix[1:]]
-        replace_file(job.target, lambda path: write(path, recording), "recording")
+        replace_file(
+            job.target, lambda path: write(path, recording), "recording", overwrite=options.overwrite
+        )
     except EdgeposeError as error:
         return Result(job, problem=str(error))
     except MemoryError:
@@ -328,13 +332,16 @@ def _write_poses(path: Path, poses: Poses, height_m: float) -> None:
             sink.write(pose)
 
 
-def convert_poses(source: Path, target: Path, height_m: float) -> tuple[int, float, str | None]:
+def convert_poses(
+    source: Path, target: Path, height_m: float, overwrite: bool = True
+) -> tuple[int, float, str | None]:
     """Write what is good in a file of poses; the target appears when it is whole.
 
     Args:
         source: file that `edgepose.formats.poses.reading.read_poses` reads.
         target: .csv, .npz or .bvh file.
         height_m: the wearer's stature, for the bones of a BVH file, metres.
+        overwrite: whether it may take the place of a file.
 
     Returns:
         Number of poses, seconds from the first to the last, and one line on what was not good.
@@ -343,7 +350,7 @@ def convert_poses(source: Path, target: Path, height_m: float) -> tuple[int, flo
         EdgeposeError: nothing is good, or it cannot be written.
     """
     poses, damage = salvage_poses(source)
-    replace_file(target, lambda path: _write_poses(path, poses, height_m), "poses")
+    replace_file(target, lambda path: _write_poses(path, poses, height_m), "poses", overwrite=overwrite)
     return len(poses.frames), float(poses.time_s[-1] - poses.time_s[0]), damage
 
 

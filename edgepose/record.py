@@ -80,6 +80,12 @@ def kind(path: str) -> Literal["samples", "port", "bus"]:
     )
 
 
+def growing(path: str) -> Path | None:
+    """The file that grows beside a recording until it is whole, if it is another."""
+    journal = None if path == "-" else _journal(Path(path))
+    return None if journal == Path(path) else journal
+
+
 def check_free(path: str, overwrite: bool) -> None:
     """Make sure that no recording is lost.
 
@@ -278,7 +284,7 @@ def _ignore(*_: Any) -> None:
 def _finish(path: Path, journal: Path, write: Callable[[Path], None], overwrite: bool) -> None:
     """Make the recording of its journal."""
     try:
-        replace_file(path, write, "recording", overwrite)
+        replace_file(path, write, "recording", overwrite=overwrite)
     except (EdgeposeError, MemoryError) as error:
         why = str(error) or f"{path}: not enough memory"
         raise EdgeposeError(

@@ -99,20 +99,25 @@ def check_picture(path: Path, what: str, overwrite: bool = False) -> None:
     check_output(path, "the picture", PICTURES, overwrite)
 
 
-def save_picture(figure: Figure, path: str | Path, **options: Any) -> None:
+def save_picture(figure: Figure, path: str | Path, *, overwrite: bool, **options: Any) -> None:
     """Write a figure; the file is whole or as it was before.
 
     Args:
         figure: to draw.
         path: of the picture; the ending says the kind (png, svg, pdf), a device or pipe without one gets png.
+        overwrite: whether it may take the place of a file.
         options: of matplotlib's `savefig`.
 
     Raises:
         EdgeposeError: it cannot be written.
     """
     kind = Path(path).suffix[1:] or "png"
+
+    def write(part: Path) -> None:
+        figure.savefig(part, format=kind, **options)
+
     try:
-        replace_file(path, lambda part: figure.savefig(part, format=kind, **options), "the picture")
+        replace_file(path, write, "the picture", overwrite=overwrite)
     except ValueError as error:  # an ending that matplotlib does not know
         raise EdgeposeError(f"cannot write the picture {path}: {error}") from error
 
@@ -177,7 +182,7 @@ def skeleton_strip(
     if title:
         figure.text(0.02, 1.0 - 0.6 * title_in * inch, title, ha="left", va="center", fontsize=10, color=INK)
     _legend(figure, 1.0 - (title_in + 0.5 * legend_in) * inch, reference is not None)
-    save_picture(figure, path, dpi=DPI)
+    save_picture(figure, path, overwrite=True, dpi=DPI)
 
 
 def _figures(poses: ArrayLike, offsets: ArrayLike) -> list[_Figure]:

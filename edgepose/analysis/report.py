@@ -42,7 +42,7 @@ img { max-width: 100%; } .note { color: #666; }
 """
 
 
-def write_report(path: Path, poses: Poses, body: Body, name: str) -> None:
+def write_report(path: Path, poses: Poses, body: Body, name: str, overwrite: bool = True) -> None:
     """Write the page.
 
     Args:
@@ -50,6 +50,7 @@ def write_report(path: Path, poses: Poses, body: Body, name: str) -> None:
         poses: at least one.
         body: for the figures, and for the steps, which are told by the feet.
         name: of the poses, for the heading.
+        overwrite: whether it may take the place of a file.
 
     Raises:
         EdgeposeError: matplotlib is not installed, or the file cannot be written.
@@ -76,7 +77,7 @@ def write_report(path: Path, poses: Poses, body: Body, name: str) -> None:
         f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{html.escape(name)}</title>"
         f"<style>{STYLE}</style></head><body>{chr(10).join(parts)}</body></html>\n"
     )
-    write_whole(path, page, "the report")
+    write_whole(path, page, "the report", overwrite=overwrite)
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

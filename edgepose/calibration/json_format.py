@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -48,7 +49,9 @@ def to_json(calibration: Calibration) -> str:
     }
     text = json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     # Quaternions on one line each; a line break inside of a text is escaped and so never matches.
-    return re.sub(r"\[\n[-+.\de,\s]+\]", lambda numbers: " ".join(numbers[0].split()), text)
+    text = re.sub(r"\[\n[-+.\de,\s]+\]", lambda numbers: " ".join(numbers[0].split()), text)
+    # Names of files may hold what sets a terminal.
+    return "".join(c if c.isprintable() or c == "\n" else json.dumps(c)[1:-1] for c in text)
 
 
 def from_json(text: str, where: str = "calibration") -> Calibration:
@@ -112,7 +115,7 @@ def save(calibration: Calibration, path: str | Path, overwrite: bool = True) -> 
     Raises:
         CalibrationError: it cannot be written, or is there already and not to be overwritten.
     """
-    write_whole(path, to_json(calibration), "the calibration", overwrite)
+    write_whole(path, to_json(calibration), "the calibration", overwrite=overwrite)
 
 
 def load_calibration(path: str | Path) -> Calibration:
@@ -134,8 +137,8 @@ _Fail = Callable[[str], EdgeposeError]
 def _no_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     result = dict(pairs)
     if len(result) < len(pairs):
-        names = [name for name, _ in pairs]
-        raise ValueError(f"{next(n for n in names if names.count(n) > 1)!r} appears twice")
+        (name, _), *_ = Counter(name for name, _ in pairs).most_common(1)
+        raise ValueError(f"{name!r} appears twice")
     return result
 
 

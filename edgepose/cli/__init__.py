@@ -6,6 +6,7 @@ import importlib
 import os
 import signal
 import sys
+import traceback
 from importlib.metadata import entry_points
 from io import StringIO
 from types import FrameType
@@ -100,7 +101,5 @@ def main() -> NoReturn:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         sys.exit(1)
     except Exception as error:
-        if debug:
-            raise
-        say(f"edgepose: {as_told(error)}")
+        say(traceback.format_exc().rstrip() if debug else f"edgepose: {as_told(error)}")
         sys.exit(1)

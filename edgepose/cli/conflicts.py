@@ -38,6 +38,8 @@ def check_all_files(rigs: Sequence[WearerConfig], model: Path) -> None:
         rigs: the wearers.
         model: archive that is loaded.
     """
+    if sum(rig.outputs.csv == "-" for rig in rigs) > 1:
+        raise click.UsageError("several wearers write CSV to standard output; give all but one a file")
     outputs: dict[str, str | Path | None] = {}
     inputs: dict[str, Path | None] = {"--model": model}
     for rig in rigs:
@@ -48,8 +50,6 @@ def check_all_files(rigs: Sequence[WearerConfig], model: Path) -> None:
     for rig in rigs:
         with named(rig.name):
             rig.outputs.check()
-    if sum(rig.outputs.csv == "-" for rig in rigs) > 1:
-        raise click.UsageError("several wearers write CSV to standard output; give all but one a file")
     if len(rigs) > 1:
         for flag, file in outputs.items():
             if file is not None and has_reader(file):

@@ -13,7 +13,7 @@ from edgepose.sinks.base import Sink, SinkContext
 from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.spooled import SpooledSink
 from edgepose.utils.durable_files import replace_file
-from edgepose.utils.output_targets import find_target, is_stream
+from edgepose.utils.output_targets import find_target, is_stream, part_path
 
 
 class NpzSink(Sink):
@@ -41,7 +41,7 @@ class NpzSink(Sink):
         target = find_target(path, "poses")
         if target.stream:
             raise EdgeposeError(f"cannot write poses to {path}: an NPZ file needs a file's name")
-        self._part = self._path.with_name(f"{self._path.stem}.part.csv")
+        self._part = part_path(path)
         if os.path.lexists(self._part):
             raise EdgeposeError(
                 f"{self._part} is there already, perhaps of a run that was cut off: keep its poses with "
@@ -96,7 +96,7 @@ class NpzSink(Sink):
                     self._path,
                     lambda path: write_npz(path, read_blocks(self._part), count, self._rate),
                     "poses",
-                    self._overwrite,
+                    overwrite=self._overwrite,
                 )
             except EdgeposeError as error:
                 raise EdgeposeError(f"{error}; all poses are in {self._part}") from error

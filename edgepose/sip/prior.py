@@ -59,7 +59,7 @@ def learn_prior(poses: Array, about: str) -> Prior:
     return Prior(coordinates.mean(axis=0), covariance, lower - _SLACK, upper + _SLACK, about)
 
 
-def save_prior(path: str | Path, prior: Prior) -> None:
+def save_prior(path: str | Path, prior: Prior, overwrite: bool = True) -> None:
     """Write a prior as npz in single precision.
 
     Raises:
@@ -71,7 +71,7 @@ def save_prior(path: str | Path, prior: Prior) -> None:
         with part.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, about=np.array(prior.about), **numbers)
 
-    replace_file(path, write, "the prior")
+    replace_file(path, write, "the prior", overwrite=overwrite)
 
 
 def load_prior(path: str | Path | None = None) -> Prior:

@@ -63,7 +63,7 @@ def _residuals(solution: Solution, measurements: Measurements) -> list[tuple[str
     return list(zip(measurements.names, turns.tolist(), pulls.tolist(), strict=True))
 
 
-def plot(path: str | Path, solution: Solution, measurements: Measurements) -> None:
+def plot(path: str | Path, solution: Solution, measurements: Measurements, overwrite: bool = True) -> None:
     """Draw cost by term, and residuals by sensor, over time.
 
     Raises:
@@ -86,4 +86,4 @@ def plot(path: str | Path, solution: Solution, measurements: Measurements) -> No
     pulls.set_xlabel("time, s")
     for axes in (costs, turns):
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7, frameon=False)
-    save_picture(figure, path)
+    save_picture(figure, path, overwrite=overwrite)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import sqlite3
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -159,7 +160,20 @@ def _circle(data: bytes) -> int | None:
     return None
 
 
+def _check_table(path: Path) -> None:
+    """Raises ValueError unless the messages of an SQLite log are a table.
+
+    A view can be without an end, and SQLite looks at no signal while it computes one.
+    """
+    with contextlib.closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as log:
+        row = log.execute("SELECT type, sql FROM sqlite_master WHERE name = 'messages'").fetchone()
+    if row is None or row[0] != "table" or not str(row[1]).upper().lstrip().startswith("CREATE TABLE"):
+        raise ValueError("it has no table of messages")
+
+
 def _open_log(path: Path) -> Any:
+    if path.suffix.lower() == ".db":
+        _check_table(path)
     return _BlfReader(path) if path.suffix.lower() == ".blf" else can.LogReader(path)
 
 

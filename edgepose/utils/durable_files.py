@@ -20,7 +20,7 @@ from edgepose.utils.output_streams import copy_to_stream
 from edgepose.utils.output_targets import Target, explain, find_target
 
 
-def replace_file(name: str | Path, write: Callable[[Path], None], what: str, overwrite: bool = True) -> None:
+def replace_file(name: str | Path, write: Callable[[Path], None], what: str, *, overwrite: bool) -> None:
     """Have a file written under another name and put in its place at once: it is whole or as it was before.
 
     Args:
@@ -40,7 +40,7 @@ def replace_file(name: str | Path, write: Callable[[Path], None], what: str, ove
                 write(part)
             copy_to_stream(part, target.name, what)
         return
-    part = other_name(target.path)
+    part = other_name(target)
     with _named(part, target, what):
         os.close(new_file(part, target))
         try:
@@ -53,16 +53,14 @@ def replace_file(name: str | Path, write: Callable[[Path], None], what: str, ove
             raise
 
 
-def write_whole(
-    name: str | Path, content: str | bytes | memoryview, what: str, overwrite: bool = True
-) -> None:
+def write_whole(name: str | Path, content: str | bytes | memoryview, what: str, *, overwrite: bool) -> None:
     """Write a file of a content, text in UTF-8; see `replace_file`."""
     data = content.encode(errors="backslashreplace") if isinstance(content, str) else content
 
     def write(part: Path) -> None:
         part.write_bytes(data)
 
-    replace_file(name, write, what, overwrite)
+    replace_file(name, write, what, overwrite=overwrite)
 
 
 def reason(error: EdgeposeError) -> str:
@@ -82,9 +80,12 @@ def _named(part: Path, target: Target, what: str) -> Iterator[None]:
         raise EdgeposeError(str(error).replace(str(part), target.name)) from error
 
 
-def other_name(path: Path) -> Path:
-    """A name in the same folder that nobody else has; the ending stays, because writers look at it."""
-    return path.with_name(f".{secrets.token_hex(8)}{path.suffix}")
+def other_name(target: Target) -> Path:
+    """A name in the folder of a file that nobody else has.
+
+    Its ending is that of the user's name, not of what a link leads to: writers look at it.
+    """
+    return target.path.with_name(f".{secrets.token_hex(8)}{Path(target.name).suffix}")
 
 
 def new_file(part: Path, target: Target) -> int:

@@ -66,7 +66,7 @@ class GrowingFile:
             self.file: Any = self._stream.file
             self.regular = self._stream.regular
             return
-        self._part = other_name(self._target.path)
+        self._part = other_name(self._target)
         try:
             self.file = os.fdopen(new_file(self._part, self._target), "rb+", 0)
         except OSError as error:

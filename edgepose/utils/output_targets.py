@@ -88,6 +88,21 @@ def descriptor(path: Path) -> int | None:
     return None
 
 
+def identity(name: str | Path) -> object:
+    """What is the same for two names exactly if they stand for one output; "-" is standard output."""
+    number = 1 if str(name) == "-" else descriptor(Path(name))
+    try:
+        own = os.fstat(number) if number is not None else Path(name).stat()
+        return own.st_dev, own.st_ino
+    except OSError:  # not there yet
+        return os.path.realpath(name)
+
+
+def part_path(npz: str | Path) -> Path:
+    """Where the poses for an NPZ file are while a run goes on."""
+    return Path(npz).with_name(f"{Path(npz).stem}.part.csv")
+
+
 def check_output(name: str | Path, what: str, endings: Collection[str], overwrite: bool) -> None:
     """Make sure, before any work is done, that an output costs nothing that was not meant.
 

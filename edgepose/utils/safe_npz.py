@@ -49,8 +49,15 @@ def check_size(path: Path, size: int) -> None:
         )
 
 
+def _check_regular(path: Path) -> None:
+    """Raises ValueError for what has no end, such as a device."""
+    if path.exists() and not path.is_file():
+        raise ValueError("it is no file on a disk")
+
+
 def member_names(path: Path) -> set[str]:
     """Names of what is in a file; those of arrays end in .npy. Raises what `open_npz` raises."""
+    _check_regular(path)
     with zipfile.ZipFile(path) as archive:
         return set(archive.namelist())
 
@@ -63,6 +70,7 @@ def open_npz(path: Path) -> Iterator[NpzFile]:
         FileFormatError: together they are too large, see `check_size`.
         OSError: it cannot be read; all of `BROKEN`: it is no such file, here or where an array is taken out.
     """
+    _check_regular(path)
     # A file of ours, because numpy leaves its own open where there is no archive in it.
     with path.open("rb") as file:
         with zipfile.ZipFile(file) as archive:

@@ -10,7 +10,7 @@ import io
 import pickle
 import re
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -23,6 +23,9 @@ MOST_STEPS = 5_000_000
 
 MOST_PARTS = 100_000
 """Parts of a tuple, those of the tuples in it counted as often as they are there."""
+
+MOST_ODD_KEYS = 1000
+"""Keys of dictionaries and members of sets that are no text; together, in a file."""
 
 MOST_KEY_PARTS = 100
 """Parts of a tuple that is a key: hashing goes through all of them, each time."""
@@ -45,9 +48,9 @@ class _DType(Inert):
     """A numpy dtype, as the code and the state that it was written with."""
 
     def build(self) -> np.dtype:
-        code = str(self.args[0]) if self.args else ""
-        if not re.fullmatch(r"[<>|=]?([iu][1248]|f[248])", code):
-            raise ValueError(f"dtype {code!r}")
+        code = self.args[0] if self.args else ""
+        if not isinstance(code, str) or not re.fullmatch(r"[<>|=]?([iu][1248]|f[248])", code):
+            raise ValueError("a dtype that is no number's")
         dtype = np.dtype(code)
         big = isinstance(self.state, tuple) and self.state[1:2] == (">",)
         return dtype.newbyteorder(">") if big else dtype
@@ -71,10 +74,12 @@ def _filled(shape: Any, dtype: Any, by_column: bool, data: Any) -> _Array:
     return array
 
 
-def _encode(text: str, encoding: str) -> bytes:
+def _encode(text: Any, encoding: Any) -> bytes:
     """How Python 3 writes bytes at protocol 2: as text in latin1."""
     if encoding not in ("latin1", "latin-1"):
-        raise pickle.UnpicklingError(f"bytes in {encoding!r}")
+        raise pickle.UnpicklingError("bytes in another encoding than latin1")
+    if not isinstance(text, str):
+        raise pickle.UnpicklingError("bytes of something else than text")
     return text.encode("latin1")
 
 
@@ -83,15 +88,6 @@ def _no_bytes(*count: Any) -> bytes:
     if count:
         raise pickle.UnpicklingError("bytes made of something else")
     return b""
-
-
-def _set(items: Any = ()) -> set[Any]:
-    """A set of a list; what is no list could be of any length."""
-    if not isinstance(items, (list, tuple)):
-        raise pickle.UnpicklingError(f"a set of {type(items).__name__}")
-    for item in items:
-        _check_key(item)
-    return set(items)
 
 
 class _Tuple(tuple):
@@ -103,12 +99,7 @@ class _Tuple(tuple):
     parts = 0
 
 
-def _check_key(key: Any) -> None:
-    if isinstance(key, _Tuple) and key.parts > MOST_KEY_PARTS:
-        raise pickle.UnpicklingError("a key of too many parts")
-
-
-def _functions() -> dict[tuple[str, str], Any]:
+def _functions(make_set: Callable[..., set[Any]]) -> dict[tuple[str, str], Any]:
     """What a pickle may call, by module and name, made anew for each file."""
     # A pickle can set attributes of what it names, so it gets classes and functions of its own.
     functions: dict[tuple[str, str], Any] = {
@@ -123,7 +114,9 @@ def _functions() -> dict[tuple[str, str], Any]:
             shape, dtype, order == "F", data
         )
     for module in ("builtins", "__builtin__"):
-        functions.update({(module, "object"): object, (module, "set"): _set, (module, "bytes"): _no_bytes})
+        functions.update(
+            {(module, "object"): object, (module, "set"): make_set, (module, "bytes"): _no_bytes}
+        )
     for module in ("copyreg", "copy_reg"):
         # How protocols 0 and 1 make an object; every class that can be named here is a stand-in.
         functions[module, "_reconstructor"] = lambda kind, *_: kind()
@@ -153,8 +146,9 @@ class _Unpickler(_PythonUnpickler):
     def __init__(self, content: bytes, path: Path, inert: Callable[[str, str], bool], advice: str) -> None:
         super().__init__(io.BytesIO(content), encoding="latin1")
         self.path, self.inert, self.advice = path, inert, advice
-        self.functions = _functions()
+        self.functions = _functions(self._set)
         self.steps = 0
+        self.odd_keys = 0
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) in self.functions:
@@ -170,9 +164,20 @@ class _Unpickler(_PythonUnpickler):
             raise pickle.UnpicklingError("a tuple of too many parts")
         return made
 
-    def _check_keys(self, keys: list[Any]) -> None:
+    def _check_keys(self, keys: Sequence[Any]) -> None:
         for key in keys:
-            _check_key(key)
+            # Anybody can choose numbers that meet in one place of a dictionary; text is safe from that.
+            self.odd_keys += not isinstance(key, str | bytes)
+            if self.odd_keys > MOST_ODD_KEYS or (isinstance(key, _Tuple) and key.parts > MOST_KEY_PARTS):
+                raise pickle.UnpicklingError("too many keys, or too long ones, that are no text")
+
+    def _set(self, items: Any = ()) -> set[Any]:
+        """A set of a list; what is no list could be of any length."""
+        if not isinstance(items, list | tuple):
+            raise pickle.UnpicklingError("a set of something else than a list")
+        self.steps += len(items)
+        self._check_keys(items)
+        return set(items)
 
     def load_tuple(self) -> None:
         items = self.pop_mark()

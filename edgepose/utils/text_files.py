@@ -46,7 +46,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     text = ""
     try:
         text = read_text(path, MOST_TOML_BYTES)
-        if any(key.count(".") > MOST_KEY_PARTS for key in re.split(r"[\n={,]", text)):
+        if any(line.count(".") > MOST_KEY_PARTS for line in text.splitlines()):
             raise ValueError(f"a key has more than {MOST_KEY_PARTS} parts")
         return tomllib.loads(text)
     except OSError as error:
@@ -55,7 +55,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: not valid TOML: brackets within brackets without end") from None
     except ValueError as error:  # also not UTF-8
         # The parser does not name what is there twice.
-        keys = Counter(re.findall(r"^\s*(?:\[\s*)?([\w-]+)\s*[=\]]", text, re.MULTILINE))
+        keys = Counter(re.findall(r"^[ \t]*(?:\[[ \t]*)?([\w-]+)[ \t]*[=\]]", text, re.MULTILINE))
         twice = [key for key, count in keys.items() if count > 1]
         if twice and re.search("twice|overwrite|mutate", str(error)):
             raise ConfigError(f"{path}: {twice[0]} is there twice") from None

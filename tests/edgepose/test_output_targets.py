@@ -497,5 +497,70 @@ def test_an_error_of_a_writer_leaves_the_old_file(tmp_path):
         raise ValueError("no more")
 
     with pytest.raises(ValueError, match="no more"):
-        replace_file(tmp_path / "a", write, "text")
+        replace_file(tmp_path / "a", write, "text", overwrite=True)
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [OLD]
+
+
+def test_a_link_to_a_name_without_an_ending_gets_what_was_asked_for(command, files, tmp_path):
+    (tmp_path / "o").mkdir()
+    (tmp_path / "o" / "poses.npz").symlink_to("../blob")
+    result = command("convert", files / "poses.csv", "--to", "npz", "--out", tmp_path / "o")
+    assert result.returncode == 0, result.stderr
+    assert (tmp_path / "blob").read_bytes().startswith(b"PK")
+
+
+def test_convert_does_not_follow_a_link_to_another_kind_of_file(command, files, tmp_path):
+    (tmp_path / "important.json").write_bytes(OLD)
+    (tmp_path / "o").mkdir()
+    (tmp_path / "o" / "poses.npz").symlink_to("../important.json")
+    result = command("convert", files / "poses.csv", "--to", "npz", "--out", tmp_path / "o", "--overwrite")
+    assert result.returncode == 1
+    assert "another kind of file" in result.stderr
+    assert (tmp_path / "important.json").read_bytes() == OLD
+
+
+def test_a_target_that_appears_while_a_conversion_reads(files, tmp_path):
+    out = tmp_path / "o" / "stdin.npz"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "edgepose", "convert", "-", "--to", "npz", "--out", str(tmp_path / "o")],
+        text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    time.sleep(1.0)
+    out.parent.mkdir()
+    out.write_bytes(OLD)
+    _, errors = process.communicate((files / "poses.csv").read_text(), timeout=60)
+    assert process.returncode == 1
+    assert "already" in errors
+    assert out.read_bytes() == OLD
+
+
+@pytest.mark.parametrize("flags", [(), ("--overwrite",)])
+def test_the_file_that_grows_is_nobody_elses(command, wearer, files, tmp_path, flags):
+    words = [str(word) for word in running("--csv")(wearer, files, tmp_path / "walk.part.csv")]
+    result = edgepose([*words, "--npz", str(tmp_path / "walk.npz"), *flags])
+    assert result.returncode == 2
+    assert "--csv and --npz (while it grows) name the same file" in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("out", "source"), [("w.csv", "w.csv"), ("w.npz", "w.part.csv")])
+def test_record_does_not_take_its_own_input(command, files, tmp_path, out, source):
+    write = {".csv": "csv"}[Path(source).suffix]
+    result = command("convert", files / "take.npz", "--to", write, "--out", tmp_path)
+    (tmp_path / "take.csv").rename(tmp_path / source)
+    before = (tmp_path / source).read_bytes()
+    result = command("record", out, "--file", source, "--overwrite", cwd=tmp_path)
+    assert result.returncode == 2, result.stderr
+    assert "would overwrite" in result.stderr
+    assert (tmp_path / source).read_bytes() == before
+
+
+def test_one_standard_output_for_one_output(wearer, files, tmp_path):
+    words = [str(word) for word in running("--csv")(wearer, files, Path("-"))]
+    with (tmp_path / "out").open("w") as out:
+        done = subprocess.run(
+            [sys.executable, "-m", "edgepose", *words, "--bvh", "/dev/stdout"],
+            stdout=out, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+    assert done.returncode == 2
+    assert "name the same file" in done.stderr

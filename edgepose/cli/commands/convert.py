@@ -13,7 +13,7 @@ from edgepose.cli.options.outputs import overwrite_option
 from edgepose.cli.options.source import protocol_option, sensors_option
 from edgepose.cli.terminal.messages import printable, say, show
 from edgepose.errors import EdgeposeError
-from edgepose.utils.output_targets import check_free
+from edgepose.utils.output_targets import check_free, check_output
 
 if TYPE_CHECKING:
     from edgepose.convert import Result
@@ -108,8 +108,11 @@ def convert(
     todo = [job for job in planned if job not in done]
     if not overwrite:
         check_free((job.target for job in todo), "give --skip-existing, --overwrite or another --out")
+    for job in todo:
+        if job.target.is_symlink():  # what it leads to may be of another kind
+            check_output(job.target, "the output", (f".{to}",), overwrite)
     try:
-        options = Options(protocol, sensors, filter, height)
+        options = Options(protocol, sensors, filter, height, overwrite)
         for result in _with_progress(convert_all(todo, options, jobs), len(todo)):
             done[result.job] = result
     finally:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from edgepose import __version__
-from edgepose.cli.options.outputs import overwrite_option
+from edgepose.cli.options.outputs import check_files, overwrite_option
 from edgepose.cli.options.source import source_options
 from edgepose.cli.terminal.messages import end_status, has_terminal, say, status
 from edgepose.cli.terminal.stop_signal import Stop
@@ -60,6 +60,8 @@ def record(source: SourceConfig, out: str, seconds: float | None, overwrite: boo
         raise click.UsageError(f"{out} takes the frames of a CAN bus: give --can, or name it .csv or .npz")
     raw: list[tuple[float, Any]] = []
     with ExitStack() as stack:
+        written = {"OUT": out, "OUT (while it grows)": recorder.growing(out)}
+        check_files(written, {"--file": source.file, "--sensors": source.sensors})
         recorder.check_free(out, overwrite)
         opened = stack.enter_context(
             open_source(**source.arguments(), raw=raw if kind != "samples" else None)

@@ -49,5 +49,5 @@ def report(poses: Path, out: Path | None, height: float, overwrite: bool) -> Non
         raise click.UsageError(f"--out would overwrite {poses}; name another file")
     check_output(path, "the report", (".html", ".htm"), overwrite)
     body = default_body(height)
-    write_report(path, read_poses(poses), body, poses.name)
+    write_report(path, read_poses(poses), body, poses.name, overwrite)
     show(f"Wrote {path}.")

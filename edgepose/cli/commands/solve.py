@@ -14,7 +14,7 @@ from edgepose.cli.options.body import BodyFlags, body_options
 from edgepose.cli.options.outputs import check_files, overwrite_option
 from edgepose.cli.terminal.messages import end_status, has_terminal, say, status
 from edgepose.errors import EdgeposeError
-from edgepose.utils.output_targets import check_output
+from edgepose.utils.output_targets import check_output, is_stream, part_path
 
 if TYPE_CHECKING:
     from edgepose.rotations import Array
@@ -141,7 +141,10 @@ def solve(
     if not (csv or npz or bvh):
         raise click.UsageError("give at least one output: --csv FILE, --npz FILE or --bvh FILE")
     check_files(
-        {"--csv": csv, "--npz": npz, "--bvh": bvh, "--plot": plot},
+        {
+            **{"--csv": csv, "--npz": npz, "--bvh": bvh, "--plot": plot},
+            "--npz (while it grows)": None if npz is None or is_stream(npz) else part_path(npz),
+        },
         {"IN": recording, "--calibration": calibration_path},
     )
     for name, ending in ((csv, ".csv"), (npz, ".npz"), (bvh, ".bvh")):
@@ -198,7 +201,7 @@ def solve(
     for line in report.misfits(solution, measurements):
         say(f"warning: {line}")
     if plot is not None:
-        report.plot(plot, solution, measurements)
+        report.plot(plot, solution, measurements, overwrite)
     done, frames = len(solution.rotations), len(measurements.time_s)
     say(f"{done} of {frames} poses, {solution.evaluations} cost evaluations")
     if interrupted:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,20 +13,20 @@ import click
 from edgepose.config import OutputConfig, parse_host_and_port
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.csv_columns import FORMS
-from edgepose.utils.output_targets import is_null
+from edgepose.utils.output_targets import identity, is_null
 from edgepose.utils.sockets import Destination, parse_destination
 
 
 def check_files(outputs: Mapping[str, str | Path | None], inputs: Mapping[str, Path | None]) -> None:
     """Raises click.UsageError where a file to write, by flag, is one to read, or two flags name one file."""
-    written: dict[Path, str] = {}
+    written: dict[object, str] = {}
     for flag, output in outputs.items():
-        if output is None or str(output) == "-":
+        if output is None:
             continue
         for name, given in inputs.items():
             if given is not None and _is_same_file(Path(output), given):
                 raise click.UsageError(f"{flag} would overwrite {given}, which is {name}; name another file")
-        other = written.setdefault(Path(os.path.realpath(output)), flag)
+        other = written.setdefault(identity(output), flag)
         if other != flag and not is_null(output):
             raise click.UsageError(f"{other} and {flag} name the same file, {output}; name two")
 

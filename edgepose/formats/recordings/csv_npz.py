@@ -182,8 +182,9 @@ def comments(metadata: Mapping[str, str]) -> str:
 
 
 def csv_header(metadata: Mapping[str, str]) -> str:
-    """First lines of a CSV recording, up to its column names."""
-    return comments(metadata) + COLUMNS + "\n"
+    """First lines of a CSV recording, up to its column names; nothing in them sets a terminal."""
+    seen = {key: "".join(c if c.isprintable() else "?" for c in value) for key, value in metadata.items()}
+    return comments(seen) + COLUMNS + "\n"
 
 
 def csv_row(sample: ImuSample) -> str:

@@ -83,7 +83,9 @@ def script(
         return torch.jit.script(build(network, statistics, std_scale))
 
 
-def save(module: torch.jit.ScriptModule, path: Path, metadata: dict[str, object]) -> None:
+def save(
+    module: torch.jit.ScriptModule, path: Path, metadata: dict[str, object], overwrite: bool = True
+) -> None:
     """Writes an archive with its metadata as a JSON extra file.
 
     Raises:
@@ -99,7 +101,7 @@ def save(module: torch.jit.ScriptModule, path: Path, metadata: dict[str, object]
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
         raise EdgeposeError(f"{path}: cannot be written: {reason}") from error
-    write_whole(path, content, "the archive")
+    write_whole(path, content, "the archive", overwrite=overwrite)
 
 
 def revision() -> str | None:

@@ -146,11 +146,11 @@ def evaluate(
         models = [model._replace(name=name) for model, name in zip(models, names, strict=True)]
     chosen = parts or HELD_OUT
     if heat_map:
-        _heat_map(models[0], data, chosen, every, heat_map)
+        _heat_map(models[0], data, chosen, every, heat_map, overwrite)
     else:
-        _tables(models, data, chosen, baselines, table, histogram)
+        _tables(models, data, chosen, baselines, table, histogram, overwrite)
     if reliability:
-        _reliability(models, data, chosen, reliability)
+        _reliability(models, data, chosen, reliability, overwrite)
 
 
 def _model(
@@ -190,6 +190,7 @@ def _tables(
     baselines: bool,
     table: str | None,
     histogram: Path | None,
+    overwrite: bool,
 ) -> None:
     from edgepose.analysis.metrics import format_table
     from edgepose_export.cli.progress import labelled
@@ -217,11 +218,13 @@ def _tables(
         errors = {
             part: {name: row["sip_error_deg"] for name, row in rows.items()} for part, rows in columns.items()
         }
-        plots.histogram(histogram, errors)
+        plots.histogram(histogram, errors, overwrite)
         say(f"wrote {histogram}")
 
 
-def _heat_map(model: _Model, data: Path, parts: tuple[str, ...], every: int, path: Path) -> None:
+def _heat_map(
+    model: _Model, data: Path, parts: tuple[str, ...], every: int, path: Path, overwrite: bool
+) -> None:
     if model.metadata["kind"] != "birnn":
         raise click.UsageError(
             f"{model.name} {NO_WINDOW[model.metadata['kind']]}: it has no window to draw a heat map of"
@@ -239,11 +242,13 @@ def _heat_map(model: _Model, data: Path, parts: tuple[str, ...], every: int, pat
         for future, row in zip(HEAT_MAP_FRAMES[::-1], means[::-1], strict=True):
             show(f"{future:>6}  " + "  ".join(f"{mean:6.2f}" for mean in row))
         show("        " + "  ".join(f"{past:>6}" for past in HEAT_MAP_FRAMES))
-    plots.heat_map(path, maps, HEAT_MAP_FRAMES, HEAT_MAP_FRAMES)
+    plots.heat_map(path, maps, HEAT_MAP_FRAMES, HEAT_MAP_FRAMES, overwrite)
     say(f"wrote {path}")
 
 
-def _reliability(models: list[_Model], data: Path, parts: tuple[str, ...], path: Path) -> None:
+def _reliability(
+    models: list[_Model], data: Path, parts: tuple[str, ...], path: Path, overwrite: bool
+) -> None:
     from edgepose_export.cli.progress import labelled
     from edgepose_export.evaluation import plots
     from edgepose_export.evaluation import uncertainty as rel
@@ -258,5 +263,5 @@ def _reliability(models: list[_Model], data: Path, parts: tuple[str, ...], path:
                 pair = rel.errors_and_deviations(model.module, model.metadata, takes, mode)
                 result = results.setdefault(part, {})[name] = rel.reliability(*pair)
                 show(f"\n{part}: {name}\n{rel.describe(result)}")
-    plots.reliability_plot(path, results)
+    plots.reliability_plot(path, results, overwrite)
     say(f"wrote {path}")

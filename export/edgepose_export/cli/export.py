@@ -152,8 +152,8 @@ def export(
             archive.save(module, measured, metadata)
             metadata |= _measures(measured, data, others)
         metadata["precisions"] = _precisions(script, metadata, data)
-    archive.save(module, out, metadata)
-    write_whole(beside_it, card(metadata), "the card")
+    archive.save(module, out, metadata, overwrite)
+    write_whole(beside_it, card(metadata), "the card", overwrite=overwrite)
     say(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB) and {beside_it}")
 
 

@@ -65,5 +65,5 @@ def learn_prior(inputs: tuple[Path, ...], out: Path, about: str, overwrite: bool
             sources.add(LICENSES[take.source])
     together = np.concatenate(poses).reshape(-1, 72)
     prior = learn(together, about or " and ".join(sorted(sources)))
-    save_prior(out, prior)
+    save_prior(out, prior, overwrite)
     say(f"wrote {out}: {len(together)} poses of {len(files)} files; {prior.about}")

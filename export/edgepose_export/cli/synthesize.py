@@ -37,6 +37,7 @@ class Job(NamedTuple):
     hold_s: float
     mounting_seed: int | None
     seated_seed: int | None
+    overwrite: bool
 
 
 @click.command(short_help="Make recordings from motion capture.")
@@ -120,7 +121,7 @@ def synthesize(
     files = [(root, path) for root in inputs for path in motion_files(root)]
     if not files:
         raise EdgeposeError(f"no motion files ({', '.join(KINDS)}) in {', '.join(map(str, inputs))}")
-    how = (rate, body, hold, mounting_seed, seated_seed)
+    how = (rate, body, hold, mounting_seed, seated_seed, overwrite)
     tasks = [(path, Job(out, root if root.is_dir() else root.parent, *how)) for root, path in files]
     _check_targets(tasks, overwrite)
     failed = []
@@ -205,7 +206,12 @@ def convert(path: Path, job: Job) -> str | None:
             target = _target(path, job, part)
             target.parent.mkdir(parents=True, exist_ok=True)
             arrays = recording_arrays(motion, imus, LICENSES[motion.source])
-            replace_file(target, lambda file, arrays=arrays: np.savez(file, **arrays), "recording")
+            replace_file(
+                target,
+                lambda file, arrays=arrays: np.savez(file, **arrays),
+                "recording",
+                overwrite=job.overwrite,
+            )
     except EdgeposeError as error:
         return str(error)
     except OSError as error:

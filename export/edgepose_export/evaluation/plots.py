@@ -25,12 +25,13 @@ MOST_DEG = 60
 """Errors beyond are counted in the last bin of a histogram."""
 
 
-def histogram(path: Path, parts: Mapping[str, Mapping[str, Array]]) -> None:
+def histogram(path: Path, parts: Mapping[str, Mapping[str, Array]], overwrite: bool = True) -> None:
     """Distribution of errors, as DIP's figure 5.
 
     Args:
         path: picture to write.
         parts: for each part of the split each method's errors (N,), deg.
+        overwrite: whether it may take the place of a file.
     """
     figure, axes = _panels(list(parts))
     edges = np.arange(MOST_DEG + 1)
@@ -41,10 +42,12 @@ def histogram(path: Path, parts: Mapping[str, Mapping[str, Array]]) -> None:
         label = f"SIP error, deg (the last degree: all beyond {MOST_DEG - 1})"
         ax.set(xlabel=label, ylabel="frames, %", xlim=(0, MOST_DEG), ylim=(0, None))
     _legend(figure, axes)
-    _save(figure, path)
+    _save(figure, path, overwrite)
 
 
-def heat_map(path: Path, parts: Mapping[str, Array], past: list[int], future: list[int]) -> None:
+def heat_map(
+    path: Path, parts: Mapping[str, Array], past: list[int], future: list[int], overwrite: bool = True
+) -> None:
     """Mean errors against past and future frames, as DIP's figure 6.
 
     Args:
@@ -52,6 +55,7 @@ def heat_map(path: Path, parts: Mapping[str, Array], past: list[int], future: li
         parts: for each part of the split mean errors (len(future), len(past)), deg.
         past: numbers of past frames, rising.
         future: numbers of future frames, rising.
+        overwrite: whether it may take the place of a file.
     """
     figure, axes = _panels(list(parts))
     for ax, means in zip(axes, parts.values(), strict=True):
@@ -64,10 +68,12 @@ def heat_map(path: Path, parts: Mapping[str, Array], past: list[int], future: li
             ink = "white" if value > middle else "black"
             ax.text(column, row, f"{value:.1f}", ha="center", va="center", color=ink, fontsize="small")
         figure.colorbar(image, ax=ax, label="SIP error, deg")
-    _save(figure, path)
+    _save(figure, path, overwrite)
 
 
-def reliability_plot(path: Path, parts: Mapping[str, Mapping[str, Reliability]]) -> None:
+def reliability_plot(
+    path: Path, parts: Mapping[str, Mapping[str, Reliability]], overwrite: bool = True
+) -> None:
     """Actual against predicted errors in quantiles of the predicted ones, for each part and method."""
     figure, axes = _panels(list(parts))
     for ax, methods in zip(axes, parts.values(), strict=True):
@@ -78,7 +84,7 @@ def reliability_plot(path: Path, parts: Mapping[str, Mapping[str, Reliability]])
         ax.plot([0, most], [0, most], color="0.6", linestyle="--", label="as predicted")
         ax.set(xlabel="predicted standard deviation, deg", ylabel="actual RMS error, deg")
     _legend(figure, axes)
-    _save(figure, path)
+    _save(figure, path, overwrite)
 
 
 def _panels(titles: list[str]) -> tuple[Figure, list[Any]]:
@@ -100,8 +106,8 @@ def _legend(figure: Figure, axes: list[Any]) -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize="small")
 
 
-def _save(figure: Figure, path: Path) -> None:
+def _save(figure: Figure, path: Path, overwrite: bool) -> None:
     try:
-        save_picture(figure, path, dpi=DPI)
+        save_picture(figure, path, overwrite=overwrite, dpi=DPI)
     except EdgeposeError as error:
         raise EdgeposeError(f"{path}: cannot be written: {reason(error)}") from error

@@ -386,7 +386,7 @@ def save_checkpoint(state: dict[str, Any], path: Path) -> None:
     content = io.BytesIO()
     torch.save(state, content)
     try:
-        write_whole(path, content.getbuffer(), "the checkpoint")
+        write_whole(path, content.getbuffer(), "the checkpoint", overwrite=True)
     except EdgeposeError as error:
         raise EdgeposeError(f"{path}: cannot be written: {reason(error)}") from error
 
