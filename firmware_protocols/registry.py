@@ -73,7 +73,7 @@ class _Registry(Mapping[str, Protocol]):
 def _installed() -> dict[str, Protocol]:
     """Formats of other packages, sorted by name. One that is unusable is left out with a warning."""
     found: dict[str, Protocol] = {}
-    for point in sorted(entry_points(group=GROUP)):
+    for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
         package = f"protocol {point.name!r} of {point.dist.name if point.dist else point.value}"
         if point.name in _BUILT_IN or point.name in found:
             _log.warning("%s is ignored: the name is taken", package)

@@ -121,9 +121,9 @@ class Stream:
     def finish(self) -> list[ImuSample]:
         """What is held back at the end of a log."""
         result = [] if self._detector is None else self._decide(True)
-        return (
-            result if self._decoder is None else result + self._take(self._decoder.flush(), self._arrival_s)
-        )
+        if self._decoder is not None:
+            result += self._take(self._decoder.flush(), self._arrival_s)
+        return result
 
     def _decide(self, now: bool) -> list[ImuSample]:
         assert self._detector is not None
@@ -142,7 +142,8 @@ class Stream:
         self._clock = self._clock_of(decoder.WRAP_US)
 
     def _take(self, samples: Sequence[Sample], arrival_s: float) -> list[ImuSample]:
-        assert self._clock is not None and self._decoder is not None
+        assert self._clock is not None
+        assert self._decoder is not None
         result = []
         for sensor, time_us, quat, acc, gyr, mag, _ in samples:
             place = self._known.get(sensor)

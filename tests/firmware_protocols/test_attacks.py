@@ -118,7 +118,7 @@ def test_invented_channels_do_not_push_out_a_device():
 def test_invented_components_do_not_push_out_a_device():
     pytest.importorskip("pymavlink.dialects.v20.common")
     mavlink = __import__("firmware_protocols.mavlink", fromlist=["Encoder"])
-    real, others, decoder, got = mavlink.Encoder(), mavlink.Encoder(), mavlink.Decoder(), []
+    real, others, decoder, got = mavlink.Encoder(), mavlink.Encoder(), mavlink.MavlinkDecoder(), []
     for i in range(60):
         got += decoder.feed(real.encode(STILL._replace(sensor=1, time_us=10_000 * i)))
         for other in range(20):
