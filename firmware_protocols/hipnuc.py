@@ -11,10 +11,7 @@ from binascii import crc_hqx
 from collections.abc import Iterable
 from math import radians
 
-from firmware_protocols._numbers import plausible
-from firmware_protocols._stream import StreamDecoder
-from firmware_protocols.base import Protocol, uncounted
-from firmware_protocols.hipnuc_fields import (
+from firmware_protocols._hipnuc_fields import (
     DEG,
     MASK_83,
     NODE_BIT,
@@ -30,6 +27,9 @@ from firmware_protocols.hipnuc_fields import (
     vector_i,
     write_fields,
 )
+from firmware_protocols._numbers import plausible
+from firmware_protocols._stream import StreamDecoder
+from firmware_protocols.base import Protocol, uncounted
 from firmware_protocols.rotation import from_angles, from_yaw_pitch_roll
 from firmware_protocols.sample import GRAVITY, Quaternion, Sample, Vector3, unit_quaternion
 
@@ -361,8 +361,6 @@ def _write_block(sample: Sample, node_ids: bool) -> bytes:
         *sample.quat,
     )
 
-
-# --- the protocol ---------------------------------------------------------------------------------
 
 PROTOCOL = Protocol(
     name="hipnuc",

@@ -7,10 +7,7 @@ from __future__ import annotations
 
 import struct
 
-from firmware_protocols._sequence import count_byte
-from firmware_protocols._stream import Receiver
-from firmware_protocols.base import Protocol, uncounted_can
-from firmware_protocols.hipnuc_fields import (
+from firmware_protocols._hipnuc_fields import (
     DEG,
     QUAT_I,
     VECTOR_I,
@@ -21,6 +18,9 @@ from firmware_protocols.hipnuc_fields import (
     vector_i,
     write_fields,
 )
+from firmware_protocols._sequence import count_byte
+from firmware_protocols._stream import Receiver
+from firmware_protocols.base import Protocol, uncounted_can
 from firmware_protocols.pairing import Usual
 from firmware_protocols.sample import GRAVITY, CanFrame, Sample, Vector3, unit_quaternion
 
@@ -215,8 +215,6 @@ def encode_j1939_fd(sample: Sample, count: int = 0) -> CanFrame:
 def _j1939_id(group: int, node: int) -> int:
     return 3 << 26 | group << 8 | node
 
-
-# --- the protocol ---------------------------------------------------------------------------------
 
 PROTOCOL_CANOPEN = Protocol(
     name="hipnuc-canopen",

@@ -172,9 +172,6 @@ def _open_frame(frame: bytes) -> Packet | Info:
     return decode_body(body[:-2])
 
 
-# --- the protocol ---------------------------------------------------------------------------------
-
-
 def _encoder() -> Encode:
     return lambda sample, seq: encode(packet_of(sample, seq))
 

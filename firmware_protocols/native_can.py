@@ -267,9 +267,6 @@ class NativeCanDecoder(NativeReceiver):
         return [samples[0]._replace(time_us=now % self.WRAP_US)]
 
 
-# --- the protocol ---------------------------------------------------------------------------------
-
-
 def _encoder() -> Encode:
     def encode_sample(sample: Sample, seq: int) -> list[Frame]:
         # The whole time: a wrap at 2^32 us would be a jump in the 16 bit time.

@@ -263,9 +263,6 @@ def _clock(time_us: int) -> str:
     return f"{seconds // 3600:02}:{seconds // 60 % 60:02}:{seconds % 60:02}.{hundredths:02}"
 
 
-# --- the protocol ---------------------------------------------------------------------------------
-
-
 def _encoder(pattern: str) -> Callable[[], Encode]:
     """`Protocol.encoder` of a ready pattern; a header line goes before a sensor's first sample."""
 

@@ -337,8 +337,6 @@ def _ypr(quat: Quaternion) -> Vector3:
     return (degrees(yaw), degrees(pitch), degrees(roll))
 
 
-# --- the protocol ---------------------------------------------------------------------------------
-
 PROTOCOL = Protocol(
     name="vectornav",
     transport="bytes",

@@ -11,9 +11,7 @@ from typing import Any
 
 from firmware_protocols._numbers import int16
 from firmware_protocols._stream import StreamDecoder
-from firmware_protocols.base import Protocol, uncounted
-from firmware_protocols.sample import Sample, unit_quaternion
-from firmware_protocols.witmotion_cycle import (
+from firmware_protocols._witmotion_cycle import (
     ACC,
     ACC_STEP,
     ANGLES,
@@ -31,6 +29,8 @@ from firmware_protocols.witmotion_cycle import (
     steps_of,
     vectors_of,
 )
+from firmware_protocols.base import Protocol, uncounted
+from firmware_protocols.sample import Sample, unit_quaternion
 
 _SIZE = 11
 _WORDS = struct.Struct("<4h")
@@ -149,8 +149,6 @@ def _packet(kind: int, data: bytes) -> bytes:
     body = bytes([0x55, kind]) + data
     return body + bytes([sum(body) & 0xFF])
 
-
-# --- the protocol ---------------------------------------------------------------------------------
 
 PROTOCOL = Protocol(
     name="witmotion",

@@ -11,9 +11,7 @@ from typing import Any
 
 from firmware_protocols._recent import Recent
 from firmware_protocols._stream import Receiver
-from firmware_protocols.base import Protocol, uncounted_can
-from firmware_protocols.sample import CanFrame, Sample
-from firmware_protocols.witmotion_cycle import (
+from firmware_protocols._witmotion_cycle import (
     ACC,
     ACC_STEP,
     ANGLE_NAMES,
@@ -29,6 +27,8 @@ from firmware_protocols.witmotion_cycle import (
     steps_of,
     vectors_of,
 )
+from firmware_protocols.base import Protocol, uncounted_can
+from firmware_protocols.sample import CanFrame, Sample
 
 _CAN = struct.Struct("<BB3h")
 _CAN_ANGLE = struct.Struct("<BBBxi")
@@ -102,8 +102,6 @@ def encode_can(sample: Sample, *, fine_angles: bool = False, mag_ut: float = 1.0
             frames.append(_CAN.pack(0x55, kind, *steps_of(values, step)))
     return [(sample.sensor, data, sample.sensor > 0x7FF) for data in frames]
 
-
-# --- the protocol ---------------------------------------------------------------------------------
 
 PROTOCOL = Protocol(
     name="witmotion-can",

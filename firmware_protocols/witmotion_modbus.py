@@ -10,10 +10,7 @@ import struct
 
 from firmware_protocols._numbers import int16
 from firmware_protocols._stream import StreamDecoder
-from firmware_protocols.base import Protocol, uncounted
-from firmware_protocols.rotation import from_yaw_pitch_roll, to_yaw_pitch_roll
-from firmware_protocols.sample import Quaternion, Sample, unit_quaternion
-from firmware_protocols.witmotion_cycle import (
+from firmware_protocols._witmotion_cycle import (
     ACC_STEP,
     ANGLE_STEP,
     DAY_US,
@@ -22,6 +19,9 @@ from firmware_protocols.witmotion_cycle import (
     scaled,
     steps_of,
 )
+from firmware_protocols.base import Protocol, uncounted
+from firmware_protocols.rotation import from_yaw_pitch_roll, to_yaw_pitch_roll
+from firmware_protocols.sample import Quaternion, Sample, unit_quaternion
 
 FIRST_REGISTER, ANGLE_REGISTERS, ALL_REGISTERS = 0x34, 12, 33
 """Acceleration, rate, field and angles; with temperature and quaternion in addition."""
@@ -155,9 +155,6 @@ def encode_modbus(sample: Sample, *, count: int = ANGLE_REGISTERS, mag_ut: float
     )
     words += [int16((sample.temperature or 0) * 100), *[0] * 16, *steps_of(sample.quat, QUAT_STEP)]
     return _with_crc(struct.pack(f">BBB{count}h", sample.sensor, 3, 2 * count, *words[:count]))
-
-
-# --- the protocol ---------------------------------------------------------------------------------
 
 
 def _request(sensor: int) -> tuple[bytes, int]:

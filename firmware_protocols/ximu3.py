@@ -355,8 +355,6 @@ def encode(sample: Sample, *, ascii: bool = False, frame: str = "NWU") -> bytes:
     )
 
 
-# --- the protocol ---------------------------------------------------------------------------------
-
 PROTOCOL = Protocol(
     name="ximu3",
     transport="bytes",

@@ -315,8 +315,6 @@ def _item(item: int, values: tuple[float, ...]) -> bytes:
     return struct.pack(">HB", item, len(data)) + data
 
 
-# --- the protocol ---------------------------------------------------------------------------------
-
 PROTOCOL = Protocol(
     name="xsens",
     transport="bytes",

@@ -26,9 +26,10 @@ ANGLE_STEP = pi / 32768
 """Step of an angle, rad."""
 
 QUAT_STEP = 1 / 32768
+"""Step of a quaternion's component."""
 
 DAY_US = 86_400_000_000
-"""Times are those of a day and wrap here, microseconds."""
+"""Times of samples wrap here, microseconds: devices send the time of day."""
 
 ANGLE_NAMES = ("roll", "pitch", "yaw")
 """Angles in the order on the wire."""

@@ -12,9 +12,10 @@ from firmware_protocols._numbers import int16, number, vector
 from firmware_protocols.sample import Quaternion, Sample, Vector3, unit_quaternion
 
 WRAP_US = (1 << 32) * 1000
-"""Times of samples wrap here: milliseconds of 32 bits."""
+"""Times of samples wrap here, microseconds: devices count milliseconds in 32 bits."""
 
 DEG = radians(1.0)
+"""One degree, rad."""
 
 VECTOR_I = struct.Struct("<3h")
 VECTOR_F = struct.Struct("<3f")
@@ -25,7 +26,10 @@ QUAT_F = struct.Struct("<4f")
 _FIELDS = dict(
     enumerate((12, 12, 12, 12, 16, 8, 8, 4, 4, 12, 12, 12, 12, 12, 24, 4, 4, 4, 4, 4))
 ) | {30: 24, 31: 12}  # fmt: skip
-_TIME_BIT, _TEMPERATURE_BIT, NODE_BIT = 5, 8, 19
+_TIME_BIT, _TEMPERATURE_BIT = 5, 8
+
+NODE_BIT = 19
+"""Bit of a mask that announces the id of a node."""
 
 MASK_83 = sum(1 << bit for bit in _FIELDS)
 """Bits of a mask whose fields have a known length."""
