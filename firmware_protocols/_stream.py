@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import re
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from typing import ClassVar
 
+from firmware_protocols.base import Decoder
 from firmware_protocols.sample import Counters, Sample
 
 NOTHING = (None,) * 5
 """Quantities of a sample that has none."""
 
 
-class Receiver:
-    """Counts what comes.
+class Receiver(Decoder):
+    """A decoder that counts what comes.
 
     Attributes:
         counters: what has been seen so far.
@@ -45,15 +46,12 @@ class Receiver:
             samples.append(sample)
 
 
-class StreamDecoder(Receiver, ABC):
+class StreamDecoder(Receiver):
     """Samples out of a byte stream that may be cut anywhere, start anywhere and contain noise.
 
     After a frame that turns out to be none, the search goes on one byte after its start: a start byte can
     occur inside a payload, and a false length must not swallow the good frames behind it.
     """
-
-    WRAP_US: ClassVar[int]
-    """Sample.time_us starts again at 0 after this many microseconds."""
 
     _START: ClassVar[re.Pattern[bytes]]
     """Where a frame can start; has to match its first byte alone at the end of the data."""

@@ -9,19 +9,19 @@ from __future__ import annotations
 import re
 import struct
 from math import degrees, radians
-from typing import ClassVar
 
 from firmware_protocols import rotation
 from firmware_protocols._numbers import int16
 from firmware_protocols._sequence import count_byte
 from firmware_protocols._stream import StreamDecoder
+from firmware_protocols.base import Protocol
 from firmware_protocols.sample import GRAVITY, Quaternion, Sample
 
 FRAME_BYTES = 19
 """Bytes of a frame, header and checksum included."""
 
 ORDERS = ("zxy", "zyx", "zyx-swapped")
-"""How the three angles make a rotation, see `Decoder`."""
+"""How the three angles make a rotation, see `Bno08xDecoder`."""
 
 _HEADER = b"\xaa\xaa"
 _FRAME = struct.Struct("<xxB6h3xx")
@@ -30,10 +30,10 @@ _MG = GRAVITY / 1000
 _MAX_TEXT = 256
 
 
-class Decoder(StreamDecoder):
+class Bno08xDecoder(StreamDecoder):
     """Samples out of a byte stream; sensor is 0 and the time None."""
 
-    WRAP_US: ClassVar[int] = 1 << 64
+    WRAP_US = 1 << 64
 
     _START = re.compile(rb"\xaa(?:\xaa|\Z)")
 
@@ -128,3 +128,14 @@ def encode(sample: Sample, index: int, *, order: str = "zxy", clockwise: bool = 
     force = [int16(x / _MG) for x in sample.acc]
     body = struct.pack("<B6h3x", index & 0xFF, *angles, *force)
     return _HEADER + body + bytes([sum(body) & 0xFF])
+
+
+PROTOCOL = Protocol(
+    name="bno08x-rvc",
+    transport="bytes",
+    speed=115200,
+    text="BNO08x in UART-RVC mode: angles without a common heading, acceleration",
+    decoder=Bno08xDecoder,
+    encoder=lambda: encode,
+    alone=True,
+)

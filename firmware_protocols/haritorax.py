@@ -9,9 +9,10 @@ import re
 import struct
 from base64 import b64decode, b64encode
 from collections.abc import Iterable
-from typing import ClassVar
 
-from firmware_protocols.sample import GRAVITY, Counters, Sample, unit_quaternion
+from firmware_protocols._stream import Receiver
+from firmware_protocols.base import Protocol, uncounted
+from firmware_protocols.sample import GRAVITY, Sample, unit_quaternion
 
 MAX_LINE = 512
 """Longest line that is read, bytes; eight wired sensors need 155."""
@@ -34,7 +35,7 @@ _DONGLE_BLOCKS = {16: (0,), 30: (0, 16)}
 _WIRED_LENGTHS = range(_BLOCK.size, 8 * _BLOCK.size + 1, _BLOCK.size)
 
 
-class Decoder:
+class HaritoraxDecoder(Receiver):
     """Samples out of a byte stream that may be cut anywhere, start anywhere and contain noise.
 
     Sensor is the slot of the tracker on this port of the dongle (0 to 7; 8 more for the second sensor of a
@@ -44,13 +45,12 @@ class Decoder:
         counters: what has been seen so far.
     """
 
-    WRAP_US: ClassVar[int] = 1 << 64
+    WRAP_US = 1 << 64
 
     def __init__(self) -> None:
         """Start with nothing seen."""
-        self.counters = Counters()
+        super().__init__()
         self._rest = b""
-        self._in_sync = True
 
     def feed(self, data: bytes) -> list[Sample]:
         """Samples completed by the next bytes of the stream, in the order they came."""
@@ -72,12 +72,9 @@ class Decoder:
         samples = _samples(match) if match is not None else []
         # A good line may follow on a broken one that has lost its end.
         if match is None or match.start() or not samples:
-            self.counters.bad += 1
-            self._in_sync = False
+            self._bad()
         if samples:
-            if not self._in_sync:
-                self._in_sync = True
-                self.counters.resyncs += 1
+            self._good()
             self.counters.packets += len(samples)
         return samples
 
@@ -127,3 +124,14 @@ def _block(sample: Sample, step: float) -> bytes:
         raise ValueError("a block has both orientation and specific force")
     w, *xyz = (round(value * _QUAT_STEPS) for value in sample.quat)
     return _BLOCK.pack(*xyz, w, *(max(-32768, min(32767, round(value / step))) for value in sample.acc))
+
+
+PROTOCOL = Protocol(
+    name="haritorax",
+    transport="bytes",
+    speed=500_000,
+    text="HaritoraX trackers, by a GX dongle or wired; ids are slots of the dongle",
+    decoder=HaritoraxDecoder,
+    encoder=uncounted(encode),
+    ids=range(6),
+)

@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from math import isfinite
 
 from firmware_protocols._stream import StreamDecoder
+from firmware_protocols.base import Protocol, uncounted
 from firmware_protocols.sample import GRAVITY, Quaternion, Sample, Vector3, unit_quaternion
 
 SENSOR_DATA = 9
@@ -159,3 +160,15 @@ def encode(sample: Sample, fields: Iterable[str] = USUAL_FIELDS, floats: bool = 
     except (struct.error, OverflowError) as error:
         raise ValueError(f"cannot send {sample}: {error}") from None
     return _START_BYTE + body + (sum(body) & 0xFFFF).to_bytes(2, "little") + _END
+
+
+PROTOCOL = Protocol(
+    name="lpms",
+    transport="bytes",
+    speed=115200,
+    text="LP-Research LPMS, set to send rate, acceleration, field and quaternion as f32",
+    decoder=LpmsDecoder,
+    encoder=uncounted(encode),
+    ids=range(1, 7),
+    alone=True,
+)

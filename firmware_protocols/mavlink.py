@@ -9,12 +9,13 @@ from __future__ import annotations
 import re
 from collections.abc import Container
 from importlib import import_module
-from typing import Any, ClassVar
+from typing import Any
 
 from firmware_protocols._numbers import number, vector
 from firmware_protocols._recent import Recent
 from firmware_protocols._sequence import count_byte
 from firmware_protocols._stream import StreamDecoder
+from firmware_protocols.base import Encode, Protocol
 from firmware_protocols.pairing import Pairing
 from firmware_protocols.sample import GRAVITY, Sample, Vector3, unit_quaternion, z_up
 
@@ -36,7 +37,7 @@ def _dialect() -> Any:
         ) from None
 
 
-class Decoder(StreamDecoder):
+class MavlinkDecoder(StreamDecoder):
     """Samples out of a byte stream.
 
     Sensor is sysid << 8 | compid. An orientation and a reading of one component whose times are no more than
@@ -44,7 +45,7 @@ class Decoder(StreamDecoder):
     missing.
     """
 
-    WRAP_US: ClassVar[int] = _WRAP_US
+    WRAP_US = _WRAP_US
 
     _START = re.compile(rb"[\xfd\xfe]")
 
@@ -231,3 +232,20 @@ class Encoder:
             sample.temperature or 0.0,
             has,
         )
+
+
+def _encoder() -> Encode:
+    encoder = Encoder()  # counts for itself
+    return lambda sample, seq: encoder.encode(sample)
+
+
+PROTOCOL = Protocol(
+    name="mavlink",
+    transport="bytes",
+    speed=57600,
+    text="MAVLink 1 and 2 (needs pymavlink); ids are system id << 8 | component id",
+    decoder=MavlinkDecoder,
+    encoder=_encoder,
+    ids=[system << 8 | 1 for system in range(1, 7)],
+    alone=True,
+)

@@ -13,6 +13,7 @@ from itertools import accumulate
 from firmware_protocols._numbers import number, vector
 from firmware_protocols._sequence import MAX_PAUSE_US
 from firmware_protocols._stream import StreamDecoder
+from firmware_protocols.base import Protocol, uncounted
 from firmware_protocols.rotation import from_angles, from_matrix, to_yaw_pitch_roll
 from firmware_protocols.sample import GRAVITY, Sample, unit_quaternion, z_up
 
@@ -262,3 +263,14 @@ def encode(
     except (struct.error, OverflowError) as error:
         raise ValueError(f"cannot send {sample}: {error}") from None
     return encode_packet(descriptor, parts)
+
+
+PROTOCOL = Protocol(
+    name="mip",
+    transport="bytes",
+    speed=115200,
+    text="MicroStrain MIP: 3DM-GX, 3DM-CV",
+    decoder=MipDecoder,
+    encoder=uncounted(encode),
+    alone=True,
+)

@@ -9,19 +9,21 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-from firmware_protocols.native import (
+from firmware_protocols.base import Encode, Frame, Protocol
+from firmware_protocols.native import NativeReceiver
+from firmware_protocols.native_packet import (
     ACC_SCALE,
     GYR_SCALE,
     MAG_SCALE,
     QUAT_SCALE,
     Info,
     Packet,
-    Receiver,
     body_size,
     decode_body,
     encode_body,
     encode_info_body,
     fixed,
+    packet_of,
 )
 from firmware_protocols.sample import Sample, Vector3, unit_quaternion
 
@@ -107,7 +109,7 @@ def encode_fd(message: Packet | Info, base: int = BASE, *, floats: bool = False)
         floats: send vectors and quaternion as binary32 instead of int16.
 
     Raises:
-        ValueError: as `native.encode_body`; no such sensor or base; or the body is longer than 64 bytes.
+        ValueError: as `encode_body`; no such sensor or base; or the body is longer than 64 bytes.
     """
     body = encode_info_body(message) if isinstance(message, Info) else encode_body(message, floats=floats)
     for length in FD_LENGTHS:
@@ -143,7 +145,7 @@ class _Open:
     arrival_s: float | None = None
 
 
-class NativeCanDecoder(Receiver):
+class NativeCanDecoder(NativeReceiver):
     """Samples out of the frames of a bus, CAN 2.0 and CAN FD in any mixture.
 
     In CAN 2.0 a QUAT belongs to the ACC before it only if it is the first QUAT after it. A sample of which
@@ -263,3 +265,23 @@ class NativeCanDecoder(Receiver):
         now = last + ((body.t_us - last + 0x80000000) & 0xFFFFFFFF) - 0x80000000
         self._fd_us[sensor] = now
         return [samples[0]._replace(time_us=now % self.WRAP_US)]
+
+
+def _encoder() -> Encode:
+    def encode_sample(sample: Sample, seq: int) -> list[Frame]:
+        # The whole time: a wrap at 2^32 us would be a jump in the 16 bit time.
+        packet = packet_of(sample, seq)._replace(t_us=sample.time_us or 0)
+        return [(can_id, data, False, False) for can_id, data in encode(packet)]
+
+    return encode_sample
+
+
+PROTOCOL = Protocol(
+    name="native-can",
+    transport="can",
+    speed=500_000,
+    text="edgepose's own packet on CAN 2.0 and CAN FD",
+    decoder=NativeCanDecoder,
+    encoder=_encoder,
+    ids=range(6),
+)

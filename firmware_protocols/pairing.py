@@ -1,7 +1,8 @@
 """One Sample of messages that a device sends apart.
 
-By their times: `Pairing`. By the order in which they come, where they have none: `hipnuc` and `witmotion`,
-with `Usual`. The MTi-600 (time or group counter) and the native packet on CAN have rules of their own.
+By their times: `Pairing`. By the order in which they come, where they have none: HiPNUC on CAN and
+WitMotion, with `Usual`. The MTi-600 (time or group counter) and the native packet on CAN have rules of their
+own.
 """
 
 from __future__ import annotations

@@ -1,9 +1,6 @@
 """What every decoder gives: one reading of one sensor in one convention, whatever the wire says.
 
-A decoder of a byte stream has `feed(data: bytes) -> list[Sample]`, one of a CAN bus
-`feed(can_id: int, data: bytes, extended: bool = False) -> list[Sample]`; both have `counters` and the class
-attribute `WRAP_US`. Feeding is incremental: any chunking of the same bytes gives the same samples. Nothing
-that comes from a wire raises.
+`base.Decoder` is the interface of the decoders.
 """
 
 from __future__ import annotations

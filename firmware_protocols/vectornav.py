@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from firmware_protocols._numbers import number, vector
 from firmware_protocols._stream import StreamDecoder
+from firmware_protocols.base import Protocol, uncounted
 from firmware_protocols.rotation import from_angles, to_yaw_pitch_roll
 from firmware_protocols.sample import Quaternion, Sample, Vector3, unit_quaternion, z_up
 
@@ -334,3 +335,24 @@ def encode_ascii(sample: Sample, name: str = "VNQMR", *, crc: bool = False) -> b
 def _ypr(quat: Quaternion) -> Vector3:
     yaw, pitch, roll = to_yaw_pitch_roll(quat)
     return (degrees(yaw), degrees(pitch), degrees(roll))
+
+
+PROTOCOL = Protocol(
+    name="vectornav",
+    transport="bytes",
+    speed=115200,
+    text="VectorNav binary outputs (reads the ASCII lines too)",
+    decoder=VectorNavDecoder,
+    encoder=uncounted(encode_binary),
+    alone=True,
+)
+
+PROTOCOL_ASCII = Protocol(
+    name="vectornav-ascii",
+    transport="bytes",
+    speed=115200,
+    text="VectorNav ASCII lines (reads the binary outputs too)",
+    decoder=VectorNavDecoder,
+    encoder=uncounted(encode_ascii),
+    alone=True,
+)

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import struct
 from math import degrees, isfinite, radians
-from typing import ClassVar
 
 from firmware_protocols import rotation
 from firmware_protocols._numbers import plausible
 from firmware_protocols._recent import Recent
 from firmware_protocols._stream import Receiver
+from firmware_protocols.base import Protocol, uncounted
 from firmware_protocols.pairing import Pairing
 from firmware_protocols.sample import GRAVITY, Quaternion, Sample, Vector3, unit_quaternion, z_up
 
@@ -49,7 +49,7 @@ _DEG = radians(1.0)
 _Message = tuple[int, str, int, tuple[float, ...]]  # sensor, letter, time, values
 
 
-class Decoder(Receiver):
+class Ximu3Decoder(Receiver):
     """Samples out of a byte stream that may be cut anywhere, start anywhere and contain noise.
 
     A Sample has the time of its orientation and inertial messages. One whose partner is lost (or is not
@@ -60,7 +60,7 @@ class Decoder(Receiver):
     outer << 8 | inner for a channel of a channel.
     """
 
-    WRAP_US: ClassVar[int] = 1 << 64
+    WRAP_US = 1 << 64
 
     def __init__(self, frame: str = "NWU") -> None:
         """Start with nothing seen.
@@ -353,3 +353,14 @@ def encode(sample: Sample, *, ascii: bool = False, frame: str = "NWU") -> bytes:
     return b"".join(
         encode_message(letter, time_us, values, sensor=sample.sensor, ascii=ascii) for letter, values in parts
     )
+
+
+PROTOCOL = Protocol(
+    name="ximu3",
+    transport="bytes",
+    speed=115200,
+    text="x-io x-IMU3, ASCII and binary; ids are channels of multiplexed messages",
+    decoder=Ximu3Decoder,
+    encoder=uncounted(encode),
+    alone=True,
+)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from firmware_protocols import native_can
-from firmware_protocols.native import ACC_SCALE, GYR_SCALE, MAG_SCALE, QUAT_SCALE
+from firmware_protocols.native_packet import ACC_SCALE, GYR_SCALE, MAG_SCALE, QUAT_SCALE
 
 DEST = Path(__file__).parents[1] / "firmware_protocols" / "dbc"
 

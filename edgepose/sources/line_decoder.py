@@ -10,7 +10,7 @@ from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import Counters, Device
 from edgepose.sources.protocol_detection import Chunk, Detector, decode
-from firmware_protocols.registry import Decoder, Protocol
+from firmware_protocols.base import Decoder, DeviceInfo, Protocol
 from firmware_protocols.sample import Sample
 
 _log = logging.getLogger(__name__)
@@ -121,8 +121,9 @@ class Stream:
     def finish(self) -> list[ImuSample]:
         """What is held back at the end of a log."""
         result = [] if self._detector is None else self._decide(True)
-        flush = getattr(self._decoder, "flush", None)  # of decoders that wait for a message's partner
-        return result if flush is None else result + self._take(flush(), self._arrival_s)
+        if self._decoder is not None:
+            result += self._take(self._decoder.flush(), self._arrival_s)
+        return result
 
     def _decide(self, now: bool) -> list[ImuSample]:
         assert self._detector is not None
@@ -142,6 +143,7 @@ class Stream:
 
     def _take(self, samples: Sequence[Sample], arrival_s: float) -> list[ImuSample]:
         assert self._clock is not None
+        assert self._decoder is not None
         result = []
         for sensor, time_us, quat, acc, gyr, mag, _ in samples:
             place = self._known.get(sensor)
@@ -150,9 +152,8 @@ class Stream:
                 if place is None:
                     continue
             result.append(ImuSample(place, self._clock(place, time_us, arrival_s), quat, acc, gyr, mag))
-        infos = getattr(self._decoder, "infos", None)
-        if infos:
-            self._check_frames(infos)
+        if self._decoder.infos:
+            self._check_frames(self._decoder.infos)
         return result
 
     def _find(self, sensor: int) -> int | None:
@@ -177,9 +178,9 @@ class Stream:
         self._known[sensor] = place
         return place
 
-    def _check_frames(self, infos: Mapping[int, object]) -> None:
+    def _check_frames(self, infos: Mapping[int, DeviceInfo]) -> None:
         for sensor, info in infos.items():
-            if getattr(info, "frame", None) == "NED":
+            if info.frame == "NED":
                 raise EdgeposeError(
                     f"{self.name}: sensor id {sensor} sends its orientation in a frame with Z down (NED); "
                     "set its firmware to a frame with Z up (ENU)"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -67,7 +68,7 @@ def candidates(name: str, transport: Literal["bytes", "can"], live: bool) -> lis
     # Two names can stand for one decoder.
     first = {
         protocol.decoder: protocol
-        for protocol in reversed(PROTOCOLS.values())
+        for protocol in reversed(list(PROTOCOLS.values()))
         if protocol.transport == transport and not (live and protocol.request)
     }
     return list(reversed(first.values()))
@@ -150,22 +151,20 @@ class Detector:
 
 def _text_lines(path: Path) -> Protocol:
     from edgepose.utils.text_files import read_toml
-    from firmware_protocols import text
+    from firmware_protocols.text import TextDecoder
+    from firmware_protocols.text_pattern import pattern_from_table
 
     try:
-        pattern = text.pattern_from_table(read_toml(path))
+        pattern = pattern_from_table(read_toml(path))
     except ValueError as error:
         raise ConfigError(f"{path}: {error}") from None
 
-    def decoder() -> Any:
-        return text.Decoder(pattern)
-
     return Protocol(
-        path.name,
-        "bytes",
-        115200,
-        "text lines as a file says",
-        decoder,
+        name=path.name,
+        transport="bytes",
+        speed=115200,
+        text="text lines as a file says",
+        decoder=partial(TextDecoder, pattern),
         encoder=None,
         ids=range(6),
         alone="sensor" not in (pattern.regex or "") and "sensor" not in pattern.columns,

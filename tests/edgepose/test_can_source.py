@@ -17,7 +17,7 @@ from edgepose.pipeline.frame_synchronizer import FrameClock
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import open_source
 from firmware_protocols import native_can
-from firmware_protocols.native import Info, Packet
+from firmware_protocols.native_packet import Info, Packet
 from firmware_protocols.registry import PROTOCOLS
 from firmware_protocols.sample import Sample
 

@@ -26,7 +26,7 @@ from edgepose.formats.recordings import csv_npz as rec
 from edgepose.imu import ImuSample
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose_export.synthesis.heading_routine import ASIDE_DEG, exercises
-from firmware_protocols import native
+from firmware_protocols import native, native_packet
 
 REAL = Path(__file__).parents[1] / "data" / "imu" / "six-sites-3s.npz"
 
@@ -112,7 +112,7 @@ def test_a_raw_capture(tmp_path: Path) -> None:
     with file.open("wb") as stream:
         for seq in range(100):
             for i, (q, f) in enumerate(zip(quats.tolist(), forces(quats).tolist(), strict=True)):
-                stream.write(native.encode(native.Packet(i, seq, 20_000 * seq, tuple(q), tuple(f))))
+                stream.write(native.encode(native_packet.Packet(i, seq, 20_000 * seq, tuple(q), tuple(f))))
     result = run("--file", file, "--hold", 1, "--out", tmp_path / "calib.json")
     assert result.exit_code == 0, result
     assert_recovers(cal.load_calibration(tmp_path / "calib.json"), np.zeros(6), 0.1)
@@ -246,7 +246,7 @@ class Wearer(threading.Thread):
             for i, (q, f) in enumerate(zip(quats.tolist(), forces(quats).tolist(), strict=True)):
                 if i not in self.silent:
                     data += native.encode(
-                        native.Packet(i, seq, int(now * 1e6), tuple(q), tuple(f), (0.0, 0.0, 0.0))
+                        native_packet.Packet(i, seq, int(now * 1e6), tuple(q), tuple(f), (0.0, 0.0, 0.0))
                     )
             seq = (seq + 1) & 0xFFFF
             try:

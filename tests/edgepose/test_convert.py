@@ -37,7 +37,8 @@ from edgepose.formats.recordings.xio_session import placement_of
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
 from firmware_protocols import native_can
-from firmware_protocols.native import Packet, encode
+from firmware_protocols.native import encode
+from firmware_protocols.native_packet import Packet
 from firmware_protocols.sample import GRAVITY
 
 REAL = Path(__file__).parents[1] / "data" / "imu" / "six-sites-3s.npz"

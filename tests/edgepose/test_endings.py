@@ -26,7 +26,7 @@ from edgepose.formats.poses.reading import read_poses
 from edgepose.formats.recordings.csv_npz import read_recording, samples
 from edgepose.utils.safe_pickle import read_pickle
 from firmware_protocols import native_can
-from firmware_protocols.native import Packet
+from firmware_protocols.native_packet import Packet
 
 RUN = [sys.executable, "-m", "edgepose", "run", "--model", "rnn"]
 LIMIT_S = 60.0

@@ -135,7 +135,8 @@ def test_devices_that_somebody_has_edited(calibrated, noted):
 
 def test_a_capture_keeps_its_devices(command, wearer, tmp_path):
     """From calibrate to run: the protocol and ids of a log go with the calibration."""
-    from firmware_protocols.native import Packet, encode
+    from firmware_protocols.native import encode
+    from firmware_protocols.native_packet import Packet
 
     recording = read_recording(wearer.recording)
     counts, data = dict.fromkeys(range(6), 0), b""

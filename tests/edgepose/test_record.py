@@ -27,7 +27,8 @@ from edgepose.pipeline.frame_synchronizer import FrameClock
 from edgepose.record import CAN_LOGS, Output, open_output, record
 from edgepose.sources import open_source
 from firmware_protocols import native_can
-from firmware_protocols.native import Packet, encode
+from firmware_protocols.native import encode
+from firmware_protocols.native_packet import Packet
 
 REAL = Path(__file__).parents[1] / "data" / "imu" / "six-sites-3s.npz"
 

@@ -33,7 +33,8 @@ from edgepose.placements import PLACEMENTS
 from edgepose.sinks.udp import decode_binary
 from edgepose.skeleton import JOINTS, PARENTS
 from firmware_protocols import native_can
-from firmware_protocols.native import Packet, encode
+from firmware_protocols.native import encode
+from firmware_protocols.native_packet import Packet
 
 SIMULATOR = Path(__file__).parents[2] / "tools" / "simulate.py"
 BONES = [18, 19, 4, 5, 15, 0]  # those with the sensors, in the order of PLACEMENTS

@@ -13,7 +13,8 @@ from edgepose.placements import PLACEMENTS
 from edgepose.sources import open_source
 from edgepose.sources.line_config import links
 from edgepose.sources.sensor_map import default_places, read_map
-from firmware_protocols.native import Packet, encode
+from firmware_protocols.native import encode
+from firmware_protocols.native_packet import Packet
 from firmware_protocols.registry import PROTOCOLS
 
 PORTS = "\n".join(f'{name} = {{ port = "/dev/ttyUSB{i}" }}' for i, name in enumerate(PLACEMENTS))

@@ -21,7 +21,8 @@ from edgepose.pipeline.frame_synchronizer import FrameClock
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import open_source
 from edgepose.sources.protocol_detection import protocol_named
-from firmware_protocols.native import Info, Packet, encode, encode_info
+from firmware_protocols.native import encode, encode_info
+from firmware_protocols.native_packet import Info, Packet
 from firmware_protocols.registry import PROTOCOLS
 from firmware_protocols.sample import Sample
 

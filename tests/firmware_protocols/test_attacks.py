@@ -9,7 +9,18 @@ from time import process_time
 import pytest
 
 import firmware_protocols
-from firmware_protocols import hipnuc, mip, native, text, vectornav, witmotion, ximu3, xsens
+from firmware_protocols import (
+    hipnuc,
+    mip,
+    native,
+    native_packet,
+    text,
+    text_pattern,
+    vectornav,
+    witmotion_can,
+    ximu3,
+    xsens,
+)
 from firmware_protocols._numbers import LARGEST, int16
 from firmware_protocols._recent import MAX_SENSORS
 from firmware_protocols._sequence import count_byte
@@ -67,7 +78,7 @@ DOCS = Path(firmware_protocols.__file__).parent / "docs"
 
 def test_regexes_of_the_documentation_are_fast_and_read_numbers():
     (regex,) = re.findall(r"^regex = '(.+)'$", (DOCS / "text.md").read_text(encoding="utf-8"), re.MULTILINE)
-    decoder = text.Decoder(text.Pattern(regex=regex))
+    decoder = text.TextDecoder(text_pattern.Pattern(regex=regex))
     (sample,) = decoder.feed(b"IMU7 q=1,-0.0,+0,1e-3 a=.5,0,-9.81\r\n")
     assert (sample.sensor, sample.acc) == (7, (0.5, 0.0, -9.81))
     start = process_time()
@@ -80,9 +91,9 @@ def test_regexes_of_the_documentation_are_fast_and_read_numbers():
 
 
 def test_invented_can_ids_do_not_push_out_a_device():
-    decoder, got = witmotion.WitCanDecoder(), 0
+    decoder, got = witmotion_can.WitCanDecoder(), 0
     for i in range(200):
-        for frame in witmotion.encode_can(STILL._replace(sensor=0x50)):
+        for frame in witmotion_can.encode_can(STILL._replace(sensor=0x50)):
             got += len(decoder.feed(*frame))
         for other in range(50):
             decoder.feed(0x1000 + 50 * i + other, b"\x55\x51" + bytes(6), True)
@@ -91,7 +102,7 @@ def test_invented_can_ids_do_not_push_out_a_device():
 
 
 def test_invented_channels_do_not_push_out_a_device():
-    decoder, got = ximu3.Decoder(), 0
+    decoder, got = ximu3.Ximu3Decoder(), 0
     for i in range(200):
         got += len(decoder.feed(ximu3.encode(STILL._replace(sensor=65, time_us=10_000 * i))))
         for other in range(50):
@@ -107,7 +118,7 @@ def test_invented_channels_do_not_push_out_a_device():
 def test_invented_components_do_not_push_out_a_device():
     pytest.importorskip("pymavlink.dialects.v20.common")
     mavlink = __import__("firmware_protocols.mavlink", fromlist=["Encoder"])
-    real, others, decoder, got = mavlink.Encoder(), mavlink.Encoder(), mavlink.Decoder(), []
+    real, others, decoder, got = mavlink.Encoder(), mavlink.Encoder(), mavlink.MavlinkDecoder(), []
     for i in range(60):
         got += decoder.feed(real.encode(STILL._replace(sensor=1, time_us=10_000 * i)))
         for other in range(20):
@@ -130,13 +141,13 @@ LARGE = {
         hipnuc.encode(HUGE._replace(gyr=STILL.gyr, temperature=1.0))
     ),
     "hipnuc fields": lambda: hipnuc.HipnucDecoder().feed(hipnuc.encode_fields(HUGE)),
-    "native": lambda: native.Decoder().feed(
-        native.encode(native.Packet(0, 0, 0, *HUGE[2:6]), floats=True)
+    "native": lambda: native.NativeDecoder().feed(
+        native.encode(native_packet.Packet(0, 0, 0, *HUGE[2:6]), floats=True)
     ),
-    "text": lambda: text.Decoder(
-        text.Pattern(header="a,b,c", columns={"ax": "a", "ay": "b", "az": "c"})
+    "text": lambda: text.TextDecoder(
+        text_pattern.Pattern(header="a,b,c", columns={"ax": "a", "ay": "b", "az": "c"})
     ).feed(b"0,0,0\n1e30,0,0\n0,1e400,0\n"),
-    "ximu3": lambda: ximu3.Decoder().feed(
+    "ximu3": lambda: ximu3.Ximu3Decoder().feed(
         b"M,1,1e300,0,0\nT,1,1e300\n" + ximu3.encode(STILL)
     ),
 }  # fmt: skip
@@ -154,7 +165,9 @@ def test_the_smallest_numbers_are_numbers():
     tiny = STILL._replace(acc=(5e-324, -1e-310, 1e-45))
     (sample,) = xsens.XbusDecoder().feed(xsens.encode_mtdata2(tiny, 0, number_format="f64"))
     assert sample.acc == tiny.acc
-    (sample,) = native.Decoder().feed(native.encode(native.Packet(0, 0, 0, *tiny[2:5]), floats=True))
+    (sample,) = native.NativeDecoder().feed(
+        native.encode(native_packet.Packet(0, 0, 0, *tiny[2:5]), floats=True)
+    )
     assert sample.acc == (0.0, 0.0, pytest.approx(1e-45, abs=1e-45))
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_protocols.bno08x import FRAME_BYTES, ORDERS, Decoder, encode
+from firmware_protocols.bno08x import FRAME_BYTES, ORDERS, Bno08xDecoder, encode
 from firmware_protocols.rotation import rotate
 from firmware_protocols.sample import GRAVITY, Sample
 
@@ -44,7 +44,7 @@ def frame(index=0, angles=(0, 0, 0), acc=(0, 0, 1000)):
 def test_vector():
     vector = DATA["vectors"][0]
     assert frame(vector["index"], vector["raw"][:3], vector["raw"][3:]) == WIRE
-    (sample,) = Decoder().feed(WIRE)
+    (sample,) = Bno08xDecoder().feed(WIRE)
     assert sample.sensor == 0
     assert sample.time_us is sample.gyr is None
     assert sample.acc == pytest.approx([x * GRAVITY / 1000 for x in vector["raw"][3:]])
@@ -54,7 +54,7 @@ def test_vector():
 def test_gravity_of_the_vector_points_up_in_the_default_order_best():
     tilt = {}
     for order in ORDERS:
-        (sample,) = Decoder(order).feed(WIRE)
+        (sample,) = Bno08xDecoder(order).feed(WIRE)
         x, y, z = rotate(sample.quat, sample.acc)
         tilt[order] = math.degrees(math.atan2(math.hypot(x, y), z))
     assert tilt["zxy"] < 0.06
@@ -79,15 +79,15 @@ def test_gravity_of_the_vector_points_up_in_the_default_order_best():
     ],
 )
 def test_orders(order, angles, axis_in, axis_out, clockwise):
-    (sample,) = Decoder(order, clockwise).feed(frame(0, angles))
+    (sample,) = Bno08xDecoder(order, clockwise).feed(frame(0, angles))
     assert rotate(sample.quat, axis_in) == pytest.approx(axis_out, abs=1e-9)
 
 
 def test_sense_of_the_heading():
     for order in ORDERS:
-        (sample,) = Decoder(order).feed(frame(0, (9000, 0, 0)))
+        (sample,) = Bno08xDecoder(order).feed(frame(0, (9000, 0, 0)))
         assert rotate(sample.quat, (1, 0, 0)) == pytest.approx((0, -1, 0), abs=1e-9)
-        (sample,) = Decoder(order, clockwise=False).feed(frame(0, (9000, 0, 0)))
+        (sample,) = Bno08xDecoder(order, clockwise=False).feed(frame(0, (9000, 0, 0)))
         assert rotate(sample.quat, (1, 0, 0)) == pytest.approx((0, 1, 0), abs=1e-9)
 
 
@@ -95,7 +95,7 @@ def test_sense_of_the_heading():
 @settings(max_examples=150, deadline=None)
 def test_round_trip(seed, order, clockwise):
     (sample,) = stream(1, seed)
-    got = Decoder(order, clockwise).feed(encode(sample, seed, order=order, clockwise=clockwise))
+    got = Bno08xDecoder(order, clockwise).feed(encode(sample, seed, order=order, clockwise=clockwise))
     assert all_close(got, [sample])
 
 
@@ -104,7 +104,7 @@ def test_still_sensor_reads_gravity_upwards():
     for _ in range(100):
         w, x, y, z = quaternion(rng)
         acc = rotate((w, -x, -y, -z), (0.0, 0.0, GRAVITY))
-        (sample,) = Decoder().feed(encode(Sample(0, None, (w, x, y, z), acc), 0))
+        (sample,) = Bno08xDecoder().feed(encode(Sample(0, None, (w, x, y, z), acc), 0))
         assert rotate(sample.quat, sample.acc) == pytest.approx((0, 0, GRAVITY), abs=0.02)
 
 
@@ -113,14 +113,14 @@ def test_still_sensor_reads_gravity_upwards():
 def test_any_chunking_gives_the_same(in_pieces, sizes):
     data = b"\xaa\xaa\xaajunk" + b"".join(encode(s, i) for i, s in enumerate(stream(20))) + b"\xaa"
     data += b"%SW\r\n" + WIRE
-    got, _ = in_pieces(Decoder, data, sizes)
+    got, _ = in_pieces(Bno08xDecoder, data, sizes)
     assert len(got) == 21
 
 
 @given(st.lists(st.binary(max_size=80) | st.sampled_from([b"\xaa", b"\xaa\xaa", WIRE[:10], WIRE])))
 @settings(max_examples=200, deadline=None)
 def test_random_bytes_never_raise(chunks):
-    decoder = Decoder()
+    decoder = Bno08xDecoder()
     for chunk in chunks:
         for sample in decoder.feed(chunk):
             assert math.hypot(*sample.quat) == pytest.approx(1)
@@ -133,7 +133,7 @@ def test_header_inside_a_frame():
     frames = [frame(0xAA, (-0x5556 % 18000, 170, -17750), (-0x5556, -0x5556, -0x5556)) for _ in range(3)]
     assert all(f.count(b"\xaa\xaa") > 2 for f in frames)
     for start in range(FRAME_BYTES):
-        decoder = Decoder()
+        decoder = Bno08xDecoder()
         assert len(decoder.feed(b"".join(frames)[start:])) == 3 - (start > 0)
 
 
@@ -149,7 +149,7 @@ def test_flipped_bits_and_cuts_cost_only_what_they_touch():
         else:
             del piece[rng.randrange(FRAME_BYTES) :]
         pieces[i] = bytes(piece)
-    decoder = Decoder()
+    decoder = Bno08xDecoder()
     got = decoder.feed(b"".join(pieces))
     assert all_close(got, [s for i, s in enumerate(expected) if i not in touched])
     # Those behind the last good one cannot be missed.
@@ -158,7 +158,7 @@ def test_flipped_bits_and_cuts_cost_only_what_they_touch():
 
 
 def test_index_counts_losses_and_wraps():
-    decoder = Decoder()
+    decoder = Bno08xDecoder()
     for index in (250, 251, 255, 0, 1, 4):
         decoder.feed(frame(index))
     assert decoder.counters.lost == 3 + 2
@@ -168,14 +168,14 @@ def test_index_counts_losses_and_wraps():
 
 
 def test_greeting_is_a_restart():
-    decoder = Decoder()
+    decoder = Bno08xDecoder()
     decoder.feed(frame(100) + b"%Hillcrest Labs 10003608\r\n%SW Ver 3.2.13\r\n" + frame(0))
     assert decoder.counters.restarts == 1
     assert decoder.counters.lost == 0
 
 
 def test_impossible_angles_are_bad():
-    decoder = Decoder()
+    decoder = Bno08xDecoder()
     assert decoder.feed(frame(0, (18001, 0, 0)) + frame(0, (0, -18001, 0)) + frame(0, (0, 0, 32767))) == []
     assert decoder.counters.bad
 
@@ -190,7 +190,7 @@ def test_what_cannot_be_sent(sample):
 
 def test_settings_are_checked():
     with pytest.raises(ValueError, match="order must be one of"):
-        Decoder("xyz")
+        Bno08xDecoder("xyz")
     with pytest.raises(ValueError, match="order must be one of"):
         encode(Sample(0, None, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), 0, order="")
     with pytest.raises(ValueError, match="cannot send"):

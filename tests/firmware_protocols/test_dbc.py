@@ -9,8 +9,8 @@ import cantools
 import pytest
 
 import firmware_protocols
-from firmware_protocols.native import Packet
 from firmware_protocols.native_can import NativeCanDecoder, encode, encode_sync
+from firmware_protocols.native_packet import Packet
 from firmware_protocols.sample import unit_quaternion
 
 FOLDER = Path(firmware_protocols.__file__).parent / "dbc"

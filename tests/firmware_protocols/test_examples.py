@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 import firmware_protocols
-from firmware_protocols.native import Decoder, Info
+from firmware_protocols.native import NativeDecoder
 from firmware_protocols.native_can import NativeCanDecoder
+from firmware_protocols.native_packet import Info
 
 EXAMPLES = Path(firmware_protocols.__file__).parent / "examples"
 ARDUINO = Path(__file__).parent / "arduino"
@@ -48,7 +49,7 @@ def send_packets(cc, tmp_path_factory):
 
 def test_c_example(send_packets):
     done = subprocess.run([send_packets, "300"], capture_output=True, check=True)
-    decoder = Decoder()
+    decoder = NativeDecoder()
     samples = decoder.feed(done.stdout)
     good(samples, decoder.counters, range(6), 300)
     assert all(b.time_us - a.time_us == 10_000 for a, b in pairwise(samples[::6]))
@@ -87,7 +88,7 @@ def run_sketch(cxx, tmp_path):
 
 
 def test_sketch_with_made_up_data(run_sketch):
-    decoder = Decoder()
+    decoder = NativeDecoder()
     samples = decoder.feed(run_sketch(SENSOR_COUNT=6))
     good(samples, decoder.counters, range(6), 500)
     firmware = "edgepose_sketch 1 made-up data"
@@ -96,7 +97,7 @@ def test_sketch_with_made_up_data(run_sketch):
 
 
 def test_sketch_with_bno085(run_sketch):
-    decoder = Decoder()
+    decoder = NativeDecoder()
     samples = decoder.feed(run_sketch(SENSOR="SENSOR_BNO085", FIRST_ID=3))
     good(samples, decoder.counters, [3], 500)
     assert samples[-1].quat == (0.0, 1.0, 0.0, 0.0)

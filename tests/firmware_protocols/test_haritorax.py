@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_protocols.haritorax import MAX_LINE, SLOTS, Decoder, encode, encode_wired
+from firmware_protocols.haritorax import MAX_LINE, SLOTS, HaritoraxDecoder, encode, encode_wired
 from firmware_protocols.rotation import rotate
 from firmware_protocols.sample import GRAVITY, Sample
 
@@ -41,7 +41,7 @@ def close(a, b):
 
 
 def test_tracker():
-    (sample,) = Decoder().feed(TRACKER)
+    (sample,) = HaritoraxDecoder().feed(TRACKER)
     w, x, y, z = (value * 16383.4 for value in sample.quat)
     assert (x, y, z, w) == pytest.approx((3280, -8549, -274, 13583), abs=0.1)
     assert sample.acc == pytest.approx([v * GRAVITY / 2048 for v in (1950, 794, 853)])
@@ -50,14 +50,14 @@ def test_tracker():
 
 
 def test_leg_tracker_has_two_sensors():
-    samples = Decoder().feed(LEG)
+    samples = HaritoraxDecoder().feed(LEG)
     assert [sample.sensor for sample in samples] == [1, 1 + SLOTS]
     for sample in samples:
         assert rotate(sample.quat, sample.acc) == pytest.approx((0, 0, GRAVITY), abs=0.1)
 
 
 def test_wired_sensors_stand_upright():
-    samples = Decoder().feed(WIRED)
+    samples = HaritoraxDecoder().feed(WIRED)
     assert [sample.sensor for sample in samples] == list(range(6))
     up = [rotate(sample.quat, sample.acc) for sample in samples]
     for x, y, z in up:
@@ -69,21 +69,21 @@ def test_wired_sensors_stand_upright():
 @settings(max_examples=100, deadline=None)
 def test_round_trip(seed):
     samples = stream(6, seed)
-    one, wired = Decoder(), Decoder()
+    one, wired = HaritoraxDecoder(), HaritoraxDecoder()
     assert all(map(close, one.feed(b"".join(map(encode, samples))), samples))
     assert all(map(close, wired.feed(encode_wired(samples)), samples))
     assert one.counters.packets == wired.counters.packets == 6
 
 
 def test_captured_line_is_encoded_back():
-    assert encode(*Decoder().feed(TRACKER)) == TRACKER
+    assert encode(*HaritoraxDecoder().feed(TRACKER)) == TRACKER
 
 
 @given(st.lists(st.integers(1, 60), max_size=40))
 @settings(max_examples=50, deadline=None)
 def test_any_chunking_gives_the_same(sizes):
     data = b"\xffAA==\r\n" + TRACKER + b"a0:7F\n\n" + LEG.replace(b"\n", b"\r\n") + WIRED + TRACKER[:9]
-    whole, pieces = Decoder(), Decoder()
+    whole, pieces = HaritoraxDecoder(), HaritoraxDecoder()
     expected = whole.feed(data)
     got, at = [], 0
     for size in [*sizes, len(data)]:
@@ -96,7 +96,7 @@ def test_any_chunking_gives_the_same(sizes):
 
 
 def test_a_broken_line_without_its_end_costs_only_itself():
-    decoder = Decoder()
+    decoder = HaritoraxDecoder()
     assert len(decoder.feed(TRACKER[:-5] + TRACKER + b"X\0\n" + TRACKER)) == 2
     assert (decoder.counters.bad, decoder.counters.resyncs) == (2, 2)
 
@@ -125,7 +125,7 @@ def with_bytes(change):
     ],
 )
 def test_lines_that_cannot_be_true(line):
-    decoder = Decoder()
+    decoder = HaritoraxDecoder()
     assert decoder.feed(line) == []
     assert decoder.counters.bad == 1
     assert len(decoder.feed(TRACKER)) == 1
@@ -135,7 +135,7 @@ def test_lines_that_cannot_be_true(line):
 @given(st.lists(st.binary(max_size=80) | st.sampled_from([b"X", b":", b"\n", b"P:", TRACKER, WIRED[:99]])))
 @settings(max_examples=200, deadline=None)
 def test_random_bytes_never_raise(chunks):
-    decoder = Decoder()
+    decoder = HaritoraxDecoder()
     for chunk in chunks:
         for sample in decoder.feed(chunk):
             assert math.hypot(*sample.quat) == pytest.approx(1)

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_protocols import hipnuc
-from firmware_protocols.hipnuc import HipnucCanopenDecoder, HipnucDecoder, HipnucJ1939Decoder
+from firmware_protocols import hipnuc, hipnuc_can
+from firmware_protocols.hipnuc import HipnucDecoder
+from firmware_protocols.hipnuc_can import HipnucCanopenDecoder, HipnucJ1939Decoder
 from firmware_protocols.sample import GRAVITY, Counters, Sample
 
 VECTORS = json.loads((Path(__file__).parents[1] / "data" / "protocols" / "hipnuc.json").read_text())
@@ -340,8 +341,8 @@ def test_random_payloads_never_raise(parts):
 # --- CAN ------------------------------------------------------------------------------------------
 
 BUSES = {
-    "canopen": (HipnucCanopenDecoder, hipnuc.encode_canopen, ("acc", "gyr", "quat")),
-    "j1939": (HipnucJ1939Decoder, hipnuc.encode_j1939, ("acc", "gyr", "mag", "temperature", "quat")),
+    "canopen": (HipnucCanopenDecoder, hipnuc_can.encode_canopen, ("acc", "gyr", "quat")),
+    "j1939": (HipnucJ1939Decoder, hipnuc_can.encode_j1939, ("acc", "gyr", "mag", "temperature", "quat")),
 }
 
 
@@ -387,7 +388,7 @@ def test_slow_can_quantities():
     for i, sample in enumerate(sent):
         rare = {} if i % 10 == 5 else {"temperature": None}
         half = {} if i % 2 else {"mag": None}
-        frames += hipnuc.encode_j1939(sample._replace(**rare, **half))
+        frames += hipnuc_can.encode_j1939(sample._replace(**rare, **half))
     samples = run(decoder, frames)
     assert (len(samples), decoder.counters.lost) == (40, 0)
     assert [s.temperature is not None for s in samples].count(True) == 4
@@ -477,14 +478,14 @@ def test_j1939_layout():
 def test_can_fd_frames():
     sent = [s._replace(mag=None, temperature=None) for s in stream(4, sensor=3)]
     decoder = HipnucJ1939Decoder()
-    frames = [hipnuc.encode_j1939_fd(s, 254 + i) for i, s in enumerate(sent)]
+    frames = [hipnuc_can.encode_j1939_fd(s, 254 + i) for i, s in enumerate(sent)]
     assert {len(data) for _, data, _ in frames} == {64}
     same(run(decoder, frames[:1] + frames[2:]), sent[:1] + sent[2:])
     assert (decoder.counters.lost, decoder.counters.restarts) == (1, 0)
-    run(decoder, [hipnuc.encode_j1939_fd(sent[0], 200)])
+    run(decoder, [hipnuc_can.encode_j1939_fd(sent[0], 200)])
     assert decoder.counters.restarts == 1
     with pytest.raises(ValueError, match="too much"):
-        hipnuc.encode_j1939_fd(stream(1)[0])
+        hipnuc_can.encode_j1939_fd(stream(1)[0])
     can_id, data, _ = frames[0]
     assert decoder.feed(can_id, data[:48], True) == []
     assert decoder.feed(can_id, data[:6], True) == []

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_protocols import mavlink
-from firmware_protocols.mavlink import Decoder, Encoder
+from firmware_protocols.mavlink import Encoder, MavlinkDecoder
 from firmware_protocols.rotation import rotate
 from firmware_protocols.sample import GRAVITY, Sample, z_up
 
@@ -73,7 +73,7 @@ def packed(message, sysid=1, compid=5, seq=0, **options):
 
 @pytest.mark.parametrize("vector", DATA["vectors"], ids=lambda v: v["id"])
 def test_vectors(vector):
-    decoder = Decoder()
+    decoder = MavlinkDecoder()
     assert decoder.feed(bytes.fromhex(vector["hex"])) == []
     (sample,) = decoder.flush()
     assert sample.sensor == vector["sensor"]
@@ -93,7 +93,7 @@ def test_level_and_north():
     """Body axes of MAVLink are x forward, y right, z down: a level still one reads -1 g on z."""
     attitude = common.MAVLink_attitude_quaternion_message(1000, 1, 0, 0, 0, 0, 0, 0)
     reading = common.MAVLink_scaled_imu_message(1000, 0, 0, -1000, 0, 0, 0, 0, 0, 0)
-    decoder = Decoder()
+    decoder = MavlinkDecoder()
     (sample,) = decoder.feed(packed(reading) + packed(attitude, seq=1))
     assert rotate(sample.quat, sample.acc) == pytest.approx((0, 0, GRAVITY))
     assert rotate(sample.quat, (1.0, 0.0, 0.0)) == pytest.approx((0, 1, 0), abs=1e-9)
@@ -105,7 +105,7 @@ def test_level_and_north():
 def test_round_trip(highres):
     expected = stream(50, sensors=(SENSOR, 2 << 8 | 1, 1 << 8 | 6))
     encoder = Encoder(highres=highres)
-    decoder = Decoder()
+    decoder = MavlinkDecoder()
     got = decoder.feed(b"".join(map(encoder.encode, expected)))
     assert all_close(got, expected, 1e-4 if highres else 0.06)
     assert decoder.counters.packets == 150
@@ -122,7 +122,7 @@ def test_lost_messages_are_counted_and_never_mixed():
     ]
     rng = random.Random(4)
     touched = set(rng.sample(range(1, 599), 50))
-    decoder = Decoder()
+    decoder = MavlinkDecoder()
     got = decoder.feed(b"".join(p for i, p in enumerate(pieces) if i not in touched)) + decoder.flush()
     assert decoder.counters.lost == len(touched)
     by_time = {s.time_us: s for s in expected}
@@ -141,10 +141,10 @@ def test_times_need_not_be_equal():
     data = b""
     for sample, late in zip((a, b), shifted, strict=True):
         data += encoder.encode(late._replace(quat=None)) + encoder.encode(sample._replace(acc=None, gyr=None))
-    got = Decoder().feed(data)
+    got = MavlinkDecoder().feed(data)
     # Where both have a rate, that of the reading counts: the orientation's is 0 here.
     assert all_close(got, [a, b])
-    decoder = Decoder(tolerance_us=1000)
+    decoder = MavlinkDecoder(tolerance_us=1000)
     assert len(decoder.feed(data) + decoder.flush()) == 3
 
 
@@ -153,7 +153,7 @@ def test_one_of_several_readings():
         return common.MAVLink_highres_imu_message(1000, 0, 0, z, *[0] * 10, 63, number)
 
     data = packed(reading(0, -1)) + packed(reading(1, -2)) + packed(reading(0, -3))
-    decoder = Decoder(imu=1)
+    decoder = MavlinkDecoder(imu=1)
     assert [s.acc for s in decoder.feed(data) + decoder.flush()] == [(0, 0, -2)]
     assert decoder.counters.skipped == 2
 
@@ -161,7 +161,7 @@ def test_one_of_several_readings():
 def test_other_versions_messages_and_values():
     nan = math.nan
     attitude = common.MAVLink_attitude_quaternion_message(7, 1, 0, 0, 0, 0, 0, 0)
-    decoder = Decoder()
+    decoder = MavlinkDecoder()
     decoder.feed(packed(common.MAVLink_heartbeat_message(1, 1, 0, 0, 0, 3)))
     decoder.feed(packed(common.MAVLink_attitude_quaternion_message(5, nan, 0, 0, 0, 0, 0, 0)))
     decoder.feed(packed(common.MAVLink_attitude_quaternion_message(5, 0, 0, 0, 0, 0, 0, 0)))
@@ -171,7 +171,7 @@ def test_other_versions_messages_and_values():
     signing.signing.secret_key = bytes(32)
     signing.signing.sign_outgoing = True
     for wire in (packed(attitude, force_mavlink1=True), bytes(attitude.pack(signing))):
-        decoder = Decoder()
+        decoder = MavlinkDecoder()
         assert decoder.feed(wire + wire[:1]) + decoder.flush() == [
             Sample(SENSOR, 7000, z_up((1.0, 0.0, 0.0, 0.0)), None, (0, 0, 0))
         ]
@@ -183,7 +183,7 @@ def test_other_versions_messages_and_values():
 def test_any_chunking_gives_the_same(in_pieces, sizes):
     encoder = Encoder()
     data = b"\xfd\x05noise\xfe" + b"".join(map(encoder.encode, stream(8))) + b"\xfd\x00\x02" + bytes(300)
-    got, _ = in_pieces(Decoder, data, sizes)
+    got, _ = in_pieces(MavlinkDecoder, data, sizes)
     assert len(got) == 8
 
 
@@ -192,7 +192,7 @@ def test_any_chunking_gives_the_same(in_pieces, sizes):
 )
 @settings(max_examples=150, deadline=None)
 def test_random_bytes_never_raise(chunks):
-    decoder = Decoder()
+    decoder = MavlinkDecoder()
     for chunk in chunks:
         decoder.feed(chunk)
         assert len(decoder._rest) < 300
@@ -216,7 +216,7 @@ def test_flipped_bits_and_cuts_cost_only_what_they_touch():
             at = rng.randrange(1, len(piece))
             piece[at:at] = rng.randbytes(rng.randrange(1, 40))
         pieces[i] = bytes(piece)
-    decoder = Decoder()
+    decoder = MavlinkDecoder()
     # A cut at the end may leave a length that reaches beyond it.
     got = decoder.feed(b"".join(pieces) + bytes(300))
     whole = {s.time_us: s for s in got if s.quat is not None and s.acc is not None}
@@ -232,7 +232,7 @@ def test_sees_what_pymavlink_sees():
     data = b"".join(map(encoder.encode, stream(100)))
     parser = common.MAVLink(None)
     messages = parser.parse_buffer(data)
-    decoder = Decoder()
+    decoder = MavlinkDecoder()
     got = decoder.feed(data)
     turns = [m for m in messages if m.get_msgId() == 31]
     assert len(messages) == 2 * len(turns) == 2 * len(got) == 200
@@ -258,7 +258,7 @@ def test_what_cannot_be_sent(sample):
 
 def test_without_pymavlink(monkeypatch):
     monkeypatch.setitem(sys.modules, "pymavlink.dialects.v20.common", None)
-    for make in (Decoder, Encoder):
+    for make in (MavlinkDecoder, Encoder):
         with pytest.raises(RuntimeError, match=r"pip install \"edgepose\[mavlink\]\""):
             make()
-    assert mavlink.Decoder.WRAP_US == 1000 << 32
+    assert mavlink.MavlinkDecoder.WRAP_US == 1000 << 32

@@ -10,16 +10,9 @@ from cobs import cobs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_protocols import native
-from firmware_protocols.native import (
-    Decoder,
-    Info,
-    Packet,
-    decode_body,
-    encode,
-    encode_body,
-    encode_info,
-)
+from firmware_protocols import native, native_packet
+from firmware_protocols.native import NativeDecoder, encode, encode_info
+from firmware_protocols.native_packet import Info, Packet, decode_body, encode_body
 from firmware_protocols.sample import Counters, Sample
 
 VECTOR = Packet(3, 0x0102, 1_000_000, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 9.81), (0.0, 0.0, 0.0))
@@ -59,7 +52,7 @@ INFOS = st.builds(
     st.integers(0, 255),
     st.text(st.characters(min_codepoint=0x20, max_codepoint=0x7E), max_size=32),
     st.none() | st.integers(0, 23),
-    st.sampled_from(native.FRAMES),
+    st.sampled_from(native_packet.FRAMES),
     st.integers(0, 65535).map(lambda n: n / 10),
 )
 
@@ -87,7 +80,7 @@ def stream(n, sensors=1, period_us=10_000):
 
 
 def decode(data):
-    decoder = Decoder()
+    decoder = NativeDecoder()
     return decoder.feed(data), decoder.counters
 
 
@@ -123,7 +116,7 @@ def test_layout_of_every_block():
         "<BBHHIh4f3f3f3fBB", 0x11, 9, 0x3F0, 1, 2, 3660, 0, 1, 0, 0, 1, 2, 3, 1, -1, 2, 10, 20, -30, 87, 0xA5
     )  # fmt: skip
     assert encode_body(packet, floats=True) == floats
-    assert len(floats) == native.MAX_BODY
+    assert len(floats) == native_packet.MAX_BODY
     assert decode_body(head + fixed) == decode_body(floats) == packet
 
 
@@ -142,7 +135,7 @@ def test_round_trip(packet, floats):
         0.005 + 1e-9,
     )
     assert back.battery == packet.battery
-    decoder = Decoder()
+    decoder = NativeDecoder()
     expected = [] if packet[3:8] == (None,) * 5 else [sample(back)]
     assert decoder.feed(encode(packet, floats=floats)) == expected
     assert (decoder.counters.packets, decoder.counters.skipped) == ((1, 0) if expected else (0, 1))
@@ -152,7 +145,7 @@ def test_round_trip(packet, floats):
 @given(INFOS)
 @settings(max_examples=80, deadline=None)
 def test_info_round_trip(info):
-    decoder = Decoder()
+    decoder = NativeDecoder()
     assert decoder.feed(encode_info(info)) == []
     assert decoder.infos == {info.sensor_id: info}
     assert (decoder.counters.packets, decoder.counters.skipped) == (0, 1)
@@ -160,7 +153,10 @@ def test_info_round_trip(info):
 
 def test_info_layout():
     info = Info(3, "edgepose-esp32 1.2", 18, "ENU", 100.0)
-    assert native.encode_info_body(info) == bytes([0x12, 3, 18, 1, 0xE8, 0x03, 18]) + b"edgepose-esp32 1.2"
+    assert (
+        native_packet.encode_info_body(info)
+        == bytes([0x12, 3, 18, 1, 0xE8, 0x03, 18]) + b"edgepose-esp32 1.2"
+    )
 
 
 @pytest.mark.parametrize(
@@ -286,7 +282,7 @@ def test_quaternion_is_normalised():
 
 
 def test_packet_with_nothing_for_a_sample():
-    decoder = Decoder()
+    decoder = NativeDecoder()
     assert decoder.feed(framed(head(0)) + encode(Packet(1, 7, 8, battery=(60, 1)))) == []
     assert decoder.batteries == {1: (60, 1)}
     assert (decoder.counters.skipped, decoder.counters.lost) == (2, 1)
@@ -313,9 +309,9 @@ def test_any_chunking(seed):
                     b"y" * 200,
                 ]
             )
-    whole = Decoder()
+    whole = NativeDecoder()
     expected = whole.feed(data)
-    pieces = Decoder()
+    pieces = NativeDecoder()
     packets, start = [], 0
     while start < len(data):
         size = rng.choice([1, 2, 7, 64, 200])
@@ -368,7 +364,7 @@ def test_every_truncation_costs_one_packet():
 @pytest.mark.parametrize("size", [1, 50, 10_000])
 def test_longest_packet_after_noise(noise, size):
     data = random.Random(noise).randbytes(noise).replace(b"\0", b"\1") + encode(LONGEST, floats=True)
-    decoder, packets = Decoder(), []
+    decoder, packets = NativeDecoder(), []
     for start in range(0, len(data), size):
         packets += decoder.feed(data[start : start + size])
     assert [p.sensor for p in packets] == [LONGEST.sensor_id]
@@ -384,7 +380,7 @@ def test_start_in_the_middle_and_unfinished_end():
 
 
 def test_oversize_frame_is_dropped_without_growing():
-    decoder = Decoder()
+    decoder = NativeDecoder()
     for _ in range(1000):
         assert decoder.feed(b"\x55" * 1000) == []
         assert len(decoder._rest) <= native.MAX_FRAME + 1
@@ -401,7 +397,7 @@ def test_longest_frame_is_accepted():
 @given(st.lists(st.binary(max_size=120), max_size=8))
 @settings(max_examples=150, deadline=None)
 def test_random_bytes_never_raise(chunks):
-    decoder = Decoder()
+    decoder = NativeDecoder()
     for chunk in chunks:
         decoder.feed(chunk)
     assert decoder.counters.bytes == sum(map(len, chunks))
@@ -414,8 +410,8 @@ def test_random_bodies_with_good_checksums_never_raise(body, kind):
 
 
 def test_accepts_every_bytes_like():
-    assert Decoder().feed(bytearray(WIRE)) == [sample(VECTOR)]
-    assert Decoder().feed(memoryview(WIRE)) == [sample(VECTOR)]
+    assert NativeDecoder().feed(bytearray(WIRE)) == [sample(VECTOR)]
+    assert NativeDecoder().feed(memoryview(WIRE)) == [sample(VECTOR)]
 
 
 # --- sequences ------------------------------------------------------------------------------------
@@ -423,7 +419,7 @@ def test_accepts_every_bytes_like():
 
 def run(*seq_and_time, sensor=0):
     """Counters after packets at (seq, seconds), and the sequence numbers that came out."""
-    decoder = Decoder()
+    decoder = NativeDecoder()
     out = []
     for seq, t in seq_and_time:
         seq &= 0xFFFF

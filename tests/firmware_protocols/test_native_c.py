@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from firmware_protocols import native, native_can
-from firmware_protocols.native import Decoder, Info, Packet
+from firmware_protocols import native, native_can, native_packet
+from firmware_protocols.native import NativeDecoder
+from firmware_protocols.native_packet import Info, Packet
 
 SOURCE = Path(__file__).parent / "packet_encoder.c"
 FLT_MAX = 3.4028234663852886e38
@@ -93,7 +94,7 @@ def request(packet, floats, extra_mask=0):
 def info_request(info):
     segment = 255 if info.segment is None else info.segment
     return (
-        f"I {info.sensor_id} {segment} {native.FRAMES.index(info.frame)} "
+        f"I {info.sensor_id} {segment} {native_packet.FRAMES.index(info.frame)} "
         f"{round(info.rate_hz * 10)} {info.firmware.encode().hex() or '-'}"
     )
 
@@ -126,7 +127,7 @@ def test_ties_go_away_from_zero(program):
         (0.25, -0.25, 0.75),
         -0.125,
     )
-    body = native.encode_body(packet)
+    body = native_packet.encode_body(packet)
     assert struct.unpack("<14h", body[10:]) == (
         *(16384, -16384, 16384, -16384), *(13, -13, 38), *(113, -113, 0), *(3, -3, 8), -13
     )  # fmt: skip
@@ -145,7 +146,7 @@ def test_saturates(program):
         327.675,
         (200, 255),
     )
-    assert struct.unpack("<11hBB", native.encode_body(packet)[10:]) == (
+    assert struct.unpack("<11hBB", native_packet.encode_body(packet)[10:]) == (
         *(32767, -32768, 32767, -32767), *(32767, -32768, 32767), *(32767, -32768, -32768), 32767, 100, 255
     )  # fmt: skip
     assert ask(program, [request(packet, False)]) == [native.encode(packet).hex()]
@@ -167,12 +168,12 @@ def test_info_equals_python(program):
     infos = [Info(255, ""), Info(0, "~" * 32, 23, "Z-up", 6553.5)]
     for _ in range(100):
         text = "".join(chr(rng.randrange(0x20, 0x7F)) for _ in range(rng.randrange(33)))
-        frame, segment = rng.choice(native.FRAMES), rng.choice([None, *range(24)])
+        frame, segment = rng.choice(native_packet.FRAMES), rng.choice([None, *range(24)])
         infos.append(Info(rng.randrange(256), text, segment, frame, rng.randrange(65536) / 10))
     requests = [info_request(i) for i in infos]
     answers = ask(program, requests)
     assert answers == [native.encode_info(i).hex() for i in infos]
-    decoder = Decoder()
+    decoder = NativeDecoder()
     for info, answer in zip(infos, answers, strict=True):
         decoder.feed(bytes.fromhex(answer))
         assert decoder.infos[info.sensor_id] == info
@@ -247,7 +248,7 @@ def test_can_fd_equals_python(program, cases):
     answers = ask(program, ["F" + request(p, floats)[1:] for p, floats in cases])
     too_long = 0
     for (packet, floats), answer in zip(cases, answers, strict=True):
-        if len(native.encode_body(packet, floats=floats)) > 64:
+        if len(native_packet.encode_body(packet, floats=floats)) > 64:
             too_long += 1
             assert answer == ""
         else:

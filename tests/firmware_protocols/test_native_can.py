@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_protocols import native_can
-from firmware_protocols.native import Info, Packet, encode_body
 from firmware_protocols.native_can import NativeCanDecoder, can_id, encode, encode_fd, encode_sync
+from firmware_protocols.native_packet import Info, Packet, encode_body
 from firmware_protocols.sample import Counters, Sample
 
 LEVEL = Packet(3, 0x0102, 1_000_000, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 9.81), (0.0, 0.0, 0.0))

@@ -33,7 +33,7 @@ import pytest
 import witmotion.protocol
 
 import firmware_protocols
-from firmware_protocols import bno08x, mip, xsens
+from firmware_protocols import bno08x, mip, xsens_can
 from firmware_protocols.sample import GRAVITY, Sample, z_up
 from firmware_protocols.witmotion import WitDecoder
 
@@ -149,7 +149,7 @@ def test_bno08x():
         if i % 10 == 0:
             body[rng.randrange(17)] ^= 1 << rng.randrange(8)
         theirs = parse(bytes(body))
-        ours = bno08x.Decoder().feed(b"\xaa\xaa" + body)
+        ours = bno08x.Bno08xDecoder().feed(b"\xaa\xaa" + body)
         assert (theirs is None) == (i % 10 == 0) == (not ours)
         if theirs is None:
             continue
@@ -288,12 +288,12 @@ if HAS_MSCL:
 def test_mti600_by_its_dbc():
     """What our encoder sends is what the DBC file says, and our decoder reads what cantools encodes by it."""
     database = cantools.database.load_file(DBC)
-    ours, by_dbc = xsens.Mti600CanDecoder(), xsens.Mti600CanDecoder()
+    ours, by_dbc = xsens_can.Mti600CanDecoder(), xsens_can.Mti600CanDecoder()
     steps = {"quat": 1 / 32767, "gyr": 2**-9, "acc": 2**-8, "mag": 2**-10, "temperature": 2**-8}
     got, again = [], []
     samples = [sample._replace(mag=tuple(x / 40 for x in sample.mag)) for sample in random_samples(6)]
     for count, sample in enumerate(samples):
-        for can_id, data in xsens.encode_mti600(sample, count):
+        for can_id, data in xsens_can.encode_mti600(sample, count):
             message = database.get_message_by_frame_id(can_id)
             signals = message.decode(data)
             if "time" in signals:

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from firmware_protocols import text
 from firmware_protocols.rotation import rotate
 from firmware_protocols.sample import GRAVITY, Sample
-from firmware_protocols.text import PATTERNS, Decoder, Pattern, encode, encode_header, pattern_from_table
+from firmware_protocols.text import TextDecoder, encode, encode_header
+from firmware_protocols.text_pattern import PATTERNS, Pattern, pattern_from_table
 
 try:
     import tomllib
@@ -61,7 +62,7 @@ def same(a, b, tolerance=2e-4):
 
 @pytest.mark.parametrize("vector", DATA["vectors"], ids=lambda v: v["id"])
 def test_vectors(vector):
-    decoder = Decoder(vector["pattern"])
+    decoder = TextDecoder(vector["pattern"])
     (sample,) = decoder.feed(vector["lines"].encode())
     assert sample.time_us == vector.get("time_us")
     if "quat" in vector:
@@ -87,7 +88,7 @@ def test_vectors(vector):
 @pytest.mark.parametrize("name", PATTERNS)
 def test_round_trip(name):
     expected = stream(50)
-    decoder = Decoder(name)
+    decoder = TextDecoder(name)
     got = decoder.feed(encode_header(name) + b"".join(encode(s, name) for s in expected))
     assert len(got) == 50
     for a, b in zip(got, expected, strict=True):
@@ -103,7 +104,7 @@ def test_round_trip(name):
 
 def test_still_sensor_reads_gravity_upwards():
     rng = random.Random(2)
-    decoder = Decoder("artemis-dmp")
+    decoder = TextDecoder("artemis-dmp")
     decoder.feed(encode_header("artemis-dmp"))
     for _ in range(50):
         w, x, y, z = quaternion(rng)
@@ -121,7 +122,7 @@ def test_pattern_of_a_toml_file():
         units = { acc = "-g", time = "ms" }
         """  # noqa: E501
     )
-    decoder = Decoder(pattern_from_table(table))
+    decoder = TextDecoder(pattern_from_table(table))
     assert decoder.WRAP_US == 1000 << 32
     a, b = decoder.feed(b"IMU3 t=1500 q=0 0 0 1 a=0 0 1\nIMU4 t=4294967296 q=1 0 0 0 a=1 0 0 T=20.5\n")
     assert a[:2] == (3, 1_500_000)
@@ -151,7 +152,7 @@ def test_columns_of_a_toml_file():
         az = "az"
         """
     )
-    decoder = Decoder(pattern_from_table(table))
+    decoder = TextDecoder(pattern_from_table(table))
     got = decoder.feed(b".5;0;1;0;0;0;1;2;3\n2.25;7;1;0;0;0;0;0;981\n")
     # The first line may have lost its beginning.
     assert got == [Sample(7, 2_250_000, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 981 * 0.01))]
@@ -159,7 +160,7 @@ def test_columns_of_a_toml_file():
 
 
 def test_header_says_where_the_columns_are():
-    decoder = Decoder("artemis-dmp")
+    decoder = TextDecoder("artemis-dmp")
     assert decoder.feed(b"0.1,0.2,0.3\n01/01/2026,00:00:00.00,0,0,0\n") == []
     assert decoder.counters.skipped == 2
     decoder.feed(b"Q6_3,x,Q6_1,Q6_2,\r\n")
@@ -187,7 +188,7 @@ def test_time(unit, value, expected):
     pattern = Pattern(
         columns={"time": "t", "ax": "a", "ay": "b", "az": "c"}, units={"time": unit}, header="t,a,b,c"
     )
-    assert Decoder(pattern).feed(f"\nfirst\n{value},0,0,1\n".encode())[0].time_us == expected
+    assert TextDecoder(pattern).feed(f"\nfirst\n{value},0,0,1\n".encode())[0].time_us == expected
 
 
 # --- the line -------------------------------------------------------------------------------------
@@ -205,7 +206,7 @@ ADAFRUIT = b"Quaternion: 1.0000, 0.0000, 0.0000, 0.0000\r\n"
     ],
 )
 def test_what_cannot_be_true_is_bad(line):
-    decoder = Decoder("adafruit")
+    decoder = TextDecoder("adafruit")
     assert len(decoder.feed(line + b"\n" + ADAFRUIT)) == 1
     assert decoder.counters.bad == decoder.counters.resyncs == 1
 
@@ -213,7 +214,7 @@ def test_what_cannot_be_true_is_bad(line):
 @pytest.mark.parametrize("word", ["nan", "inf", "1_0", "", "x", "1e999"])
 def test_words_that_are_no_numbers(word):
     pattern = Pattern(columns={"ax": "a", "ay": "b", "az": "c"}, header="a,b,c,d")
-    decoder = Decoder(pattern)
+    decoder = TextDecoder(pattern)
     assert decoder.feed(f"\nfirst\n{word},0,0,1\n1,2,3,4\n".encode()) == [Sample(0, acc=(1.0, 2.0, 3.0))]
     assert decoder.counters.bad == 1
 
@@ -221,13 +222,13 @@ def test_words_that_are_no_numbers(word):
 @pytest.mark.parametrize("word", ["", "1:2", "a:b:c", "-1:00:00", "1:2:nan", "1:2:inf", "1_0:0:0"])
 def test_words_that_are_no_clock(word):
     pattern = replace(PATTERNS["artemis"], header="rtcTime,aX,aY,aZ")
-    decoder = Decoder(pattern)
+    decoder = TextDecoder(pattern)
     assert decoder.feed(f"first\n{word},0,0,1\n".encode()) == []
     assert decoder.counters.bad == 1
 
 
 def test_a_lost_line_end_costs_one_line_only():
-    decoder = Decoder("adafruit")
+    decoder = TextDecoder("adafruit")
     got = decoder.feed(ADAFRUIT + ADAFRUIT[:20] + ADAFRUIT + ADAFRUIT)
     assert len(got) == 3
     assert decoder.counters.bad == 0
@@ -245,10 +246,10 @@ def test_cuts_cost_only_what_they_touch():
                 bytes(rng.choice(b"\x00\x80\xff") if rng.random() < 0.5 else b for b in pieces[i][:-2])
                 + b"\r\n"
             )
-        clean = Decoder(name).feed(
+        clean = TextDecoder(name).feed(
             encode_header(name) + b"".join(p for i, p in enumerate(pieces) if i not in touched)
         )
-        decoder = Decoder(name)
+        decoder = TextDecoder(name)
         got = decoder.feed(encode_header(name) + b"".join(pieces))
         assert got == clean
         assert len(got) == 240
@@ -265,7 +266,7 @@ def test_any_chunking_gives_the_same(in_pieces, sizes, name):
         + encode(stream(1)[0], name)
         + b"1"
     )
-    got, _ = in_pieces(lambda: Decoder(name), data, sizes)
+    got, _ = in_pieces(lambda: TextDecoder(name), data, sizes)
     assert len(got) == 9
 
 
@@ -275,7 +276,7 @@ def test_any_chunking_gives_the_same(in_pieces, sizes, name):
 )
 @settings(max_examples=200, deadline=None)
 def test_random_bytes_never_raise(name, chunks):
-    decoder = Decoder(name)
+    decoder = TextDecoder(name)
     decoder.feed(encode_header(name))
     before = decoder.counters.bytes
     for chunk in chunks:
@@ -331,7 +332,7 @@ def test_patterns_are_checked(table, words):
 
 def test_names_are_checked():
     with pytest.raises(ValueError, match="pattern must be one of"):
-        Decoder("csv")
+        TextDecoder("csv")
     with pytest.raises(ValueError, match="pattern must be one of"):
         encode(Sample(0), "csv")
     with pytest.raises(ValueError, match="have an orientation"):

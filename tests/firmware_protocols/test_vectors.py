@@ -16,15 +16,18 @@ from firmware_protocols import (
     bno08x,
     haritorax,
     hipnuc,
+    hipnuc_can,
     j1939,
     lpms,
     mip,
     native,
+    native_packet,
     rotation,
     vectornav,
     witmotion,
     ximu3,
     xsens,
+    xsens_can,
 )
 from firmware_protocols.sample import GRAVITY, Sample, z_up
 
@@ -78,7 +81,7 @@ def read_hipnuc(wire, vector):
 
 
 def read_hipnuc_canopen(wire, vector):
-    decoder, can_id = hipnuc.HipnucCanopenDecoder(), int(vector["expect"]["can_id"], 16)
+    decoder, can_id = hipnuc_can.HipnucCanopenDecoder(), int(vector["expect"]["can_id"], 16)
     node = can_id & 0x7F
     frames = dict.fromkeys((0x180 + node, 0x280 + node), bytes(6)) | {can_id: wire}
     for other, data in frames.items():
@@ -115,7 +118,7 @@ def read_witmotion(wire, vector):
 
 
 def read_bno08x_rvc(wire, vector):
-    (sample,) = bno08x.Decoder().feed(wire)
+    (sample,) = bno08x.Bno08xDecoder().feed(wire)
     (index,) = [i for i in range(256) if bno08x.encode(sample, i) == wire]
     angles = struct.unpack_from("<3h", bno08x.encode(sample, index), 3)
     return {"index": index, "raw": [*angles, *scaled(sample.acc, GRAVITY / 1000)]}
@@ -147,14 +150,14 @@ def read_lpbus(wire, vector):
 
 
 def read_ximu3(wire, vector):
-    decoder = ximu3.Decoder()
+    decoder = ximu3.Ximu3Decoder()
     assert decoder.feed(wire) == []
     (sample,) = decoder.flush()
     return {"id": chr(wire[0] & 0x7F), "t_us": sample.time_us, "quat_wxyz": sample.quat}
 
 
 def read_haritorax(wire, vector):
-    (sample,) = haritorax.Decoder().feed(wire + b"\n")
+    (sample,) = haritorax.HaritoraxDecoder().feed(wire + b"\n")
     w, x, y, z = (value * vector["expect"]["norm"] for value in sample.quat)
     return {
         "qxyzw_raw": [round(value) for value in (x, y, z, w)],
@@ -164,19 +167,19 @@ def read_haritorax(wire, vector):
 
 
 def read_native(wire, vector):
-    (sample,) = native.Decoder().feed(wire)
+    (sample,) = native.NativeDecoder().feed(wire)
     body = native.cobs_decode(wire[:-1])[:-2]
     return {
         "header": list(struct.unpack_from("<BBHHI", body)),
-        "quat": scaled(sample.quat, 1 / native.QUAT_SCALE),
-        "acc": scaled(sample.acc, 1 / native.ACC_SCALE),
-        "gyr": scaled(sample.gyr, 1 / native.GYR_SCALE),
+        "quat": scaled(sample.quat, 1 / native_packet.QUAT_SCALE),
+        "acc": scaled(sample.acc, 1 / native_packet.ACC_SCALE),
+        "gyr": scaled(sample.gyr, 1 / native_packet.GYR_SCALE),
     }
 
 
 def read_xsens_can(wire, vector):
     can_id = int(vector["expect"]["can_id"], 16)
-    decoder = xsens.Mti600CanDecoder()
+    decoder = xsens_can.Mti600CanDecoder()
     # The first messages only show which there are.
     samples = [sample for _ in range(4) for sample in decoder.feed(can_id, wire)]
     (value,) = [v for v in (samples[0].quat, samples[0].acc, samples[0].gyr) if v is not None]

@@ -9,9 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_protocols import witmotion
+from firmware_protocols import witmotion, witmotion_can, witmotion_modbus
 from firmware_protocols.sample import GRAVITY, Counters, Sample
-from firmware_protocols.witmotion import WitCanDecoder, WitDecoder, WitModbusDecoder
+from firmware_protocols.witmotion import WitDecoder
+from firmware_protocols.witmotion_can import WitCanDecoder
+from firmware_protocols.witmotion_modbus import WitModbusDecoder
 
 VECTORS = {
     v["id"]: v
@@ -88,11 +90,11 @@ def test_serial_vectors():
 def test_poll_vector():
     vector = VECTORS["wit_poll"]
     expected = vector["expect"]
-    assert witmotion.poll(**expected).hex() == vector["hex"]
-    assert witmotion.crc16(b"123456789") == 0x4B37
+    assert witmotion_modbus.poll(**expected).hex() == vector["hex"]
+    assert witmotion_modbus.crc16(b"123456789") == 0x4B37
     for wrong in ((0, 0x34, 12), (248, 0x34, 12), (1, -1, 12), (1, 0x34, 0), (1, 0x34, 126)):
         with pytest.raises(ValueError, match="cannot ask"):
-            witmotion.poll(*wrong)
+            witmotion_modbus.poll(*wrong)
 
 
 # --- serial ---------------------------------------------------------------------------------------
@@ -277,8 +279,8 @@ def test_modbus_round_trip(count, echo):
     decoder, samples = WitModbusDecoder(count=count), []
     for sample in sent:
         if echo:
-            samples += decoder.feed(witmotion.poll(sample.sensor, count=count))
-        samples += decoder.feed(witmotion.encode_modbus(sample, count=count))
+            samples += decoder.feed(witmotion_modbus.poll(sample.sensor, count=count))
+        samples += decoder.feed(witmotion_modbus.encode_modbus(sample, count=count))
     same(samples, sent)
     assert (decoder.counters.packets, decoder.counters.bad) == (9, 0)
     assert decoder.counters.skipped == 9 * echo
@@ -287,15 +289,15 @@ def test_modbus_round_trip(count, echo):
 def test_modbus_refusal_is_skipped():
     decoder = WitModbusDecoder()
     head = bytes([0x50, 0x83, 2])
-    refusal = head + witmotion.crc16(head).to_bytes(2, "little")
-    answer = witmotion.encode_modbus(stream(1, sensor=0x50)[0])
+    refusal = head + witmotion_modbus.crc16(head).to_bytes(2, "little")
+    answer = witmotion_modbus.encode_modbus(stream(1, sensor=0x50)[0])
     assert len(decoder.feed(refusal + answer)) == 1
     assert (decoder.counters.skipped, decoder.counters.bad) == (1, 0)
 
 
 def test_modbus_bad_line():
     sent = [s._replace(time_us=None, temperature=None) for s in stream(3, sensor=0x50)]
-    first, good, third = map(witmotion.encode_modbus, sent)
+    first, good, third = map(witmotion_modbus.encode_modbus, sent)
     broken = [good[:i] for i in range(1, len(good))] + [good[i:] for i in range(1, len(good))]
     for bit in range(8 * len(good)):
         flipped = bytearray(good)
@@ -312,8 +314,10 @@ def test_modbus_refuses():
     with pytest.raises(ValueError, match="count"):
         WitModbusDecoder(count=13)
     with pytest.raises(ValueError, match="needs"):
-        witmotion.encode_modbus(Sample(0x50))
-    zero = witmotion.encode_modbus(stream(1, sensor=1)[0]._replace(quat=(0.0, 0.0, 0.0, 0.0)), count=33)
+        witmotion_modbus.encode_modbus(Sample(0x50))
+    zero = witmotion_modbus.encode_modbus(
+        stream(1, sensor=1)[0]._replace(quat=(0.0, 0.0, 0.0, 0.0)), count=33
+    )
     decoder = WitModbusDecoder(count=33)
     assert decoder.feed(zero) == []
     assert decoder.counters.bad == 1
@@ -328,7 +332,7 @@ def test_can_round_trip_of_several_devices(fine):
     sent = {d: [s._replace(time_us=None, temperature=None) for s in stream(10, sensor=d)] for d in devices}
     decoder, got = WitCanDecoder(fine_angles=fine), []
     for i in range(10):
-        cycles = [witmotion.encode_can(sent[d][i], fine_angles=fine) for d in devices]
+        cycles = [witmotion_can.encode_can(sent[d][i], fine_angles=fine) for d in devices]
         for frames in zip(*cycles, strict=True):
             for frame in frames:
                 got += decoder.feed(*frame)
@@ -340,7 +344,7 @@ def test_can_round_trip_of_several_devices(fine):
 @pytest.mark.parametrize("fine", [False, True])
 def test_lost_can_frames_never_mix_cycles(fine):
     sent = [s._replace(time_us=None, temperature=None) for s in stream(8, sensor=0x50)]
-    frames = [f for s in sent for f in witmotion.encode_can(s, fine_angles=fine)]
+    frames = [f for s in sent for f in witmotion_can.encode_can(s, fine_angles=fine)]
     size = len(frames) // 8
     for start in range(2 * size, 3 * size):
         for count in range(1, size):

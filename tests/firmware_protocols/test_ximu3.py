@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from firmware_protocols import ximu3
 from firmware_protocols.rotation import rotate
 from firmware_protocols.sample import GRAVITY, Sample, z_up
-from firmware_protocols.ximu3 import Decoder, encode, encode_message
+from firmware_protocols.ximu3 import Ximu3Decoder, encode, encode_message
 
 DATA = json.loads((Path(__file__).parents[1] / "data/protocols/ximu3.json").read_text(encoding="utf-8"))
 STILL = ((0.0, 0.0, GRAVITY), (0.0, 0.0, 0.0))
@@ -41,7 +41,7 @@ def stream(n, sensors=(0,), period_us=10_000, seed=1):
 
 
 def decode(data, **options):
-    decoder = Decoder(**options)
+    decoder = Ximu3Decoder(**options)
     return decoder.feed(data) + decoder.flush()
 
 
@@ -71,7 +71,7 @@ def all_close(a, b, tolerance=1e-4):
 
 @pytest.mark.parametrize("vector", DATA["vectors"], ids=lambda v: v["id"])
 def test_vectors(vector):
-    decoder = Decoder()
+    decoder = Ximu3Decoder()
     assert decoder.feed(bytes.fromhex(vector["hex"])) == []
     (sample,) = decoder.flush()
     assert sample.sensor == 0
@@ -97,7 +97,7 @@ def test_encoder_gives_the_vectors(vector):
 def test_gravity_points_up_in_recordings(recorded):
     wire = encode_message("I", recorded["time_us"], recorded["inertial"])
     wire += encode_message("Q", recorded["time_us"], recorded["quaternion"])
-    (sample,) = Decoder().feed(wire)
+    (sample,) = Ximu3Decoder().feed(wire)
     x, y, z = rotate(sample.quat, sample.acc)
     assert math.degrees(math.atan2(math.hypot(x, y), z)) < 1
     assert z == pytest.approx(GRAVITY, abs=0.05)
@@ -138,7 +138,7 @@ def test_linear_and_earth_acceleration_with_orientation(frame):
 
 
 def test_other_messages_are_skipped_and_counted():
-    decoder = Decoder()
+    decoder = Ximu3Decoder()
     lines = [
         b"N,1000000,Hello\r\n",
         b"B,1000000,100.0000,4.2000,2.0000\r\n",
@@ -175,7 +175,7 @@ def test_other_messages_are_skipped_and_counted():
     ],
 )
 def test_what_cannot_be_true_is_bad(line):
-    decoder = Decoder()
+    decoder = Ximu3Decoder()
     assert decoder.feed(line + b"\n") + decoder.flush() == []
     assert decoder.counters.bad == 1
 
@@ -188,7 +188,7 @@ def test_orientation_and_reading_of_one_instant_are_one_sample():
     inertial = encode(expected._replace(quat=None))
     turn = encode(expected._replace(acc=None, gyr=None))
     for wire in (inertial + turn, turn + inertial):
-        assert all_close(Decoder().feed(wire), [expected])
+        assert all_close(Ximu3Decoder().feed(wire), [expected])
 
 
 def test_a_lost_message_never_mixes_two_instants():
@@ -209,7 +209,7 @@ def test_second_form_of_an_orientation_is_skipped():
     turn = encode_message("Q", 10, q)
     linear = encode_message("L", 10, (*q, 0, 0, 0))
     for parts in ((inertial, turn, linear), (turn, linear, inertial), (linear, turn, inertial)):
-        decoder = Decoder()
+        decoder = Ximu3Decoder()
         assert all_close(decoder.feed(b"".join(parts)) + decoder.flush(), [Sample(0, 10, q, *STILL)])
         assert decoder.counters.skipped == 1
 
@@ -227,14 +227,14 @@ def test_channels_are_sensors():
     expected = stream(20, sensors=(0, ord("A"), ord("B"), ord("A") << 8 | ord("C")))
     rng = random.Random(5)
     pieces = [encode(s, ascii=rng.random() < 0.5) for s in expected]
-    assert all_close(Decoder().feed(b"".join(pieces)), expected, 2e-3)
+    assert all_close(Ximu3Decoder().feed(b"".join(pieces)), expected, 2e-3)
     assert b"^A^CI," in encode(expected[3], ascii=True)
 
 
 def test_restart_needs_two_messages():
     before, after = stream(5), [s._replace(time_us=s.time_us - 4_900_000) for s in stream(5)]
     before = [s._replace(time_us=s.time_us + 60_000_000) for s in before]
-    decoder = Decoder()
+    decoder = Ximu3Decoder()
     got = decoder.feed(b"".join(map(encode, before + after))) + decoder.flush()
     # The first reading of the new clock is given up, its orientation comes out alone.
     assert all_close(got, [*before, after[0]._replace(acc=None, gyr=None), *after[1:]])
@@ -270,7 +270,7 @@ samples = st.builds(
 @given(samples, st.booleans(), st.sampled_from(ximu3.FRAMES))
 @settings(max_examples=150, deadline=None)
 def test_round_trip(sample, ascii, frame):
-    got = Decoder(frame).feed(encode(sample, ascii=ascii, frame=frame))
+    got = Ximu3Decoder(frame).feed(encode(sample, ascii=ascii, frame=frame))
     assert all_close(got, [sample], 2e-3 if ascii else 1e-4)
 
 
@@ -278,14 +278,14 @@ def test_round_trip(sample, ascii, frame):
 @settings(max_examples=50, deadline=None)
 def test_any_chunking_gives_the_same(in_pieces, sizes, ascii):
     data = b"\x80noise\n" + b"".join(encode(s, ascii=ascii) for s in stream(8, sensors=(0, 65, 66))) + b"I,1"
-    got, _ = in_pieces(Decoder, data, sizes)
+    got, _ = in_pieces(Ximu3Decoder, data, sizes)
     assert len(got) == 24
 
 
 @given(st.lists(st.binary(max_size=300) | st.sampled_from([b"\xd1", b"\xc9", b"^", b"I,", b"\n", b"{"])))
 @settings(max_examples=200, deadline=None)
 def test_random_bytes_never_raise(chunks):
-    decoder = Decoder()
+    decoder = Ximu3Decoder()
     for chunk in chunks:
         for sample in decoder.feed(chunk):
             assert sample.quat is None or math.hypot(*sample.quat) == pytest.approx(1)
@@ -309,7 +309,7 @@ def test_flipped_bits_and_cuts_cost_only_what_they_touch():
             at = rng.randrange(len(piece))
             piece[at:at] = rng.randbytes(rng.randrange(1, 40))
         pieces[i] = bytes(piece)
-    decoder = Decoder()
+    decoder = Ximu3Decoder()
     got = decoder.feed(b"".join(pieces)) + decoder.flush()
     whole = {(s.sensor, s.time_us): s for s in got if s.quat is not None and s.acc is not None}
     for i, sample in enumerate(expected):
@@ -328,7 +328,7 @@ def test_lost_line_feed_does_not_cost_the_message_behind():
 
 
 def test_long_line_keeps_memory_small():
-    decoder = Decoder()
+    decoder = Ximu3Decoder()
     for _ in range(200):
         decoder.feed(b"x" * 1000)
     assert len(decoder._rest) <= ximu3.MAX_MESSAGE + 1
@@ -356,7 +356,7 @@ def test_what_cannot_be_sent(sample):
 
 def test_settings_are_checked():
     with pytest.raises(ValueError, match="frame must be one of"):
-        Decoder("ned")
+        Ximu3Decoder("ned")
 
 
 def test_same_as_the_makers_library(tmp_path):

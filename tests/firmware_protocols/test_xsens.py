@@ -11,17 +11,8 @@ from hypothesis import strategies as st
 
 from firmware_protocols.rotation import rotate
 from firmware_protocols.sample import Sample, z_up
-from firmware_protocols.xsens import (
-    FRAMES,
-    MTDATA2,
-    MTI600_IDS,
-    Mti600CanDecoder,
-    XbusDecoder,
-    encode_mtdata2,
-    encode_mti600,
-    encode_xbus,
-    mtdata2_items,
-)
+from firmware_protocols.xsens import FRAMES, MTDATA2, XbusDecoder, encode_mtdata2, encode_xbus, mtdata2_items
+from firmware_protocols.xsens_can import MTI600_IDS, Mti600CanDecoder, encode_mti600
 
 DATA = Path(__file__).parents[1] / "data" / "protocols"
 VECTORS = {v["id"]: v for v in json.loads((DATA / "xsens.json").read_text())}

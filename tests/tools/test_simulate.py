@@ -22,7 +22,8 @@ import pytest
 from edgepose.formats.recordings.csv_npz import from_samples, read_recording, write_csv, write_npz
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
-from firmware_protocols.native import cobs_decode, decode_body
+from firmware_protocols.native import cobs_decode
+from firmware_protocols.native_packet import decode_body
 from firmware_protocols.registry import PROTOCOLS
 from firmware_protocols.rotation import rotate
 

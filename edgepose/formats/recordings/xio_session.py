@@ -12,7 +12,7 @@ from edgepose.formats.recordings.csv_npz import Recording, from_samples
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
 from firmware_protocols.sample import Sample
-from firmware_protocols.ximu3 import Decoder
+from firmware_protocols.ximu3 import Ximu3Decoder
 
 MAIN_FILE = "Inertial.csv"
 """The file that makes a folder one of a sensor."""
@@ -107,7 +107,7 @@ def _samples(index: int, folder: Path, problems: list[str]) -> Iterator[ImuSampl
 
     A line of a file is a message as the device sends it, but for the letter at its start.
     """
-    decoder = Decoder()
+    decoder = Ximu3Decoder()
     files = [
         _messages(folder / name, letter) for name, letter in _LETTERS.items() if (folder / name).exists()
     ]

@@ -1,0 +1,229 @@
+"""What lines of text look like: the patterns that `text` reads.
+
+docs/text.md shows how one is written in a TOML file.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from math import isfinite, radians
+
+from firmware_protocols.sample import GRAVITY
+
+FIELDS = (
+    "sensor", "time", "w", "x", "y", "z", "yaw", "pitch", "roll",
+    "ax", "ay", "az", "gx", "gy", "gz", "mx", "my", "mz", "temperature",
+)  # fmt: skip
+"""Names of what a line can hold: groups of a regular expression, or keys of `columns`."""
+
+FRAMES = ("Z-up", "NED")
+
+UNITS: dict[str, dict[str, float]] = {
+    "acc": {"m/s2": 1.0, "g": GRAVITY, "mg": GRAVITY / 1000},
+    "gyr": {"rad/s": 1.0, "deg/s": radians(1.0), "mrad/s": 0.001},
+    "mag": {"uT": 1.0, "nT": 0.001, "mG": 0.1, "G": 100.0},
+    "angle": {"deg": radians(1.0), "rad": 1.0},
+    "time": {"us": 1.0, "ms": 1e3, "s": 1e6, "clock": 1e6},
+    "temperature": {"degC": 1.0},
+}
+DAY_US = 86_400_000_000
+_WRAP_US = {"us": 1 << 32, "ms": 1000 << 32, "clock": DAY_US}
+
+QUAT, ANGLES = ("w", "x", "y", "z"), ("yaw", "pitch", "roll")
+ACC, GYR, MAG = ("ax", "ay", "az"), ("gx", "gy", "gz"), ("mx", "my", "mz")
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """What the lines of a device look like: either a regular expression or columns.
+
+    Attributes:
+        regex: searched in every line; its named groups are FIELDS. It should begin with fixed text and end in
+            `$`, so that no piece of a line, and no two pieces run together, can match. A group should not be
+            able to hold what separates it from the next, or bad lines take long to be refused.
+        columns: name of the column for each of the FIELDS, or a list of names of which the first that is
+            there counts; names are in a header line. Those that the header does not have are absent.
+        header: the header line, for devices that send none or sent it before the port was open.
+        separator: between columns.
+        units: of acc (m/s2, g, mg), gyr (rad/s, deg/s, mrad/s), mag (uT, nT, mG, G), angle (deg, rad), time
+            (us, ms, s, clock: hours:minutes:seconds), or the SI value (uT, us) of one step as a number; a
+            leading minus turns the sign around. What is not named is SI, degrees or us.
+        frame: inertial frame of the orientation, "Z-up" or "NED".
+        wrap_us: where the time starts again at 0; by default 2^32 us or ms, a day for clock, never for s.
+
+    Without w, w = sqrt(1 - x^2 - y^2 - z^2). Angles are Rz(yaw) Ry(pitch) Rx(roll).
+    """
+
+    regex: str | None = None
+    columns: Mapping[str, str | list[str]] = field(default_factory=dict)
+    header: str | None = None
+    separator: str = ","
+    units: Mapping[str, str | float] = field(default_factory=dict)
+    frame: str = "Z-up"
+    wrap_us: int | None = None
+
+    def __post_init__(self) -> None:
+        """Check.
+
+        Raises:
+            ValueError: the pattern means nothing, or not one thing.
+        """
+        if (self.regex is None) == (not self.columns):
+            raise ValueError("a pattern has either a regex or columns")
+        if self.regex is not None:
+            try:
+                names = set(re.compile(self.regex).groupindex)
+            except (re.error, TypeError, OverflowError) as error:
+                raise ValueError(f"regex: {error}") from None
+        else:
+            if not isinstance(self.columns, Mapping):
+                raise ValueError("columns must be a table: field = name of the column")
+            names = set(self.columns)
+            for name, wanted in self.columns.items():
+                listed = [wanted] if isinstance(wanted, str) else wanted
+                if not isinstance(listed, list) or not listed or not all(isinstance(w, str) for w in listed):
+                    raise ValueError(f"columns: {name} must be a name or a list of names, not {wanted!r}")
+        unknown = sorted(names - set(FIELDS))
+        if unknown:
+            raise ValueError(f"unknown field {unknown[0]!r}; fields are {', '.join(FIELDS)}")
+        for group in (QUAT[1:], ANGLES, ACC, GYR, MAG):
+            missing = [name for name in group if name not in names]
+            if 0 < len(missing) < 3:
+                raise ValueError(
+                    f"{group[0]} without {missing[0]}" if missing[0] != group[0] else f"no {group[0]}"
+                )
+        if "w" in names and "x" not in names:
+            raise ValueError("w without x")
+        if not names & {"x", "yaw", "ax", "gx"}:
+            raise ValueError("a pattern needs an orientation, a force or a rate")
+        if {"x", "yaw"} <= names:
+            raise ValueError("a pattern has either a quaternion or angles")
+        if not self.separator or not isinstance(self.separator, str):
+            raise ValueError("separator must be a character")
+        if self.frame not in FRAMES:
+            raise ValueError(f"frame must be one of {', '.join(FRAMES)}, not {self.frame!r}")
+        if self.wrap_us is not None and not (type(self.wrap_us) is int and self.wrap_us > 0):
+            raise ValueError(f"wrap_us must be a whole number above 0, not {self.wrap_us!r}")
+        for quantity in self.units:
+            self.scale(quantity)
+        if self.header is not None and (
+            not self.columns or find_columns(self, columns_of(self.header, self.separator)) is None
+        ):
+            raise ValueError("the header has none of the columns")
+
+    def scale(self, quantity: str) -> float:
+        """SI value (uT, us) of one step.
+
+        Raises:
+            ValueError: there is no such quantity or unit.
+        """
+        known = UNITS.get(quantity)
+        if known is None:
+            raise ValueError(f"units: unknown quantity {quantity!r}; quantities are {', '.join(UNITS)}")
+        unit = self.units.get(quantity, next(iter(known)))
+        if isinstance(unit, str):
+            name = unit.removeprefix("-")
+            if name in known and (unit == name or quantity not in ("time", "temperature")):
+                return known[name] if unit == name else -known[name]
+        elif type(unit) in (int, float) and isfinite(unit) and unit:
+            return float(unit)
+        raise ValueError(f"units: {quantity} must be one of {', '.join(known)} or a number, not {unit!r}")
+
+    @property
+    def wraps_at_us(self) -> int:
+        """Where the time starts again at 0."""
+        if self.wrap_us is not None:
+            return self.wrap_us
+        unit = self.units.get("time", "us")
+        return _WRAP_US.get(unit, 1 << 64) if isinstance(unit, str) else 1 << 64
+
+
+def pattern_from_table(table: Mapping[str, object]) -> Pattern:
+    """Pattern of a table of a TOML file; its keys are the attributes.
+
+    Raises:
+        ValueError: an unknown key, or values that mean nothing.
+    """
+    known = {f.name for f in fields(Pattern)}
+    unknown = sorted(set(table) - known)
+    if unknown:
+        raise ValueError(f"unknown key {unknown[0]!r}; keys are {', '.join(sorted(known))}")
+    for key in ("columns", "units"):
+        if not isinstance(table.get(key, {}), Mapping):
+            raise ValueError(f"{key} must be a table")
+    for key in ("regex", "header", "separator", "frame"):
+        if not isinstance(table.get(key, ""), str):
+            raise ValueError(f"{key} must be text")
+    return Pattern(**table)  # type: ignore[arg-type]
+
+
+_NUMBER = r"[-+]?\d+(?:\.\d*)?"
+
+
+def _list(names: tuple[str, ...]) -> str:
+    return r"\s*,\s*".join(f"(?P<{name}>{_NUMBER})" for name in names)
+
+
+_ARTEMIS: dict[str, str | list[str]] = {
+    "time": "rtcTime",
+    "x": ["Q9_1", "Q6_1"],
+    "y": ["Q9_2", "Q6_2"],
+    "z": ["Q9_3", "Q6_3"],
+}
+
+PATTERNS = {
+    # Sketches for Adafruit's AHRS and BNO055 libraries.
+    "adafruit": Pattern(regex=rf"Quaternion:\s*{_list(QUAT)}\s*$"),
+    # Razor AHRS firmware: x forward, y right, z down.
+    "razor": Pattern(regex=rf"#YPR={_list(ANGLES)}\s*$", frame="NED"),
+    # OpenLog Artemis as delivered: no orientation.
+    "artemis": Pattern(
+        columns={
+            **_ARTEMIS,
+            **dict(zip(ACC, ("aX", "aY", "aZ"), strict=True)),
+            **dict(zip(GYR, ("gX", "gY", "gZ"), strict=True)),
+            **dict(zip(MAG, ("mX", "mY", "mZ"), strict=True)),
+            "temperature": "imu_degC",
+        },
+        units={"acc": "mg", "gyr": "deg/s", "mag": "uT", "time": "clock"},
+    ),
+    # OpenLog Artemis with the sensor's own motion processor: orientation, and readings as raw steps.
+    "artemis-dmp": Pattern(
+        columns={
+            **_ARTEMIS,
+            **dict(zip(ACC, ("RawAX", "RawAY", "RawAZ"), strict=True)),
+            **dict(zip(GYR, ("RawGX", "RawGY", "RawGZ"), strict=True)),
+            **dict(zip(MAG, ("RawMX", "RawMY", "RawMZ"), strict=True)),
+        },
+        units={"acc": GRAVITY / 8192, "gyr": radians(1 / 16.4), "mag": 0.15, "time": "clock"},
+    ),
+}
+"""Ready patterns by name."""
+
+
+def columns_of(line: str, separator: str) -> list[str]:
+    """Columns of a line, without the empty ones at its end."""
+    columns = [column.strip() for column in line.split(separator)]
+    # Loggers end lines with a separator.
+    while columns and not columns[-1]:
+        columns.pop()
+    return columns
+
+
+def find_columns(pattern: Pattern, columns: list[str]) -> tuple[int, dict[str, int]] | None:
+    """Number of columns and index of each field; None if these are not the columns of a header."""
+    places = {}
+    for name, wanted in pattern.columns.items():
+        for column in [wanted] if isinstance(wanted, str) else wanted:
+            if column in columns:
+                places[name] = columns.index(column)
+                break
+    for group in (QUAT[1:], ANGLES, ACC, GYR, MAG):
+        if not all(name in places for name in group):
+            for name in group:
+                places.pop(name, None)
+    if not places.keys() & {"x", "yaw", "ax", "gx"}:
+        return None
+    return len(columns), places

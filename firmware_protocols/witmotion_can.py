@@ -1,0 +1,114 @@
+"""WitMotion on CAN: frames that hold one quantity each.
+
+Layouts are in docs/witmotion.md. Everything is little-endian.
+"""
+
+from __future__ import annotations
+
+import struct
+from math import pi, radians
+from typing import Any
+
+from firmware_protocols._recent import Recent
+from firmware_protocols._stream import Receiver
+from firmware_protocols._witmotion_cycle import (
+    ACC,
+    ACC_STEP,
+    ANGLE_NAMES,
+    ANGLES,
+    DAY_US,
+    GYR,
+    GYR_STEP,
+    MAG,
+    TIME,
+    Cycle,
+    angles_of,
+    scaled,
+    steps_of,
+    vectors_of,
+)
+from firmware_protocols.base import Protocol, uncounted_can
+from firmware_protocols.sample import CanFrame, Sample
+
+_CAN = struct.Struct("<BB3h")
+_CAN_ANGLE = struct.Struct("<BBBxi")
+
+
+class WitCanDecoder(Receiver):
+    """Samples out of CAN frames; `sensor` is the identifier of the device.
+
+    The orientation is that of the angles: a quaternion does not fit into a frame and comes without its last
+    component. The frames have neither count nor time: if just as many frames of a device as make whole cycles
+    are lost in a row, quantities of different cycles meet unnoticed.
+
+    Attributes:
+        counters: what has been seen so far; `lost` are incomplete cycles.
+    """
+
+    WRAP_US = DAY_US
+
+    def __init__(self, *, fine_angles: bool = False, mag_ut: float = 1.0) -> None:
+        """Start with nothing seen.
+
+        Args:
+            fine_angles: devices of high precision (HWT9073) send each angle in a frame of its own.
+            mag_ut: microtesla of one step of the magnetic field, which differs between models. With 1 the
+                field comes in steps.
+        """
+        super().__init__()
+        self._fine = fine_angles
+        self._mag_ut = mag_ut
+        self._cycles: Recent[tuple[int, bool], Cycle] = Recent()
+
+    def feed(self, can_id: int, data: bytes, extended: bool = False) -> list[Sample]:
+        """The samples that this frame completes."""
+        self.counters.bytes += len(data)
+        if len(data) != 8 or data[0] != 0x55 or not (TIME <= data[1] <= 0x5A):
+            self.counters.skipped += 1
+            return []
+        cycle = self._cycles.get((can_id, extended)) or Cycle(can_id, self.counters)
+        self._cycles[can_id, extended] = cycle
+        _, kind, x, y, z = _CAN.unpack(data)
+        order = kind * 4
+        values: dict[str, Any]
+        if kind == ACC:
+            values = {"acc": scaled((x, y, z), ACC_STEP)}
+        elif kind == GYR:
+            values = {"gyr": scaled((x, y, z), GYR_STEP)}
+        elif kind == MAG:
+            values = {"mag": scaled((x, y, z), self._mag_ut)}
+        elif kind != ANGLES:
+            values = {}
+        elif not self._fine:
+            values = angles_of((x, y, z))
+        else:
+            _, _, axis, angle = _CAN_ANGLE.unpack(data)
+            if not 1 <= axis <= 3:
+                return self._bad()
+            order += axis
+            values = {ANGLE_NAMES[axis - 1]: radians(angle / 1000)}
+        self._good()
+        return cycle.add(order, values)
+
+
+def encode_can(sample: Sample, *, fine_angles: bool = False, mag_ut: float = 1.0) -> list[CanFrame]:
+    """CAN frames of one cycle of what the sample has; identifiers above 0x7FF are extended."""
+    frames = []
+    for kind, values, step in vectors_of(sample, mag_ut, True):
+        if kind == ANGLES and fine_angles:
+            for axis, value in enumerate(values):
+                frames.append(_CAN_ANGLE.pack(0x55, kind, axis + 1, round(value * 180_000 / pi)))
+        else:
+            frames.append(_CAN.pack(0x55, kind, *steps_of(values, step)))
+    return [(sample.sensor, data, sample.sensor > 0x7FF) for data in frames]
+
+
+PROTOCOL = Protocol(
+    name="witmotion-can",
+    transport="can",
+    speed=250_000,
+    text="WitMotion on CAN; ids are CAN ids",
+    decoder=WitCanDecoder,
+    encoder=uncounted_can(encode_can),
+    ids=range(0x50, 0x56),
+)
