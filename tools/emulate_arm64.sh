@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Follows docs/install.md word by word on an emulated 64-bit ARM computer, and compares its poses with this machine's.
+# Follows docs/guide/install.md word by word on an emulated 64-bit ARM computer, and compares its poses with this machine's.
 #
 #   sudo tools/emulate_arm64.sh [bookworm|trixie] [CPU...]
 #
@@ -34,7 +34,7 @@ inside() {  # CPU, COMMANDS
 }
 
 block() {  # N: the Nth block of commands of the install page
-  awk -v wanted="$1" '/^```/ { inside = !inside; if (inside) count++; next } inside && count == wanted' docs/install.md
+  awk -v wanted="$1" '/^```/ { inside = !inside; if (inside) count++; next } inside && count == wanted' docs/guide/install.md
 }
 
 register

@@ -21,7 +21,7 @@ print(own if (2, 4) <= tuple(map(int, own.split(".")[:2])) <= newest else "")' 2
     echo "About 300 MB are downloaded unless pip has them already, a third of that PyTorch."
   else
     echo "PyTorch is most of it. Unless pip has it already, or its settings lead to a CPU build (some 200 MB),"
-    echo "the CUDA build is downloaded, several GB; see docs/install.md."
+    echo "the CUDA build is downloaded, several GB; see docs/guide/install.md."
   fi
   "$python" -m venv $site_packages .venv
   .venv/bin/python -m pip install --quiet --disable-pip-version-check --constraint "$constraints" --editable '.[dev]'

@@ -29,7 +29,7 @@ class Finding(NamedTuple):
     """The most important thing about a sensor.
 
     Attributes:
-        name: "ok" or one of the names in docs/check.md.
+        name: "ok" or one of the names in docs/guide/check.md.
         advice: what it is and what to do, one line; empty where there is nothing to do.
         problem: whether poses suffer; without, the advice only says how more can be found out.
     """

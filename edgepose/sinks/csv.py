@@ -1,4 +1,4 @@
-"""Poses as comma-separated values, one row a frame. The columns are described in docs/outputs.md."""
+"""Poses as comma-separated values, one row a frame. Columns: docs/reference/outputs.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Poses over UDP, one datagram a frame, as JSON or binary. The layouts are described in docs/outputs.md."""
+"""Poses over UDP, one datagram a frame, as JSON or binary. Layouts: docs/reference/outputs.md."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Poses by the VMC protocol (Virtual Motion Capture, OSC over UDP), which programs for VRM avatars read.
 
-Version 2.0 of https://protocol.vmc.info; what is sent is described in docs/outputs.md.
+Version 2.0 of https://protocol.vmc.info; what is sent is described in docs/reference/outputs.md.
 """
 
 from __future__ import annotations

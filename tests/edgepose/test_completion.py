@@ -1,4 +1,4 @@
-"""Completion in the shell, as docs/install.md sets it up."""
+"""Completion in the shell, as docs/guide/install.md sets it up."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-DOCS = Path(__file__).parents[2] / "docs" / "install.md"
+DOCS = Path(__file__).parents[2] / "docs" / "guide" / "install.md"
 PATH = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
 
 

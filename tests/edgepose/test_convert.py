@@ -42,7 +42,7 @@ from firmware_protocols.native_packet import Packet
 from firmware_protocols.sample import GRAVITY
 
 REAL = Path(__file__).parents[1] / "data" / "imu" / "six-sites-3s.npz"
-DOCS = Path(__file__).parents[2] / "docs" / "recordings.md"
+DOCS = Path(__file__).parents[2] / "docs" / "guide" / "recordings.md"
 
 
 def rows(count: int = 10) -> list[ImuSample]:

@@ -67,7 +67,7 @@ def test_what_a_processor_multiplies(machine, hwcap, fp16, int8):
 
 
 def test_the_install_page_says_what_is_pinned():
-    page = (ROOT / "docs" / "install.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "guide" / "install.md").read_text(encoding="utf-8")
     for machine in ("aarch64", "x86_64"):
         _, pinned = torch_of(machine)
         assert f"{str(pinned.specifier)[2:]} is pinned" in page

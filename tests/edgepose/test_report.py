@@ -250,7 +250,7 @@ def test_without_matplotlib(monkeypatch, tmp_path):
 
 
 def test_documented_commands_are_understood():
-    docs = (Path(__file__).parents[2] / "docs" / "report.md").read_text()
+    docs = (Path(__file__).parents[2] / "docs" / "guide" / "report.md").read_text()
     documented = re.findall(r"^edgepose report (.*)$", docs, re.MULTILINE)
     assert len(documented) >= 2
     for words in documented:

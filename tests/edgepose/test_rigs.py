@@ -32,7 +32,7 @@ from edgepose.sinks.csv import CsvSink
 from edgepose.sources import open_source
 from edgepose_export.networks.shape import NetworkShape
 
-PAGE = (Path(__file__).parents[2] / "docs" / "sensors.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "guide" / "sensors.md").read_text(encoding="utf-8")
 SIMULATOR = Path(__file__).parents[2] / "tools" / "simulate.py"
 ALL_HELD = f"held {' '.join(PLACEMENTS)}"
 

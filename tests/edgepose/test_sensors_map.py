@@ -132,7 +132,7 @@ def test_an_unknown_protocol_of_a_port(read):
 
 # --- the page about it --------------------------------------------------------------------------------------
 
-PAGE = (Path(__file__).parents[2] / "docs" / "sensors.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs" / "guide" / "sensors.md").read_text()
 
 
 MAPS = [text for text in re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL) if "calibration" not in text]

@@ -24,7 +24,7 @@ from edgepose.sinks.udp import UdpSink, decode_binary, encode_binary, encode_jso
 from edgepose.skeleton import JOINTS
 from edgepose.utils.sockets import parse_destination, resolve
 
-DOCS = Path(__file__).parents[2] / "docs" / "outputs.md"
+DOCS = Path(__file__).parents[2] / "docs" / "reference" / "outputs.md"
 STATUSES = ("ok", "held head", "held left_forearm pelvis; filling window", "filling window")
 
 

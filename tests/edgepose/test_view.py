@@ -480,7 +480,7 @@ def test_without_viser(monkeypatch):
 
 
 def test_documented_commands_are_understood():
-    docs = (Path(__file__).parents[2] / "docs" / "view.md").read_text()
+    docs = (Path(__file__).parents[2] / "docs" / "guide" / "view.md").read_text()
     documented = re.findall(r"^edgepose view (.*?)(?: *#.*)?$", docs, re.MULTILINE)
     assert len(documented) >= 3
     for words in documented:

@@ -1,4 +1,4 @@
-"""The measures of `edgepose solve` that docs/solve.md has, on one short take."""
+"""The measures of `edgepose solve` that docs/guide/solve.md has, on one short take."""
 
 import pickle
 import subprocess

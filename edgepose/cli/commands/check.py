@@ -71,7 +71,7 @@ class State(NamedTuple):
 def check(
     ctx: click.Context, source: SourceConfig, seconds: float | None, calibration: Path | None, as_json: bool
 ) -> None:
-    """Show how each sensor does, and what to do where something is wrong: docs/check.md has the words.
+    """Show how each sensor does, and what to do where something is wrong: docs/guide/check.md has the words.
 
     The rig may lie on a table or be worn. Hold it still for some seconds: gravity, noise and bias are only
     seen at rest. Turn it to and fro: only then gyroscope and orientation can be compared.

@@ -40,7 +40,7 @@ protocol_option = click.option(
 sensors_option = click.option(
     "--sensors",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="TOML file that says which port, bus and id is worn where; see docs/sensors.md. Names of "
+    help="TOML file that says which port, bus and id is worn where; see docs/guide/sensors.md. Names of "
     "ports and buses in it need no --port and --can.  [default: ids in the usual order]",
 )
 """The flag --sensors."""

@@ -59,7 +59,7 @@ def rig_options(command: click.Command) -> click.Command:
         metavar="FILE",
         type=click.Path(path_type=Path),
         help="TOML file with the flags of one wearer, as names; several times for several wearers, who share "
-        "the network. See docs/sensors.md.",
+        "the network. See docs/guide/sensors.md.",
     )
     run = command.callback
     assert run is not None

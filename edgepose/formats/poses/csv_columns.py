@@ -1,4 +1,4 @@
-"""Columns of poses as comma-separated values, described in docs/outputs.md."""
+"""Columns of poses as comma-separated values, described in docs/reference/outputs.md."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ def card(metadata: dict[str, Any]) -> str:
         "MOCAP is a folder with the motion named above. For the shipped models: the BVH files of CMU "
         f"subjects 01, 02, 03, 05 - 09 and some further takes (cgspeed's conversion){bandai}. The whole "
         "config is in the archive's metadata."
-        + (" OTHERS are the checkpoints that it was trained on from, see docs/models.md." * several),
+        + (" OTHERS are earlier checkpoints, see docs/research/training-history.md." * several),
         "",
     ]
     return "\n".join(lines)

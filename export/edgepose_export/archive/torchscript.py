@@ -78,7 +78,7 @@ def script(
     It is not frozen: a frozen module could not pack its weights, and gains two percent.
     """
     with warnings.catch_warnings():
-        # TorchScript is deprecated in favour of torch.export; it is used on purpose, see docs/models.md.
+        # TorchScript is deprecated in favour of torch.export; on purpose, see docs/reference/models.md.
         warnings.filterwarnings("ignore", message="`torch.jit", category=DeprecationWarning)
         return torch.jit.script(build(network, statistics, std_scale))
 

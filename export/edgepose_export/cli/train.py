@@ -25,7 +25,7 @@ def _config_path(name: str) -> Path:
     "--config",
     required=True,
     metavar="NAME|FILE",
-    help="Shipped config, e.g. birnn, rnn, dip-birnn, dip-rnn (docs/models.md lists all), or a TOML file.",
+    help="Shipped config, e.g. birnn, rnn, dip-birnn (docs/research/training.md lists all), or a TOML file.",
 )
 @click.option(
     "--data",
