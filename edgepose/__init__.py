@@ -1,3 +1,104 @@
-"""edgepose: six body-worn IMUs in, SMPL poses out."""
+"""edgepose: six body-worn IMUs in, SMPL poses out.
+
+The names in `__all__` are the public API, described in docs/python-api.md. They are imported when they are
+first used: `import edgepose` loads neither torch nor numpy.
+"""
+
+from typing import TYPE_CHECKING
+
+from edgepose.utils.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from edgepose.calibration import Calibration, load_calibration
+    from edgepose.config import OutputConfig, SourceConfig, WearerConfig
+    from edgepose.errors import (
+        CalibrationError,
+        ConfigError,
+        DeviceError,
+        EdgeposeError,
+        FileFormatError,
+        ModelError,
+    )
+    from edgepose.formats.poses.reading import read_poses
+    from edgepose.formats.recordings.csv_npz import Recording, read_recording
+    from edgepose.imu import ImuFrame, ImuSample
+    from edgepose.inference.model import Model, load_model
+    from edgepose.pipeline.wearer_pipeline import Pipeline
+    from edgepose.placements import PLACEMENTS
+    from edgepose.pose import PoseFrame
+    from edgepose.sinks.base import Sink
+    from edgepose.sinks.bvh import BvhSink
+    from edgepose.sinks.csv import CsvSink
+    from edgepose.sinks.npz import NpzSink
+    from edgepose.sinks.udp import UdpSink
+    from edgepose.sinks.vmc import VmcSink
+    from edgepose.skeleton import JOINTS
+    from edgepose.sources import open_source
 
 __version__ = "0.1.0"
+
+_MODULES = {
+    "BvhSink": "edgepose.sinks.bvh",
+    "Calibration": "edgepose.calibration",
+    "CalibrationError": "edgepose.errors",
+    "ConfigError": "edgepose.errors",
+    "CsvSink": "edgepose.sinks.csv",
+    "DeviceError": "edgepose.errors",
+    "EdgeposeError": "edgepose.errors",
+    "FileFormatError": "edgepose.errors",
+    "ImuFrame": "edgepose.imu",
+    "ImuSample": "edgepose.imu",
+    "JOINTS": "edgepose.skeleton",
+    "Model": "edgepose.inference.model",
+    "ModelError": "edgepose.errors",
+    "NpzSink": "edgepose.sinks.npz",
+    "OutputConfig": "edgepose.config",
+    "PLACEMENTS": "edgepose.placements",
+    "Pipeline": "edgepose.pipeline.wearer_pipeline",
+    "PoseFrame": "edgepose.pose",
+    "Recording": "edgepose.formats.recordings.csv_npz",
+    "Sink": "edgepose.sinks.base",
+    "SourceConfig": "edgepose.config",
+    "UdpSink": "edgepose.sinks.udp",
+    "VmcSink": "edgepose.sinks.vmc",
+    "WearerConfig": "edgepose.config",
+    "load_calibration": "edgepose.calibration",
+    "load_model": "edgepose.inference.model",
+    "open_source": "edgepose.sources",
+    "read_poses": "edgepose.formats.poses.reading",
+    "read_recording": "edgepose.formats.recordings.csv_npz",
+}
+
+__all__ = [
+    "JOINTS",
+    "PLACEMENTS",
+    "BvhSink",
+    "Calibration",
+    "CalibrationError",
+    "ConfigError",
+    "CsvSink",
+    "DeviceError",
+    "EdgeposeError",
+    "FileFormatError",
+    "ImuFrame",
+    "ImuSample",
+    "Model",
+    "ModelError",
+    "NpzSink",
+    "OutputConfig",
+    "Pipeline",
+    "PoseFrame",
+    "Recording",
+    "Sink",
+    "SourceConfig",
+    "UdpSink",
+    "VmcSink",
+    "WearerConfig",
+    "load_calibration",
+    "load_model",
+    "open_source",
+    "read_poses",
+    "read_recording",
+]
+
+__getattr__, __dir__ = lazy_names(__name__, _MODULES)

@@ -1,0 +1,92 @@
+"""A model archive as an object: poses of arrays, without a run around it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from edgepose.errors import ModelError
+from edgepose.inference import archive
+from edgepose.inference.engine import Engine, StreamEngine
+from edgepose.inference.quantisation import pack
+
+FRAMES_PER_STEP = 64
+"""Frames of a whole recording that the network computes at once."""
+
+
+class Model:
+    """A loaded archive.
+
+    Attributes:
+        metadata: what the archive says about itself.
+        rate_hz: frames per second that it was trained for.
+        past: frames before the present one of a window, of a bidirectional model.
+        future: frames after the present one that it waits for; 0 of a unidirectional model.
+        precision: of its weights while it runs.
+    """
+
+    def __init__(self, name: str | Path, *, trust: bool = False, precision: str = "auto") -> None:
+        """Load an archive.
+
+        Args:
+            name: of a bundled model, or the path of an archive.
+            trust: load it although its checksum is not known: loading an archive runs its code.
+            precision: of the weights, "auto", "f32", "fp16" or "int8".
+
+        Raises:
+            ModelError: there is no such archive, it is damaged or not trusted, or cannot run here.
+        """
+        info = archive.inspect(archive.find(str(name)))
+        self.metadata: dict[str, Any] = info.metadata
+        self.rate_hz = float(info.metadata["rate_hz"])
+        self.past, self.future = int(info.metadata["past"]), int(info.metadata["future"])
+        self._module = archive.load(info, trust)
+        self.precision = pack(self._module, info, precision)
+
+    def engine(self, frames_per_step: int = 1) -> Engine:
+        """What makes poses frame by frame; it has a state of its own.
+
+        Args:
+            frames_per_step: frames that are computed together; more than one is faster, and for recordings.
+        """
+        many = frames_per_step > 1 and self.precision != "int8" and hasattr(self._module, "stream_many")
+        return StreamEngine(self._module, self.past, self.future, frames_per_step if many else 1)
+
+    def poses(self, orientation: ArrayLike, acceleration: ArrayLike) -> NDArray[np.float32]:
+        """Poses of a whole recording (DIP section 3).
+
+        Args:
+            orientation: (T, 6, 3, 3) rotations of the bones in the body frame, R_TB, in the order of
+                `edgepose.PLACEMENTS`, at `rate_hz`.
+            acceleration: (T, 6, 3) accelerations in the body frame without gravity, m/s^2.
+
+        Returns:
+            (T, 24, 3, 3) rotations of SMPL's joints, each against its parent, the pelvis against the body
+            frame.
+
+        Raises:
+            ModelError: the arrays have other shapes, or numbers in them are not finite.
+        """
+        bones, force = np.asarray(orientation, np.float32), np.asarray(acceleration, np.float32)
+        frames = len(bones)
+        if bones.shape != (frames, 6, 3, 3) or force.shape != (frames, 6, 3):
+            raise ModelError(
+                "orientation must be (T, 6, 3, 3) and acceleration (T, 6, 3), not "
+                f"{bones.shape} and {force.shape}"
+            )
+        if not (np.isfinite(bones).all() and np.isfinite(force).all()):
+            raise ModelError("orientation or acceleration has a NaN or an infinite number")
+        engine = self.engine(FRAMES_PER_STEP)
+        outputs = [each for i in range(frames) for each in engine.push(i, bones[i], force[i])]
+        outputs += engine.finish()
+        return (
+            np.stack([each.rotations for each in outputs]) if outputs else np.empty((0, 24, 3, 3), np.float32)
+        )
+
+
+def load_model(name: str | Path, *, trust: bool = False, precision: str = "auto") -> Model:
+    """A `Model`; see there."""
+    return Model(name, trust=trust, precision=precision)

@@ -1,0 +1,90 @@
+"""The main job from Python: samples of a source in, poses out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from edgepose.calibration import Calibration
+from edgepose.calibration.rezero import Headings
+from edgepose.imu import ImuSample
+from edgepose.orientation.stage import OrientationStage
+from edgepose.pipeline.frame_synchronizer import FrameClock
+from edgepose.pipeline.run import RunSummary, Walk
+from edgepose.pose import PoseFrame
+from edgepose.sinks.base import Sink
+
+if TYPE_CHECKING:
+    from edgepose.inference.model import Model
+
+
+class _Latest(Sink):
+    """Keeps the poses until they are taken."""
+
+    def __init__(self) -> None:
+        self._poses: list[PoseFrame] = []
+
+    def write(self, pose: PoseFrame) -> None:
+        self._poses.append(pose)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def take(self) -> list[PoseFrame]:
+        poses, self._poses = self._poses, []
+        return poses
+
+
+class Pipeline:
+    """Turns the samples of one wearer into poses.
+
+    Attributes:
+        summary: counts of what has been done so far.
+    """
+
+    def __init__(
+        self, calibration: Calibration, model: str | Path | Model = "birnn", *, trust: bool = False
+    ) -> None:
+        """Load the model.
+
+        Args:
+            calibration: of the wearer; it says which orientation filter runs.
+            model: name of a bundled model, path of an archive, or a loaded one.
+            trust: load an archive although its checksum is not known.
+
+        Raises:
+            ModelError: the archive cannot be loaded.
+        """
+        from edgepose.inference.model import Model
+
+        self._calibration = calibration
+        self._model = model if isinstance(model, Model) else Model(model, trust=trust)
+        self.summary = RunSummary()
+
+    def poses(self, source: Iterable[tuple[float, list[ImuSample]]]) -> Iterator[PoseFrame]:
+        """Poses as they become ready, to the end of the source.
+
+        Args:
+            source: batches (time on the source's clock in seconds, samples), as `edgepose.open_source` gives
+                them once it is entered.
+
+        Raises:
+            EdgeposeError: the source ended in an error; all poses before it have been given.
+        """
+        latest, engine = _Latest(), self._model.engine()
+        calibration = self._calibration
+        orient = OrientationStage(calibration.filter, magnetometer=calibration.north)
+        walk = Walk(FrameClock(self._model.rate_hz), Headings(calibration), [latest], orient)
+        self.summary = walk.summary
+        try:
+            for now_s, samples in source:
+                for body in walk.take(now_s, samples, 0.0):
+                    walk.write(engine.push(*body), walk.arrived)
+                yield from latest.take()
+        finally:
+            for body in walk.flush():
+                walk.write(engine.push(*body), walk.arrived)
+            walk.write(engine.finish(), walk.arrived)
+            walk.end()
+        yield from latest.take()

@@ -1,0 +1,137 @@
+"""The public API: names, what their import costs, the examples as they are documented."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import edgepose
+from edgepose.formats.poses.reading import read_poses
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "examples"
+
+
+def test_every_name_is_there():
+    for name in edgepose.__all__:
+        assert getattr(edgepose, name) is not None
+    assert set(edgepose.__all__) <= set(dir(edgepose))
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        edgepose.nothing  # noqa: B018
+    assert resources.files("edgepose").joinpath("py.typed").is_file()
+
+
+def test_every_name_is_documented():
+    page = (ROOT / "docs" / "python-api.md").read_text(encoding="utf-8")
+    for name in edgepose.__all__:
+        assert re.search(rf"`(edgepose\.)?{name}\b", page), name
+
+
+def test_the_import_loads_neither_torch_nor_numpy():
+    code = "import edgepose, sys, json; print(json.dumps(sorted(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], text=True, capture_output=True, check=True)
+    assert not {"torch", "numpy", "click", "serial", "can"} & set(json.loads(done.stdout))
+
+
+def test_errors_are_one_family():
+    for name in ("ConfigError", "DeviceError", "FileFormatError", "CalibrationError", "ModelError"):
+        assert issubclass(getattr(edgepose, name), edgepose.EdgeposeError)
+
+
+def run_example(name: str, *words: object) -> str:
+    command = [sys.executable, str(EXAMPLES / name), *map(str, words)]
+    done = subprocess.run(command, text=True, capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_example_of_a_recording_gives_the_poses_of_run(command, wearer, tmp_path):
+    said = run_example("poses_of_a_recording.py", wearer.short, wearer.calibration, tmp_path / "a.csv")
+    assert said == "180 poses\n"
+    flags = ("--file", wearer.short, "--calibration", wearer.calibration, "--model", "rnn")
+    assert command("run", *flags, "--csv", tmp_path / "b.csv").returncode == 0
+    one, other = read_poses(tmp_path / "a.csv"), read_poses(tmp_path / "b.csv")
+    np.testing.assert_allclose(one.rotations, other.rotations, atol=1e-5)
+    np.testing.assert_array_equal(one.time_s, other.time_s)
+
+
+def test_the_example_of_arrays():
+    assert re.fullmatch(
+        r"\(120, 24, 3, 3\), left knee bent by \d+\.\d deg\n", run_example("poses_of_arrays.py")
+    )
+
+
+def test_the_example_of_an_own_output(wearer):
+    lines = run_example("own_sink.py", wearer.short, wearer.calibration).splitlines()
+    assert len(lines) == 180
+    assert all(re.fullmatch(r"[\d.]+ [+-]0\.\d{3} m", line) for line in lines)
+
+
+def test_every_example_is_tried():
+    tried = {"poses_of_a_recording.py", "poses_of_arrays.py", "own_sink.py"}
+    assert {path.name for path in EXAMPLES.glob("*.py")} == tried
+
+
+@pytest.mark.parametrize(
+    ("orientation", "acceleration", "says"),
+    [
+        (np.zeros((4, 6, 3, 3)), np.zeros((4, 5, 3)), "must be"),
+        (np.zeros((4, 5, 3, 3)), np.zeros((4, 6, 3)), "must be"),
+        (np.full((4, 6, 3, 3), np.nan), np.zeros((4, 6, 3)), "NaN"),
+    ],
+)
+def test_arrays_that_are_none(orientation, acceleration, says):
+    with pytest.raises(edgepose.ModelError, match=says):
+        edgepose.load_model("rnn").poses(orientation, acceleration)
+
+
+def test_no_frames():
+    assert edgepose.load_model("rnn").poses(np.empty((0, 6, 3, 3)), np.empty((0, 6, 3))).shape == (
+        0,
+        24,
+        3,
+        3,
+    )
+
+
+def test_one_configuration_from_toml_and_from_python(tmp_path):
+    (tmp_path / "anna.toml").write_text(
+        'file = "walk.csv"\ncalibration = "c.json"\ncsv = "p.csv"\nheight = 1.8\nudp = "127.0.0.1:9000"\n'
+        'overwrite = true\n[sinks]\nmine = "target"\n'
+    )
+    from_file = edgepose.WearerConfig.from_toml(tmp_path / "anna.toml")
+    own = edgepose.WearerConfig(
+        source=edgepose.SourceConfig(file=tmp_path / "walk.csv"),
+        calibration=tmp_path / "c.json",
+        outputs=edgepose.OutputConfig(
+            csv=str(tmp_path / "p.csv"),
+            height=1.8,
+            udp=("127.0.0.1", 9000, "json"),
+            overwrite=True,
+            sinks={"mine": "target"},
+        ),
+        name="anna",
+        path=tmp_path / "anna.toml",
+    )
+    assert from_file == own
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: edgepose.SourceConfig(), "give one source"),
+        (lambda: edgepose.SourceConfig(port="a", file="b"), "give one source"),
+        (lambda: edgepose.SourceConfig(port="a", baud=0), "not in the range"),
+        (lambda: edgepose.OutputConfig(rotations="rodrigues"), "is not one of"),
+    ],
+)
+def test_configurations_that_mean_nothing(make, says):
+    with pytest.raises(edgepose.ConfigError, match=says):
+        make()
