@@ -55,7 +55,7 @@ else
   SECONDS=0
   inside "$1" "bash -e /root/install.sh" > "$log" 2>&1
   echo "installed in $SECONDS s under emulation"
-  echo "apt: $(grep -h '^Need to get' "$log")"
+  echo "apt: $(grep -hE '^(Need to get|  Download size)' "$log")"
   awk '/^ *Downloading .*[0-9.]+ [kM]B\)/ { size = $(NF - 1); sub(/\(/, "", size); total += /MB\)/ ? size : size / 1000 }
        END { printf "pip: %.0f MB downloaded\n", total }' "$log"
   echo "size of .venv: $(du -sm "$folder/root/edgepose/.venv" | cut -f1) MB"

@@ -1,0 +1,78 @@
+"""A wire format and an output that a package of your own adds to edgepose; its pyproject.toml names both.
+
+pip install ./examples/plugin
+edgepose check --port /dev/ttyUSB0 --protocol example-lines
+edgepose run ... --sink example-count=count.txt
+"""
+
+from __future__ import annotations
+
+import math
+
+from edgepose.pose import PoseFrame
+from edgepose.sinks.base import Sink, SinkContext
+from firmware_protocols.base import Decoder, Protocol
+from firmware_protocols.sample import Counters, Sample
+
+
+class ExampleDecoder(Decoder):
+    """Lines `E,id,time_us,qw,qx,qy,qz,ax,ay,az`."""
+
+    WRAP_US = 1 << 32
+
+    def __init__(self) -> None:
+        """Start with nothing seen."""
+        self.counters = Counters()
+        self._rest = b""
+
+    def feed(self, data: bytes) -> list[Sample]:
+        """Samples of the lines that are complete; a line that is none counts as bad."""
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        self._rest = self._rest[-1000:]  # noise without line breaks does not fill the memory
+        samples = [sample for line in lines if (sample := _parse(line)) is not None]
+        self.counters.packets += len(samples)
+        self.counters.bad += len(lines) - len(samples)
+        return samples
+
+
+def _parse(line: bytes) -> Sample | None:
+    try:
+        kind, sensor, time_us, *numbers = line.decode("ascii").strip().split(",")
+        qw, qx, qy, qz, ax, ay, az = map(float, numbers)
+        good = kind == "E" and math.isclose(math.hypot(qw, qx, qy, qz), 1.0, abs_tol=0.01)
+        return Sample(int(sensor), int(time_us), (qw, qx, qy, qz), (ax, ay, az)) if good else None
+    except ValueError:
+        return None
+
+
+PROTOCOL = Protocol(
+    name="example-lines",
+    transport="bytes",
+    speed=115200,
+    text="lines of the example plug-in",
+    decoder=ExampleDecoder,
+    encoder=None,
+    ids=range(6),
+)
+
+
+class CountSink(Sink):
+    """Writes the number of poses into a file at the end."""
+
+    def __init__(self, path: str) -> None:
+        """Count from zero."""
+        self._path, self._count = path, 0
+
+    def write(self, pose: PoseFrame) -> None:
+        """Count a pose."""
+        self._count += 1
+
+    def close(self) -> None:
+        """Write the count; a second call writes the same."""
+        with open(self._path, "w", encoding="utf-8") as file:  # noqa: PTH123
+            file.write(f"{self._count}\n")
+
+
+def open_count(target: str, context: SinkContext) -> Sink:
+    """A `CountSink`; the entry point of `--sink example-count=FILE`."""
+    return CountSink(target)
