@@ -12,7 +12,8 @@ from edgepose.calibration import HeadingReset, Hold, HoldSummary
 from edgepose.cli.options.source import Orientations, SourceFlags
 from edgepose.cli.prompts import Guide, all_reporting, held, moved, wait_for_enter
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import read_recording, samples
+from edgepose.formats.recordings.base import samples
+from edgepose.formats.recordings.registry import read_recording
 from edgepose.sources import Device
 from edgepose.sources.replay import is_recording
 
@@ -146,11 +147,11 @@ def _check_north(orient: Orientations, plan: Plan) -> None:
 
 
 def _read(source: SourceFlags, orient: Orientations) -> tuple[Hold, str | None, Mapping[int, Device]]:
-    """Everything in a recording or a raw capture, what is wrong with its end, and what sent it."""
+    """Everything in a recording or a raw capture, what is wrong with it, and what sent it."""
     path = source.file
     assert path is not None
     if is_recording(path):
-        recording = read_recording(path)
+        recording = read_recording(path, _serial_numbers(source.sensors))
         everything = (
             calibration.hold_from_recording(recording)
             if orient.passes
@@ -160,6 +161,15 @@ def _read(source: SourceFlags, orient: Orientations) -> tuple[Hold, str | None, 
     with source._replace(realtime=False).open() as opened:
         everything = calibration.hold_from_samples(chain.from_iterable(orient(came) for _, came in opened))
         return everything, opened.damage, opened.devices
+
+
+def _serial_numbers(sensors: Path | None) -> Mapping[int, str] | None:
+    """Placements by serial number in a map of sensors."""
+    if sensors is None:
+        return None
+    from edgepose.sources.sensor_map import read_map
+
+    return read_map(sensors).serial_numbers()
 
 
 def _window(

@@ -22,8 +22,9 @@ import numpy as np
 import pytest
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.poses.reading import read_poses
-from edgepose.formats.recordings.csv_npz import read_recording, samples
+from edgepose.formats.poses.registry import read_poses
+from edgepose.formats.recordings.base import samples
+from edgepose.formats.recordings.registry import read_recording
 from edgepose.utils.safe_pickle import read_pickle
 from firmware_protocols import native_can
 from firmware_protocols.native import Packet
