@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from functools import cache, partial
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
@@ -38,7 +38,6 @@ WRITERS: dict[str, Callable[[Path, Recording], None]] = {"csv": write_csv, "npz"
 """What is written, by ending."""
 
 
-@cache
 def _endings() -> tuple[str, ...]:
     """Endings of the files that are looked for in a folder."""
     return tuple(
@@ -131,13 +130,14 @@ def plan(inputs: Sequence[Path], to: str, out: Path) -> list[Job]:
 def _expand(given: Path, out: Path) -> Iterator[tuple[Path, Path]]:
     """Recordings that an input stands for, and their places below the output folder."""
     if given.is_dir():
+        endings = _endings()
         try:
-            found = sorted(_walk(given, out.resolve()))
+            found = sorted(_walk(given, out.resolve(), endings))
         except OSError as error:
             raise EdgeposeError(f"{error.filename}: cannot look into it: {error.strerror}") from None
         if not found:
             raise EdgeposeError(
-                f"{given}: no recording in this folder; names end in {', '.join(_endings())}, or .gz of a log"
+                f"{given}: no recording in this folder; names end in {', '.join(endings)}, or .gz of a log"
             )
         for path in found:
             # The session that is itself given has its own name.
@@ -164,7 +164,7 @@ def _expand(given: Path, out: Path) -> Iterator[tuple[Path, Path]]:
         raise EdgeposeError(f"{given}: no such file or folder")
 
 
-def _walk(folder: Path, out: Path) -> Iterator[Path]:
+def _walk(folder: Path, out: Path, endings: tuple[str, ...]) -> Iterator[Path]:
     """Recordings in a folder, save those of an earlier conversion."""
     if find_format(folder) is not None:
         yield folder
@@ -174,9 +174,9 @@ def _walk(folder: Path, out: Path) -> Iterator[Path]:
         if path.is_dir():
             of_session = xio_session.is_sensor(path)
             if not of_session and not path.is_symlink() and path.resolve() != out:
-                yield from _walk(path, out)
+                yield from _walk(path, out, endings)
         # A pipe could be waited for in vain.
-        elif not path.is_fifo() and (path.suffix.lower() in _endings() or is_can_log(path)):
+        elif not path.is_fifo() and (path.suffix.lower() in endings or is_can_log(path)):
             yield path
 
 
