@@ -80,7 +80,7 @@ class RecordingSource:
 
     @property
     def damage(self) -> str | None:
-        """What is wrong with the end of the file."""
+        """What is wrong with the file; the rest of it is delivered."""
         return self._recording.damage if self._recording else None
 
     def __enter__(self) -> RecordingSource:

@@ -20,11 +20,11 @@ LARGEST_TIME = 1e12
 
 @dataclass(frozen=True)
 class PoseFormat(FileFormat):
-    """A format of poses; each module of one ends with its own.
+    """A format of poses; the module of each format ends with its `FORMAT`.
 
     Attributes:
-        read: returns the poses before the first bad one, and one line on what is bad, None if nothing is.
-            Raises EdgeposeError where no pose is good.
+        read: returns the poses before the first bad one, and one line on what is bad or None. Raises
+            EdgeposeError if no pose is usable.
         holds_poses: whether a file with one of the suffixes holds poses and not a recording of sensors; by
             default all do.
     """

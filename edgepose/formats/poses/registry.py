@@ -21,7 +21,7 @@ READERS = {
     "bvh": "edgepose.formats.poses.bvh:FORMAT",
     "dip": "edgepose.formats.poses.dip:FORMAT",
 }
-"""Where each `PoseFormat` is; a module is imported when a format before it does not fit a file."""
+"""Where each `PoseFormat` is; modules are imported in this order until one fits a file."""
 
 
 def read_poses(path: str | Path) -> Poses:

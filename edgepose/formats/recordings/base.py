@@ -36,13 +36,13 @@ _CHUNK = 4096
 
 
 class ReadOptions(NamedTuple):
-    """How a recording is read; a format leaves out of account what means nothing to it.
+    """How a recording is read; formats ignore what does not concern them.
 
     Attributes:
-        names: sensors that may be in it, for formats that can hold others than those of the six placements.
-        salvage: leave bad rows out and say so in `Recording.damage` instead of raising, for formats of ours;
-            others' always do.
-        ids: placements by serial number, for formats that name sensors so.
+        names: sensors that may occur, for formats that can hold more than the six placements.
+        salvage: leave bad rows out and say so in `Recording.damage` instead of raising. CSV and NPZ only:
+            files of other programs are always salvaged.
+        ids: placements by serial number, for formats that identify sensors by it.
     """
 
     names: Sequence[str] = PLACEMENTS
@@ -52,10 +52,10 @@ class ReadOptions(NamedTuple):
 
 @dataclass(frozen=True)
 class RecordingFormat(FileFormat):
-    """A format of recordings; each module of one ends with its own.
+    """A format of recordings; the module of each format ends with its `FORMAT`.
 
     Attributes:
-        read: reads a file, or folder, of the format. Raises EdgeposeError, or OSError, where nothing is good.
+        read: reads a file, or folder, of the format. Raises EdgeposeError or OSError if nothing is usable.
         is_folder: whether a folder is a recording of the format; None where recordings are files.
     """
 

@@ -21,7 +21,7 @@ READERS = {
     "mt-manager": "edgepose.formats.recordings.mt_manager:FORMAT",
     "xio-session": "edgepose.formats.recordings.xio_session:FORMAT",
 }
-"""Where each `RecordingFormat` is; a module is imported when a format before it does not fit a file."""
+"""Where each `RecordingFormat` is; modules are imported in this order until one fits a file."""
 
 
 def read_recording(path: Path | str, ids: Mapping[int, str] | None = None) -> Recording:
