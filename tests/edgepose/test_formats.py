@@ -275,7 +275,9 @@ def test_a_folder_that_is_no_session(files, wearer, tmp_path):
         ):
             result = edgepose(*words)
             assert isinstance(result.exception, EdgeposeError), result
-            assert str(result.exception).startswith(f"{file}: unknown kind of file: a directory with no rec")
+            assert str(result.exception).startswith(
+                f"{file}: unknown kind of file (Is a directory with no rec"
+            )
         assert find_format(file) is None
 
 

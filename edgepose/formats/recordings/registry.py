@@ -97,8 +97,8 @@ def _read(path: Path, options: ReadOptions) -> Recording:
         if known is None:
             if path.is_dir():
                 raise EdgeposeError(
-                    f"{path}: unknown kind of file: a directory with no recording in it; give the one that "
-                    "holds the files or the folders of all sensors"
+                    f"{path}: unknown kind of file (Is a directory with no recording in it); give the folder "
+                    "that holds the files or folders of all sensors"
                 )
             known = _built_in("csv")
         return known.read(path, options)
