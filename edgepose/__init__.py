@@ -19,9 +19,9 @@ if TYPE_CHECKING:
         FileFormatError,
         ModelError,
     )
-    from edgepose.formats.poses.reading import read_poses
-    from edgepose.formats.recordings.csv_npz import Recording, read_recording
-    from edgepose.imu import ImuFrame, ImuSample
+    from edgepose.formats.poses.registry import read_poses
+    from edgepose.formats.recordings.registry import read_recording
+    from edgepose.imu import ImuFrame, ImuSample, Recording
     from edgepose.inference.model import Model, load_model
     from edgepose.pipeline.wearer_pipeline import Pipeline
     from edgepose.placements import PLACEMENTS
@@ -56,7 +56,7 @@ _MODULES = {
     "PLACEMENTS": "edgepose.placements",
     "Pipeline": "edgepose.pipeline.wearer_pipeline",
     "PoseFrame": "edgepose.pose",
-    "Recording": "edgepose.formats.recordings.csv_npz",
+    "Recording": "edgepose.imu",
     "Sink": "edgepose.sinks.base",
     "SourceConfig": "edgepose.config",
     "UdpSink": "edgepose.sinks.udp",
@@ -65,8 +65,8 @@ _MODULES = {
     "load_calibration": "edgepose.calibration",
     "load_model": "edgepose.inference.model",
     "open_source": "edgepose.sources",
-    "read_poses": "edgepose.formats.poses.reading",
-    "read_recording": "edgepose.formats.recordings.csv_npz",
+    "read_poses": "edgepose.formats.poses.registry",
+    "read_recording": "edgepose.formats.recordings.registry",
 }
 
 __all__ = [

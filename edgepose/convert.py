@@ -6,7 +6,7 @@ import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
@@ -15,41 +15,34 @@ from pathlib import Path
 from typing import NamedTuple
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.poses.npz_writer import write_npz as write_poses_npz
-from edgepose.formats.poses.reading import Poses, is_poses, salvage_poses
-from edgepose.formats.recordings import dip_imu, totalcapture
-from edgepose.formats.recordings import mt_manager as mtmanager
-from edgepose.formats.recordings import xio_session as xio
-from edgepose.formats.recordings.csv_npz import (
-    Recording,
-    from_samples,
-    salvage_recording,
-    write_csv,
-    write_npz,
-)
-from edgepose.formats.recordings.mvnx import read_mvnx
-from edgepose.imu import ImuSample
+from edgepose.formats.poses.npz_amass import write_npz as write_poses_npz
+from edgepose.formats.poses.registry import is_poses, pose_suffixes, salvage_poses
+from edgepose.formats.recordings import xio_session
+from edgepose.formats.recordings.base import from_samples
+from edgepose.formats.recordings.csv import write_csv
+from edgepose.formats.recordings.npz import write_npz
+from edgepose.formats.recordings.registry import find_format, recording_suffixes, salvage_recording
+from edgepose.imu import ImuSample, Recording
 from edgepose.placements import PLACEMENTS
+from edgepose.pose import Poses
 from edgepose.sinks.base import Sink
 from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.csv import CsvSink
 from edgepose.skeleton import default_body
 from edgepose.sources import open_source
 from edgepose.sources.replay import CAN_LOGS, CAPTURES, is_can_log, is_recording
+from edgepose.sources.sensor_map import read_map
 from edgepose.utils.durable_files import replace_file
 
 WRITERS: dict[str, Callable[[Path, Recording], None]] = {"csv": write_csv, "npz": write_npz}
 """What is written, by ending."""
 
-READERS: dict[str, Callable[[Path], Recording]] = {
-    ".mvnx": read_mvnx,
-    ".pkl": dip_imu.read_recording,
-    ".sensors": totalcapture.read_recording,
-}
-"""Readers of other programs' files, by ending."""
 
-ENDINGS = (".csv", ".npz", *CAPTURES, *CAN_LOGS, *READERS, ".bvh")
-"""Endings of the files that are looked for in a folder."""
+def _endings() -> tuple[str, ...]:
+    """Endings of the files that are looked for in a folder."""
+    return tuple(
+        dict.fromkeys([".csv", ".npz", *CAPTURES, *CAN_LOGS, *recording_suffixes(), *pose_suffixes()])
+    )
 
 
 class Job(NamedTuple):
@@ -139,13 +132,14 @@ def plan(inputs: Sequence[Path], to: str, out: Path) -> list[Job]:
 def _expand(given: Path, out: Path) -> Iterator[tuple[Path, Path]]:
     """Recordings that an input stands for, and their places below the output folder."""
     if given.is_dir():
+        endings = _endings()
         try:
-            found = sorted(_walk(given, out.resolve()))
+            found = sorted(_walk(given, out.resolve(), endings))
         except OSError as error:
             raise EdgeposeError(f"{error.filename}: cannot look into it: {error.strerror}") from None
         if not found:
             raise EdgeposeError(
-                f"{given}: no recording in this folder; names end in {', '.join(ENDINGS)}, or .gz of a log"
+                f"{given}: no recording in this folder; names end in {', '.join(endings)}, or .gz of a log"
             )
         for path in found:
             # The session that is itself given has its own name.
@@ -172,20 +166,19 @@ def _expand(given: Path, out: Path) -> Iterator[tuple[Path, Path]]:
         raise EdgeposeError(f"{given}: no such file or folder")
 
 
-def _walk(folder: Path, out: Path) -> Iterator[Path]:
+def _walk(folder: Path, out: Path, endings: tuple[str, ...]) -> Iterator[Path]:
     """Recordings in a folder, save those of an earlier conversion."""
-    session = xio.is_session(folder)
-    if session or mtmanager.is_session(folder):
+    if find_format(folder) is not None:
         yield folder
-    elif xio.is_sensor(folder):
+    elif xio_session.is_sensor(folder):
         raise EdgeposeError(f"{folder}: one sensor of an x-io session; give the folder above it")
     for path in folder.iterdir():
         if path.is_dir():
-            of_session = session and xio.is_sensor(path)
+            of_session = xio_session.is_sensor(path)
             if not of_session and not path.is_symlink() and path.resolve() != out:
-                yield from _walk(path, out)
+                yield from _walk(path, out, endings)
         # A pipe could be waited for in vain.
-        elif not path.is_fifo() and (path.suffix.lower() in ENDINGS or is_can_log(path)):
+        elif not path.is_fifo() and (path.suffix.lower() in endings or is_can_log(path)):
             yield path
 
 
@@ -236,13 +229,8 @@ def _make(folder: Path) -> None:
 
 
 def _read(path: Path, protocol: str, sensors: Path | None) -> Recording:
-    if path.is_dir():
-        read = mtmanager.read_session if mtmanager.is_session(path) else xio.read_session
-        return read(path, _serial_numbers(sensors))
     if is_recording(path):
-        return salvage_recording(path)
-    if path.suffix.lower() in READERS:
-        return READERS[path.suffix.lower()](path)
+        return salvage_recording(path, None if sensors is None else read_map(sensors).serial_numbers())
     problems: list[str] = []
     rows = list(_samples(path, protocol, sensors, problems))
     # Names need not be text.
@@ -261,16 +249,6 @@ def _samples(path: Path, protocol: str, sensors: Path | None, problems: list[str
             problems.append(str(error))
         if source.damage:
             problems.append(source.damage)
-
-
-def _serial_numbers(sensors: Path | None) -> Mapping[int, str] | None:
-    """Placements by the ids in a map of sensors."""
-    if sensors is None:
-        return None
-    from edgepose.sources.sensor_map import read_map
-
-    devices = read_map(sensors).devices
-    return {device.id: name for name, device in devices.items() if device.id is not None}
 
 
 def convert_all(jobs: Sequence[Job], options: Options = _DEFAULTS, workers: int = 1) -> Iterator[Result]:
@@ -338,7 +316,7 @@ def convert_poses(
     """Write what is good in a file of poses; the target appears when it is whole.
 
     Args:
-        source: file that `edgepose.formats.poses.reading.read_poses` reads.
+        source: file that `edgepose.formats.poses.registry.read_poses` reads.
         target: .csv, .npz or .bvh file.
         height_m: the wearer's stature, for the bones of a BVH file, metres.
         overwrite: whether it may take the place of a file.

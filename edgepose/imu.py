@@ -1,4 +1,4 @@
-"""What a sensor says and what six sensors say together."""
+"""Measurements of IMUs: one sample, one frame of six sensors, and whole recordings."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[np.float64]
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
@@ -61,3 +62,38 @@ class ImuFrame(NamedTuple):
     force: NDArray[np.float64]
     held: NDArray[np.bool_]
     ready_s: float
+
+
+class SensorData(NamedTuple):
+    """Samples of one sensor.
+
+    Attributes:
+        time_s: (N,) times, never decreasing, seconds.
+        quat: (N, 4) unit quaternions w, x, y, z, sensor to inertial; None if not measured.
+        acc: (N, 3) specific force, sensor frame, m/s^2; None if not measured.
+        gyr: (N, 3) angular rate, sensor frame, rad/s; None if not measured.
+        mag: (N, 3) magnetic field, sensor frame, uT; None if not measured.
+
+    A row of NaN means not measured at that time (a magnetometer slower than the rest).
+    """
+
+    time_s: Array
+    quat: Array | None = None
+    acc: Array | None = None
+    gyr: Array | None = None
+    mag: Array | None = None
+
+
+class Recording(NamedTuple):
+    """What six sensors measured.
+
+    Attributes:
+        sensors: data by placement name, in the order of PLACEMENTS.
+        metadata: rate, frame, units, placements and what else the file says about itself.
+        damage: one line for the user if a part of the file is no good (file, row, what to do); the rest is
+            here.
+    """
+
+    sensors: dict[str, SensorData]
+    metadata: dict[str, str]
+    damage: str | None = None

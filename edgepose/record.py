@@ -14,8 +14,10 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, TextIO, cast
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import csv_header, csv_row, salvage_recording, write_npz
+from edgepose.formats.recordings.csv import csv_header, csv_row
+from edgepose.formats.recordings.npz import write_npz
 from edgepose.formats.recordings.raw_capture import times_header, times_path, times_row
+from edgepose.formats.recordings.registry import salvage_recording
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import Source

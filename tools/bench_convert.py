@@ -16,7 +16,8 @@ from pathlib import Path
 import click
 import numpy as np
 
-from edgepose.formats.recordings.csv_npz import Recording, SensorData, write_csv
+from edgepose.formats.recordings.csv import write_csv
+from edgepose.imu import Recording, SensorData
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseFrame
 from edgepose.rotations import rotvec_to_matrix

@@ -16,7 +16,8 @@ import numpy as np
 from edgepose import calibration
 from edgepose import rotations as rot
 from edgepose.analysis.metrics import format_table, summary
-from edgepose.formats.recordings.csv_npz import Recording, SensorData, samples
+from edgepose.formats.recordings.base import samples
+from edgepose.imu import Recording, SensorData
 from edgepose.inference import archive
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.rotations import Array
@@ -65,7 +66,7 @@ def ideal(motion: Motion, mounting: Array) -> Recording:
 
 def oriented(recording: Recording, way: Way, seed: int) -> Recording:
     """What is left of it after the chip and the filter."""
-    from edgepose.formats.recordings.csv_npz import from_samples
+    from edgepose.formats.recordings.base import from_samples
     from edgepose.orientation import Orienter
 
     if way.chip is None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from edgepose.formats.poses.reading import read_poses
+from edgepose.formats.poses.registry import read_poses
 from edgepose.rotations import matrix_to_rotvec
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from edgepose import rotations as rot
 from edgepose.analysis.figures import skeleton_strip
 from edgepose.analysis.metrics import format_table, summary
-from edgepose.formats.poses.reading import read_poses
+from edgepose.formats.poses.registry import read_poses
 from edgepose.skeleton import default_body
 from firmware_protocols.registry import PROTOCOLS
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from edgepose.analysis.figures import skeleton_strip
 from edgepose.errors import EdgeposeError
-from edgepose.formats.poses.reading import read_poses
+from edgepose.formats.poses.registry import read_poses
 from edgepose.skeleton import default_body
 
 HEIGHT_M = 1.75

@@ -33,7 +33,9 @@ import click
 import numpy as np
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import Recording, SensorData, read_recording, write_npz
+from edgepose.formats.recordings.npz import write_npz
+from edgepose.formats.recordings.registry import read_recording
+from edgepose.imu import Recording, SensorData
 from edgepose.placements import PLACEMENTS
 from edgepose.skeleton import default_body
 from firmware_protocols.registry import PROTOCOLS, Frame

@@ -22,7 +22,7 @@ import demo
 import numpy as np
 from soak_viewer import RATE, cpu_s, make_recording, megabytes
 
-from edgepose.formats.poses.reading import read_poses
+from edgepose.formats.poses.registry import read_poses
 
 LOOKS = (0.1, 0.25, 0.5, 0.75, 0.95)
 """Parts of the time at which the run is looked at."""

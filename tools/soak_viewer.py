@@ -21,8 +21,10 @@ from pathlib import Path
 import click
 import numpy as np
 
-from edgepose.formats.poses.reading import read_poses
-from edgepose.formats.recordings.csv_npz import Recording, SensorData, read_recording, write_npz
+from edgepose.formats.poses.registry import read_poses
+from edgepose.formats.recordings.npz import write_npz
+from edgepose.formats.recordings.registry import read_recording
+from edgepose.imu import Recording, SensorData
 
 CLIP = Path(__file__).parent / "data" / "09_12.bvh"
 HOLD_S = 6

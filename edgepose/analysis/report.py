@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from edgepose.analysis.figures import INK, PREDICTION, require_matplotlib, skeleton_strip
 from edgepose.analysis.joint_angles import ANGLES, LIMBS, Walk, joint_angles, walks
-from edgepose.formats.poses.reading import Poses
 from edgepose.placements import PLACEMENTS
-from edgepose.pose import FILLING_WINDOW, held_sensors, longest_holds, status_bits
+from edgepose.pose import FILLING_WINDOW, Poses, held_sensors, longest_holds, status_bits
 from edgepose.skeleton import Body
 from edgepose.utils.durable_files import write_whole
 

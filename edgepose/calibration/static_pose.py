@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edgepose.errors import CalibrationError
-from edgepose.formats.recordings.csv_npz import Recording
-from edgepose.imu import ImuSample
+from edgepose.imu import ImuSample, Recording
 from edgepose.placements import PLACEMENTS, ROOT
 from edgepose.rotations import Array
 

@@ -13,7 +13,8 @@ from edgepose.calibration import HeadingReset, Hold, HoldSummary
 from edgepose.cli.prompts import Guide, all_reporting, held, moved, wait_for_enter
 from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import read_recording, samples
+from edgepose.formats.recordings.base import samples
+from edgepose.formats.recordings.registry import read_recording
 from edgepose.orientation.stage import OrientationStage
 from edgepose.sources import Device, open_source
 from edgepose.sources.replay import is_recording
@@ -150,11 +151,11 @@ def _check_north(orient: OrientationStage, plan: Plan) -> None:
 
 
 def _read(source: SourceConfig, orient: OrientationStage) -> tuple[Hold, str | None, Mapping[int, Device]]:
-    """Everything in a recording or a raw capture, what is wrong with its end, and what sent it."""
+    """Everything in a recording or a raw capture, what is wrong with it, and what sent it."""
     path = source.file
     assert path is not None
     if is_recording(path):
-        recording = read_recording(path)
+        recording = read_recording(path, _serial_numbers(source.sensors))
         everything = (
             calibration.hold_from_recording(recording)
             if orient.passes
@@ -164,6 +165,15 @@ def _read(source: SourceConfig, orient: OrientationStage) -> tuple[Hold, str | N
     with open_source(**dataclasses.replace(source, realtime=False).arguments()) as opened:
         everything = calibration.hold_from_samples(chain.from_iterable(orient(came) for _, came in opened))
         return everything, opened.damage, opened.devices
+
+
+def _serial_numbers(sensors: Path | None) -> Mapping[int, str] | None:
+    """Placements by serial number in a map of sensors."""
+    if sensors is None:
+        return None
+    from edgepose.sources.sensor_map import read_map
+
+    return read_map(sensors).serial_numbers()
 
 
 def _window(

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from edgepose.calibration.checks import GRAVITY, GRAVITY_SCALE_LIMIT, GRAVITY_TILT_LIMIT_DEG
-from edgepose.diagnostics.sensor_health import POSE_TILT_DEG, REST_ACC, REST_S, SensorHealth
+from edgepose.calibration.fit import POSE_TILT_DEG
+from edgepose.diagnostics.sensor_health import REST_ACC, REST_S, SensorHealth
 from edgepose.sources.clock_sync import FOLLOWED_PPM
 
 SILENT_S = 1.0

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
 from edgepose.formats.joint_tree import JointTree, fail, numbers
+from edgepose.pose import tidy_rate
 from edgepose.rotations import euler_to_matrix
 from edgepose.utils.safe_npz import check_size
 
@@ -27,13 +28,6 @@ FRAME_TIMES = (1e-5, 1e2)
 _LONGEST_LINE = 1 << 20  # characters; that of a frame of 1000 joints has less than 50,000
 _MOST_JOINTS = 10_000
 _JOINT_BYTES = 8 * (9 + 3)  # that a joint of a frame takes
-
-
-def tidy_rate(frame_time: float) -> float:
-    """Frames per second of a frame time in seconds that was printed with few digits: .0083333 is 120 Hz."""
-    rate = 1.0 / frame_time
-    whole = round(rate)
-    return float(whole) if abs(rate - whole) < 1e-4 * rate else rate
 
 
 def read_bvh(path: str | Path) -> JointTree:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import Recording, SensorData
+from edgepose.imu import Recording, SensorData
 from edgepose.orientation.filter import OrientationFilter
 from edgepose.orientation.smoother import smooth
 from edgepose.orientation.types import Oriented

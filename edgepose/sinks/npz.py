@@ -6,8 +6,8 @@ import os
 from pathlib import Path
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.poses.npz_writer import write_npz
-from edgepose.formats.poses.reading import read_blocks
+from edgepose.formats.poses.csv import read_blocks
+from edgepose.formats.poses.npz_amass import write_npz
 from edgepose.pose import PoseFrame
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.sinks.csv import CsvSink

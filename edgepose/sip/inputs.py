@@ -6,7 +6,9 @@ from pathlib import Path
 
 from edgepose.calibration import Calibration
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import Recording, from_samples, read_sensors, samples
+from edgepose.formats.recordings.base import from_samples, samples
+from edgepose.formats.recordings.registry import read_sensors
+from edgepose.imu import Recording
 from edgepose.placements import PLACEMENTS, SITES
 from edgepose.sip.measurements import Mount, mounts, mounts_from_hold
 

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from edgepose import rotations as rot
 from edgepose.calibration import GRAVITY, POSES, Calibration
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import Recording, SensorData
-from edgepose.imu import GAP_S
+from edgepose.imu import GAP_S, Recording, SensorData
 from edgepose.placements import PLACEMENTS, SITES
 from edgepose.skeleton import JOINTS
 

@@ -126,7 +126,7 @@ def open_source(
         can: CAN bus, INTERFACE:CHANNEL.
         bitrate: its speed, bit/s; None is the protocol's usual one, or 500000.
         fd: take CAN FD frames too.
-        file: recording (.csv, .npz, "-" for CSV on stdin), raw serial capture (.bin, .raw) or log of a CAN
+        file: recording of any format ("-" is CSV on stdin), raw serial capture (.bin, .raw) or log of a CAN
             bus.
         realtime: deliver a file at its own pace.
         protocol: name of a wire format, a TOML file that describes text lines, or "auto".

@@ -1,4 +1,4 @@
-"""Samples from recordings, raw captures of a serial port, and logs of CAN buses."""
+"""Samples from recordings of any format, raw captures of a serial port, and logs of CAN buses."""
 
 from __future__ import annotations
 
@@ -9,9 +9,15 @@ from pathlib import Path
 from types import TracebackType
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import Recording, read_recording, salvage_recording, samples
+from edgepose.formats.recordings.base import samples
 from edgepose.formats.recordings.raw_capture import read_capture
-from edgepose.imu import ImuSample
+from edgepose.formats.recordings.registry import (
+    find_format,
+    read_recording,
+    recording_suffixes,
+    salvage_recording,
+)
+from edgepose.imu import ImuSample, Recording
 from edgepose.sources import Batches, Counters, Device, Source, total
 from edgepose.sources.clock_sync import CaptureClock, DeviceClock, HostClocks
 from edgepose.sources.line_decoder import Clock, Places, Stream
@@ -31,21 +37,29 @@ _SLICE_S = 0.01
 
 
 class RecordingSource:
-    """A CSV or NPZ recording."""
+    """A recording of any format."""
 
-    def __init__(self, path: Path, realtime: bool, lenient: bool = False, waits: bool = True) -> None:
+    def __init__(
+        self,
+        path: Path,
+        realtime: bool,
+        lenient: bool = False,
+        waits: bool = True,
+        ids: Mapping[int, str] | None = None,
+    ) -> None:
         """Nothing is read yet.
 
         Args:
-            path: the file.
+            path: the file, or the folder of a session.
             realtime: deliver it at its own pace.
             lenient: take the good rows of any sensors; without, all six and no bad row.
             waits: see `open_source`.
+            ids: placements by serial number, see `read_recording`.
         """
         self.behind_s = 0.0
         self._path = path
         self._read = salvage_recording if lenient else read_recording
-        self._realtime, self._waits = realtime, waits
+        self._realtime, self._waits, self._ids = realtime, waits, ids
         self._recording: Recording | None = None
         self._packets = 0
 
@@ -66,7 +80,7 @@ class RecordingSource:
 
     @property
     def damage(self) -> str | None:
-        """What is wrong with the end of the file."""
+        """What is wrong with the file; the rest of it is delivered."""
         return self._recording.damage if self._recording else None
 
     def __enter__(self) -> RecordingSource:
@@ -75,7 +89,7 @@ class RecordingSource:
         Raises:
             EdgeposeError: it is no recording.
         """
-        self._recording = self._read(self._path)
+        self._recording = self._read(self._path, self._ids)
         return self
 
     def __exit__(
@@ -221,7 +235,8 @@ def open_file(
     if is_recording(path):
         if protocol != "auto":
             protocol_named(protocol)  # a wrong name is told although it would not be needed
-        return RecordingSource(path, realtime, lenient, waits)
+        ids = None if sensor_map is None else sensor_map.serial_numbers()
+        return RecordingSource(path, realtime, lenient, waits, ids)
     named = None if protocol == "auto" else protocol_named(protocol)
     if is_can_log(path) and (named is None or named.transport == "can"):
         from edgepose.sources.can_bus import read_log
@@ -233,14 +248,20 @@ def open_file(
         streams = _streams(path, protocols, sensor_map, _capture_clock)
         return LogSource(path, realtime, _read_capture, streams, waits)
     raise EdgeposeError(
-        f"{path}: unknown kind of file; recordings end in .csv or .npz, logs of CAN buses in "
-        f"{', '.join(CAN_LOGS)}, raw serial captures in {' or '.join(CAPTURES)} (with --protocol in anything)"
+        f"{path}: unknown kind of file; recordings end in {', '.join(recording_suffixes())}, logs of CAN "
+        f"buses in {', '.join(CAN_LOGS)}, raw serial captures in {' or '.join(CAPTURES)} (with --protocol in "
+        "anything else)"
     )
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a file is a recording, by its ending; a .csv may be a log of a CAN bus, by its first line."""
-    return str(path) == "-" or (path.suffix.lower() in (".csv", ".npz") and not is_can_log(path))
+    """Whether a file is a recording, by its ending; a .csv may be a log of a CAN bus, by its first line.
+
+    A folder is taken for one: where none is in it, reading tells.
+    """
+    if str(path) == "-" or path.is_dir():
+        return True
+    return path.suffix.lower() not in CAPTURES and not is_can_log(path) and find_format(path) is not None
 
 
 def is_can_log(path: Path) -> bool:

@@ -83,6 +83,10 @@ class SensorMap(NamedTuple):
             and (device.can is None or channel(device.can) == channel(line))
         }
 
+    def serial_numbers(self) -> dict[int, str]:
+        """Placements by id, for sessions of files that are named after serial numbers."""
+        return {device.id: name for name, device in self.devices.items() if device.id is not None}
+
     def all_places(self) -> Places:
         """Placements by id, of a line whose name is not known.
 

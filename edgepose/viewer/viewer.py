@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.poses.reading import Poses
 from edgepose.placements import PLACEMENTS
-from edgepose.pose import PoseFrame, held_sensors, longest_holds
+from edgepose.pose import PoseFrame, Poses, held_sensors, longest_holds
 from edgepose.sinks.udp import decode
 from edgepose.skeleton import Body, forward_kinematics
 from edgepose.viewer.body_mesh import build, ground

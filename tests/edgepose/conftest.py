@@ -10,7 +10,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from edgepose.formats.recordings.csv_npz import Recording, SensorData, read_recording, write_npz
+from edgepose.formats.recordings.npz import write_npz
+from edgepose.formats.recordings.registry import read_recording
+from edgepose.imu import Recording, SensorData
 
 CLIP = Path(__file__).parents[2] / "tools" / "data" / "09_12.bvh"
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import edgepose
-from edgepose.formats.poses.reading import read_poses
+from edgepose.formats.poses.registry import read_poses
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"

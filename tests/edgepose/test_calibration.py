@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from edgepose import calibration as cal
 from edgepose import rotations as rot
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import read_recording
+from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS, ROOT
 

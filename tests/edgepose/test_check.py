@@ -19,7 +19,9 @@ from pathlib import Path
 
 import pytest
 
-from edgepose.formats.recordings.csv_npz import read_recording, write_csv, write_npz
+from edgepose.formats.recordings.csv import write_csv
+from edgepose.formats.recordings.npz import write_npz
+from edgepose.formats.recordings.registry import read_recording
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import open_source
 

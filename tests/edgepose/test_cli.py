@@ -13,7 +13,9 @@ import pytest
 import serial
 
 from edgepose.cli import cli
-from edgepose.formats.recordings.csv_npz import read_recording, write_csv, write_npz
+from edgepose.formats.recordings.csv import write_csv
+from edgepose.formats.recordings.npz import write_npz
+from edgepose.formats.recordings.registry import read_recording
 from edgepose.inference import archive
 from edgepose.placements import PLACEMENTS
 

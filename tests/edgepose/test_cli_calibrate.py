@@ -22,7 +22,9 @@ from edgepose import calibration as cal
 from edgepose import rotations as rot
 from edgepose.cli.commands.calibrate import calibrate
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings import csv_npz as rec
+from edgepose.formats.recordings.base import from_samples
+from edgepose.formats.recordings.csv import write_csv
+from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import ImuSample
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose_export.synthesis.heading_routine import ASIDE_DEG, exercises
@@ -57,7 +59,7 @@ def write_recording(path: Path, quats_at: Callable[[float], np.ndarray], seconds
         quats = quats_at(t)
         for i, (q, f) in enumerate(zip(quats, forces(quats), strict=True)):
             samples.append(ImuSample(i, float(t), tuple(q), tuple(f)))
-    rec.write_csv(path, rec.from_samples(samples))
+    write_csv(path, from_samples(samples))
     return path
 
 
@@ -382,7 +384,7 @@ def test_headings_from_the_mounting_in_a_map(tmp_path: Path) -> None:
     file = write_recording(tmp_path / "pose.csv", lambda t: worn(cal.POSES["straight"]))
     found = cal.mounting(
         cal.calibrate(
-            cal.check_hold(cal.hold_from_recording(rec.read_recording(file))),
+            cal.check_hold(cal.hold_from_recording(read_recording(file))),
             pose="straight", body_frame="heading:70", created="", heading_offset=ERRORS,
         )
     )  # fmt: skip

@@ -25,14 +25,10 @@ from hypothesis import strategies as st
 from edgepose.cli import cli
 from edgepose.convert import Job, convert, plan
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import (
-    from_samples,
-    read_recording,
-    salvage_recording,
-    samples,
-    write_csv,
-    write_npz,
-)
+from edgepose.formats.recordings.base import from_samples, samples
+from edgepose.formats.recordings.csv import write_csv
+from edgepose.formats.recordings.npz import write_npz
+from edgepose.formats.recordings.registry import read_recording, salvage_recording
 from edgepose.formats.recordings.xio_session import placement_of
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from edgepose.errors import EdgeposeError
 from edgepose.formats.bvh import read_bvh
 from edgepose.formats.joint_tree import forward
-from edgepose.formats.poses.reading import is_poses, read_poses, salvage_poses
-from edgepose.formats.recordings.csv_npz import read_recording
+from edgepose.formats.poses.registry import is_poses, read_poses, salvage_poses
+from edgepose.formats.recordings.registry import read_recording
 from edgepose.pose import PoseFrame
 from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.csv import CsvSink

@@ -11,9 +11,9 @@ import pytest
 
 from edgepose.calibration import GRAVITY
 from edgepose.errors import EdgeposeError
-from edgepose.formats.poses.reading import read_poses
-from edgepose.formats.recordings.csv_npz import read_recording as read_npz
+from edgepose.formats.poses.registry import read_poses
 from edgepose.formats.recordings.dip_imu import read_recording
+from edgepose.formats.recordings.registry import read_recording as read_npz
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.rotations import Z_UP_TO_T, quat_to_matrix, rotvec_to_matrix
 from edgepose.skeleton import forward_kinematics

@@ -22,8 +22,9 @@ import numpy as np
 import pytest
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.poses.reading import read_poses
-from edgepose.formats.recordings.csv_npz import read_recording, samples
+from edgepose.formats.poses.registry import read_poses
+from edgepose.formats.recordings.base import samples
+from edgepose.formats.recordings.registry import read_recording
 from edgepose.utils.safe_pickle import read_pickle
 from firmware_protocols import native_can
 from firmware_protocols.native_packet import Packet
@@ -519,7 +520,8 @@ def test_escape_sequences_of_others_do_not_reach_a_terminal(wearer, tmp_path, wo
     assert b"\x1b" not in rest
     assert b"\x07" not in rest
     assert "\x9b" not in rest.decode(errors="replace")
-    assert "\u202e" not in rest.decode(errors="replace")
+    if words[0] != "record":  # whose output is data
+        assert "\u202e" not in rest.decode(errors="replace")
 
 
 def test_names_that_are_no_text(command, wearer, tmp_path):

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from edgepose import calibration as cal
 from edgepose import rotations as rot
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import read_recording
+from edgepose.formats.recordings.registry import read_recording
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose_export.synthesis.heading_routine import ASIDE_DEG, exercises
 from edgepose_export.synthesis.virtual_imus import INERTIAL_FROM_BODY, random_mounting, straight_pose

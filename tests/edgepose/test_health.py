@@ -14,8 +14,9 @@ from edgepose import rotations as rot
 from edgepose.calibration import GRAVITY, load_calibration
 from edgepose.diagnostics.rules import Finding, judge
 from edgepose.diagnostics.sensor_health import Health, SensorHealth
-from edgepose.formats.recordings.csv_npz import SensorData, read_recording, samples
-from edgepose.imu import ImuSample
+from edgepose.formats.recordings.base import samples
+from edgepose.formats.recordings.registry import read_recording
+from edgepose.imu import ImuSample, SensorData
 from edgepose.placements import PLACEMENTS
 from edgepose.sources.clock_sync import DeviceClock
 

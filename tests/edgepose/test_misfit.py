@@ -15,8 +15,9 @@ from edgepose import rotations as rot
 from edgepose.calibration import POSES, load_calibration
 from edgepose.calibration.fit import fit_pose, impossible_bones
 from edgepose.calibration.misfit import Misfits
-from edgepose.formats.recordings.csv_npz import Recording, read_recording, write_npz
-from edgepose.imu import ImuFrame
+from edgepose.formats.recordings.npz import write_npz
+from edgepose.formats.recordings.registry import read_recording
+from edgepose.imu import ImuFrame, Recording
 from edgepose.pipeline.rig_comparison import other_devices
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import Device

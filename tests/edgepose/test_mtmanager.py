@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import from_samples, read_recording, samples
+from edgepose.formats.recordings.base import from_samples, samples
 from edgepose.formats.recordings.mt_manager import is_session, read_session
+from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
 

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 from edgepose.calibration import GRAVITY
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import Recording, read_recording
 from edgepose.formats.recordings.mvnx import LABELS, read_mvnx
+from edgepose.formats.recordings.registry import read_recording
+from edgepose.imu import Recording
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import quat_rotate
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.poses.reading import read_poses
-from edgepose.formats.recordings.csv_npz import read_recording
+from edgepose.formats.poses.registry import read_poses
+from edgepose.formats.recordings.registry import read_recording
 from edgepose.sip.prior import load_prior
 from edgepose_export.mocap import read_motion
 from edgepose_export.training.dataset import read_take

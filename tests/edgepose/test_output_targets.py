@@ -22,8 +22,10 @@ from click.testing import CliRunner
 from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
 from edgepose.formats.bvh import read_bvh
-from edgepose.formats.poses.reading import read_poses
-from edgepose.formats.recordings.csv_npz import Recording, SensorData, read_recording, write_npz
+from edgepose.formats.poses.registry import read_poses
+from edgepose.formats.recordings.npz import write_npz
+from edgepose.formats.recordings.registry import read_recording
+from edgepose.imu import Recording, SensorData
 from edgepose.pose import PoseFrame
 from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.npz import NpzSink

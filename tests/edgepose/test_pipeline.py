@@ -11,7 +11,7 @@ import pytest
 from edgepose.calibration import load_calibration
 from edgepose.calibration.rezero import Headings
 from edgepose.errors import EdgeposeError
-from edgepose.formats.poses.reading import read_poses
+from edgepose.formats.poses.registry import read_poses
 from edgepose.imu import ImuFrame
 from edgepose.inference import archive
 from edgepose.inference.engine import StreamEngine

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from edgepose.formats.recordings.csv_npz import read_recording
+from edgepose.formats.recordings.registry import read_recording
 from edgepose.placements import PLACEMENTS
 
 PLUGIN = Path(__file__).parents[2] / "examples" / "plugin"

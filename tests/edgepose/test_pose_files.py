@@ -17,9 +17,11 @@ from scipy.spatial.transform import Rotation
 from edgepose.errors import EdgeposeError
 from edgepose.formats.bvh import read_bvh
 from edgepose.formats.joint_tree import forward
-from edgepose.formats.poses.reading import BLOCK, Poses, is_poses, read_blocks, read_poses, salvage_poses
-from edgepose.formats.recordings.csv_npz import read_recording, write_csv
-from edgepose.pose import PoseFrame
+from edgepose.formats.poses.csv import BLOCK, read_blocks
+from edgepose.formats.poses.registry import is_poses, read_poses, salvage_poses
+from edgepose.formats.recordings.csv import write_csv
+from edgepose.formats.recordings.registry import read_recording
+from edgepose.pose import PoseFrame, Poses
 from edgepose.sinks.bvh import BvhSink, depth_first
 from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.npz import NpzSink

@@ -24,8 +24,10 @@ from edgepose.analysis.metrics import joint_angle_error
 from edgepose.calibration import EXERCISE_S, ROUTINE, load_calibration
 from edgepose.cli.commands.calibrate import calibrate
 from edgepose.errors import EdgeposeError
-from edgepose.formats.poses.reading import read_poses
-from edgepose.formats.recordings.csv_npz import Recording, SensorData, read_recording, write_npz
+from edgepose.formats.poses.registry import read_poses
+from edgepose.formats.recordings.npz import write_npz
+from edgepose.formats.recordings.registry import read_recording
+from edgepose.imu import Recording, SensorData
 from edgepose.placements import PLACEMENTS
 from edgepose.skeleton import local_from_global
 from edgepose_export.mocap import read_motion, resample

@@ -20,8 +20,9 @@ import numpy as np
 import pytest
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import from_samples, read_recording, salvage_recording, samples
+from edgepose.formats.recordings.base import from_samples, samples
 from edgepose.formats.recordings.raw_capture import read_capture, times_path
+from edgepose.formats.recordings.registry import read_recording, salvage_recording
 from edgepose.imu import ImuSample
 from edgepose.pipeline.frame_synchronizer import FrameClock
 from edgepose.record import CAN_LOGS, Output, open_output, record

@@ -11,18 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import (
-    COLUMNS,
-    csv_header,
-    csv_row,
-    from_samples,
-    missing_sensors,
-    read_recording,
-    salvage_recording,
-    samples,
-    write_csv,
-    write_npz,
-)
+from edgepose.formats.recordings.base import from_samples, samples
+from edgepose.formats.recordings.csv import COLUMNS, csv_header, csv_row, write_csv
+from edgepose.formats.recordings.npz import write_npz
+from edgepose.formats.recordings.registry import missing_sensors, read_recording, salvage_recording
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
 

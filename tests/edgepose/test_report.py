@@ -19,7 +19,7 @@ from edgepose.analysis.joint_angles import ANGLES, LIMBS, joint_angles, walks
 from edgepose.analysis.report import POINTS, extremes, write_report
 from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
-from edgepose.formats.poses.reading import read_poses
+from edgepose.formats.poses.registry import read_poses
 from edgepose.pose import PoseFrame, longest_holds
 from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.csv import CsvSink

@@ -22,8 +22,11 @@ from edgepose.calibration import load_calibration
 from edgepose.calibration.rezero import Headings
 from edgepose.cli.options.wearer import read_rigs
 from edgepose.errors import EdgeposeError
-from edgepose.formats.poses.reading import read_poses
-from edgepose.formats.recordings.csv_npz import SensorData, read_recording, write_csv, write_npz
+from edgepose.formats.poses.registry import read_poses
+from edgepose.formats.recordings.csv import write_csv
+from edgepose.formats.recordings.npz import write_npz
+from edgepose.formats.recordings.registry import read_recording
+from edgepose.imu import SensorData
 from edgepose.inference.engine import StreamEngine
 from edgepose.pipeline.frame_synchronizer import FrameClock
 from edgepose.pipeline.run import Walk, run

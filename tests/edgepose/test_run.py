@@ -25,8 +25,10 @@ import pytest
 
 from edgepose import rotations as rot
 from edgepose.calibration import apply, load_calibration
-from edgepose.formats.poses.reading import read_poses
-from edgepose.formats.recordings.csv_npz import read_recording, samples, write_csv
+from edgepose.formats.poses.registry import read_poses
+from edgepose.formats.recordings.base import samples
+from edgepose.formats.recordings.csv import write_csv
+from edgepose.formats.recordings.registry import read_recording
 from edgepose.inference import archive
 from edgepose.pipeline.frame_synchronizer import FrameClock
 from edgepose.placements import PLACEMENTS

@@ -17,7 +17,7 @@ from pythonosc.osc_bundle import OscBundle
 
 from edgepose.formats.bvh import read_bvh
 from edgepose.formats.joint_tree import forward
-from edgepose.formats.poses.reading import read_poses
+from edgepose.formats.poses.registry import read_poses
 from edgepose.skeleton import default_body, forward_kinematics
 from edgepose_export.mocap import read_motion
 

@@ -14,7 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.poses.reading import read_poses
+from edgepose.formats.poses.registry import read_poses
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseFrame
 from edgepose.rotations import matrix_to_euler_zxy

@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 
 from edgepose.analysis import metrics
-from edgepose.formats.poses.reading import read_poses
-from edgepose.formats.recordings.csv_npz import Recording, SensorData, read_recording, write_csv, write_npz
+from edgepose.formats.poses.registry import read_poses
+from edgepose.formats.recordings.csv import write_csv
+from edgepose.formats.recordings.npz import write_npz
+from edgepose.formats.recordings.registry import read_recording
+from edgepose.imu import Recording, SensorData
 from edgepose.rotations import rotvec_to_matrix
 from edgepose.skeleton import default_body, forward_kinematics
 

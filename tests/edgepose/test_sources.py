@@ -15,8 +15,10 @@ import pytest
 import serial
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import csv_header, csv_row, read_recording, samples, write_csv
+from edgepose.formats.recordings.base import samples
+from edgepose.formats.recordings.csv import csv_header, csv_row, write_csv
 from edgepose.formats.recordings.raw_capture import times_header, times_path, times_row
+from edgepose.formats.recordings.registry import read_recording
 from edgepose.pipeline.frame_synchronizer import FrameClock
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import open_source

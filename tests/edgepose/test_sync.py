@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from edgepose import rotations
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import read_recording, samples
+from edgepose.formats.recordings.base import samples
+from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import ImuSample
 from edgepose.pipeline.frame_synchronizer import STALE_S, FrameClock
 from edgepose.placements import PLACEMENTS

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import read_recording as read_npz
+from edgepose.formats.recordings.registry import read_recording as read_npz
 from edgepose.formats.recordings.totalcapture import NAMES, read_recording
 from edgepose.placements import PLACEMENTS
 

@@ -28,7 +28,7 @@ from websockets.sync.client import connect
 
 from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
-from edgepose.formats.poses.reading import read_poses
+from edgepose.formats.poses.registry import read_poses
 from edgepose.pose import PoseFrame, held_sensors
 from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.csv import CsvSink
@@ -443,7 +443,7 @@ def test_wrong_use(command, tmp_path, words, code, says):
 SHORT_OF_MEMORY = """
 import re, resource, sys
 from pathlib import Path
-import edgepose.cli.commands.view, edgepose.formats.poses.reading
+import edgepose.cli.commands.view, edgepose.formats.poses.registry
 held = int(re.search(r"VmSize:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) << 10
 resource.setrlimit(resource.RLIMIT_AS, (held + (60 << 20),) * 2)
 edgepose.cli.main()

@@ -7,7 +7,7 @@ import pytest
 
 from edgepose import rotations as rot
 from edgepose.calibration import EXERCISE_S, GRAVITY, ROUTINE
-from edgepose.formats.recordings.csv_npz import SensorData
+from edgepose.imu import SensorData
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose_export.synthesis.heading_routine import exercises
 from edgepose_export.synthesis.imu_errors import BMI270, FIELD_UT, raw

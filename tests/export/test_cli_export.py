@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import read_recording
+from edgepose.formats.recordings.registry import read_recording
 from edgepose.inference import archive
 from edgepose.placements import PLACEMENTS
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from edgepose.analysis.metrics import joint_angle_error
 from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
-from edgepose.formats.poses.reading import read_poses
+from edgepose.formats.poses.registry import read_poses
 from edgepose.inference import archive
 from edgepose.inference.engine import StreamEngine
 from edgepose.inference.quantisation import pack, pack_weights

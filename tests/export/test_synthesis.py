@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from edgepose import calibration
 from edgepose import rotations as rot
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import read_recording
+from edgepose.formats.recordings.registry import read_recording
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import PARENTS, Body, default_body, local_from_global
 from edgepose_export.cli.synthesize import synthesize

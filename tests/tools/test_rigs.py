@@ -21,8 +21,10 @@ import serial
 
 from edgepose import rotations as rot
 from edgepose.analysis.metrics import summary
-from edgepose.formats.poses.reading import read_poses
-from edgepose.formats.recordings.csv_npz import Recording, SensorData, read_recording, write_npz
+from edgepose.formats.poses.registry import read_poses
+from edgepose.formats.recordings.npz import write_npz
+from edgepose.formats.recordings.registry import read_recording
+from edgepose.imu import Recording, SensorData
 from edgepose.skeleton import JOINTS, default_body
 from edgepose.sources.can_bus import Buffered
 

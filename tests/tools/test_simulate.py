@@ -19,7 +19,10 @@ import can
 import numpy as np
 import pytest
 
-from edgepose.formats.recordings.csv_npz import from_samples, read_recording, write_csv, write_npz
+from edgepose.formats.recordings.base import from_samples
+from edgepose.formats.recordings.csv import write_csv
+from edgepose.formats.recordings.npz import write_npz
+from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
 from firmware_protocols.native import cobs_decode

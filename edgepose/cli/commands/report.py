@@ -39,7 +39,7 @@ def report(poses: Path, out: Path | None, height: float, overwrite: bool) -> Non
       edgepose report walk.npz --out reports/walk.html --height 1.68
     """
     from edgepose.analysis.report import write_report
-    from edgepose.formats.poses.reading import read_poses
+    from edgepose.formats.poses.registry import read_poses
     from edgepose.skeleton import default_body
 
     if poses.is_dir():

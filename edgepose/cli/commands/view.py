@@ -65,7 +65,7 @@ def view(
     if reference is not None and poses is None:
         raise click.UsageError("--reference needs POSES, a file")
 
-    from edgepose.formats.poses.reading import read_poses
+    from edgepose.formats.poses.registry import read_poses
     from edgepose.skeleton import default_body
 
     body = default_body(height)

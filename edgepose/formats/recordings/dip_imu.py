@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from edgepose import rotations as rot
 from edgepose.calibration import GRAVITY
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import Recording, SensorData, from_samples, samples
+from edgepose.formats.recordings.base import RecordingFormat, from_samples, samples
+from edgepose.imu import Recording, SensorData
 from edgepose.placements import PLACEMENTS
 from edgepose.utils.safe_pickle import array_of, numbers, read_pickle
 
@@ -181,3 +182,6 @@ def _fill(values: Array, what: str) -> NDArray[np.bool_]:
     nearer = np.where(np.abs(good[after] - rows) < np.abs(rows - good[before]), good[after], good[before])
     values[:] = values[nearer]
     return finite
+
+
+FORMAT = RecordingFormat((".pkl",), lambda path, options: read_recording(path))

@@ -13,9 +13,9 @@ from math import isfinite
 from pathlib import Path
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import Recording, from_samples
+from edgepose.formats.recordings.base import RecordingFormat, from_samples
 from edgepose.formats.recordings.xio_session import by_placement
-from edgepose.imu import ImuSample
+from edgepose.imu import ImuSample, Recording
 from edgepose.placements import PLACEMENTS
 
 _COUNTER = "PacketCounter"
@@ -146,3 +146,6 @@ def _samples(lines: Iterator[str], names: list[str], index: int) -> tuple[list[I
         if values:
             samples.append(ImuSample(index, float(count), *(values.get(name) for name in _QUANTITIES)))  # type: ignore[arg-type]
     return samples, bad
+
+
+FORMAT = RecordingFormat((), lambda folder, options: read_session(folder, options.ids), is_session)

@@ -22,8 +22,8 @@ from xml.parsers import expat
 
 from edgepose.calibration import GRAVITY
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import Recording, from_samples
-from edgepose.imu import ImuSample
+from edgepose.formats.recordings.base import RecordingFormat, from_samples
+from edgepose.imu import ImuSample, Recording
 from firmware_protocols.rotation import rotate_back
 from firmware_protocols.sample import unit_quaternion
 
@@ -253,3 +253,6 @@ def _sample(sensor: int, time_s: float, numbers: dict[str, Any]) -> ImuSample:
         for values in map(numbers.get, _EXTRAS)
     )
     return ImuSample(sensor, time_s, quat, acc, gyr, mag)
+
+
+FORMAT = RecordingFormat((".mvnx",), lambda path, options: read_mvnx(path))

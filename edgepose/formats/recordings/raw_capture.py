@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import comments
+from edgepose.formats.recordings.csv import comments
 
 COLUMNS = "time_s,end"
 """Header of the times."""

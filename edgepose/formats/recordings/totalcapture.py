@@ -20,7 +20,8 @@ from edgepose import rotations as rot
 from edgepose.calibration import GRAVITY
 from edgepose.calibration.checks import tilt_deg
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import Recording, SensorData
+from edgepose.formats.recordings.base import RecordingFormat
+from edgepose.imu import Recording, SensorData
 from edgepose.placements import PLACEMENTS
 
 Array = NDArray[np.float64]
@@ -163,3 +164,6 @@ def _row(cells: list[str]) -> list[float]:
     if len(row) != _NUMBERS or not np.abs(row).max() < 1e4 or not abs(np.linalg.norm(row[:4]) - 1.0) < 0.1:
         raise ValueError
     return row
+
+
+FORMAT = RecordingFormat((".sensors",), lambda path, options: read_recording(path))

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import Recording, from_samples
-from edgepose.imu import ImuSample
+from edgepose.formats.recordings.base import RecordingFormat, from_samples
+from edgepose.imu import ImuSample, Recording
 from edgepose.placements import PLACEMENTS
 from firmware_protocols.sample import Sample
 from firmware_protocols.ximu3 import Ximu3Decoder
@@ -149,3 +149,6 @@ def _chunks(lines: Iterable[bytes]) -> Iterator[bytes]:
             yield b"".join(chunk)
             chunk = []
     yield b"".join(chunk)
+
+
+FORMAT = RecordingFormat((), lambda folder, options: read_session(folder, options.ids), is_session)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edgepose.calibration import GRAVITY
-from edgepose.formats.recordings.csv_npz import SensorData
+from edgepose.imu import SensorData
 from edgepose.rotations import Array, quat_conjugate, quat_rotate
 
 

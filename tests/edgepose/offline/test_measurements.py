@@ -8,7 +8,9 @@ import pytest
 from edgepose import rotations as rot
 from edgepose.calibration import load_calibration
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.csv_npz import Recording, SensorData, read_recording, read_sensors, write_npz
+from edgepose.formats.recordings.npz import write_npz
+from edgepose.formats.recordings.registry import read_recording, read_sensors
+from edgepose.imu import Recording, SensorData
 from edgepose.placements import SITES
 from edgepose.sip import inputs as reading
 from edgepose.sip.measurements import Mount, measure, mounts_from_hold

@@ -11,8 +11,9 @@ from edgepose import rotations as rot
 from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings import xio_session as xio
-from edgepose.formats.recordings.csv_npz import Recording, SensorData, read_recording, samples
-from edgepose.imu import ImuSample
+from edgepose.formats.recordings.base import samples
+from edgepose.formats.recordings.registry import read_recording
+from edgepose.imu import ImuSample, Recording, SensorData
 from edgepose.orientation import Event, OrientationFilter, Orienter, smooth
 from edgepose.orientation.offline import orient_recording
 from edgepose.orientation.vqf_filter import VqfFilter

@@ -1,0 +1,15 @@
+"""How each sensor of a rig does, measured on its samples while they come; `diagnostics.rules` judges it.
+
+Times at rest tell most: whatever its attitude, a sensor at rest measures nothing but gravity, which its
+orientation turns to (0, 0, 9.81) in the inertial frame.
+
+Each measurement is a small class with `update`, which takes rows of numbers (see `columns`), and `result`.
+`Sensor` keeps the newest rows of one sensor and passes them on; `Health` compares the sensors of a rig.
+"""
+
+from edgepose.diagnostics.sensor_health.columns import WINDOW_S
+from edgepose.diagnostics.sensor_health.health import Health
+from edgepose.diagnostics.sensor_health.report import SensorHealth
+from edgepose.diagnostics.sensor_health.rest import REST_ACC, REST_GYR_DEG_S, REST_S, REST_TURN_DEG
+
+__all__ = ["REST_ACC", "REST_GYR_DEG_S", "REST_S", "REST_TURN_DEG", "WINDOW_S", "Health", "SensorHealth"]

@@ -1,0 +1,70 @@
+"""All sensors of a rig."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable, Mapping
+
+from edgepose.calibration.sensor_to_segment import Calibration
+from edgepose.diagnostics.sensor_health.columns import row_of
+from edgepose.diagnostics.sensor_health.comparison import HeadingComparison, compare_values
+from edgepose.diagnostics.sensor_health.report import SensorHealth
+from edgepose.diagnostics.sensor_health.sensor import Sensor
+from edgepose.imu import ImuSample
+from edgepose.placements import PLACEMENTS
+from edgepose.sources.clock_sync import DeviceClock
+
+_FOLD_S = 2.0  # how often samples become numbers where nobody asks for them
+_MOST_PENDING = 5000
+
+
+class Health:
+    """Takes the samples of a rig and says at any time how its sensors do."""
+
+    def __init__(self, calibration: Calibration | None = None) -> None:
+        """Start with no sample seen; with a calibration, headings and placements are judged on the body."""
+        self._sensors = [Sensor() for _ in PLACEMENTS]
+        self._headings = HeadingComparison(calibration)
+        self._next_fold_s = -math.inf
+
+    def add(self, samples: Iterable[ImuSample], arrival_s: float = math.nan) -> None:
+        """Take samples in.
+
+        Args:
+            samples: of any sensors, each sensor's in time order.
+            arrival_s: when they came, on their clock, seconds; NaN if nobody knows.
+        """
+        for sample in samples:
+            pending = self._sensors[sample.sensor].pending
+            pending.append(row_of(sample, arrival_s))
+            if sample.time_s >= self._next_fold_s or len(pending) >= _MOST_PENDING:
+                self._fold()
+                self._next_fold_s = sample.time_s + _FOLD_S
+
+    def report(self, now_s: float, clocks: Mapping[int, DeviceClock] | None = None) -> list[SensorHealth]:
+        """What is known of the sensors, in the order of PLACEMENTS.
+
+        Args:
+            now_s: time up to which all samples have been taken in, on their clock, seconds.
+            clocks: of the sensors that send a time.
+        """
+        self._fold()
+        result = []
+        headings, values = self._headings.result(), compare_values(self._sensors)
+        for i, (name, sensor) in enumerate(zip(PLACEMENTS, self._sensors, strict=True)):
+            fields = headings[i] | values[i]
+            if clocks is not None and i in clocks:
+                ppm, error = clocks[i].drift_ppm()
+                fields |= {
+                    "clock_ppm": ppm,
+                    "clock_ppm_error": error,
+                    "clock_restarts": clocks[i].resets,
+                }
+            result.append(dataclasses.replace(sensor.health(name, now_s), **fields))
+        return result
+
+    def _fold(self) -> None:
+        for sensor in self._sensors:
+            sensor.fold()
+        self._headings.update(self._sensors)

@@ -1,0 +1,80 @@
+"""When samples were measured and when they came: period, jitter, losses, delay."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from edgepose.diagnostics.sensor_health.columns import ARRIVAL, TIME
+from edgepose.rotations import Array
+
+_GAP = 1.5  # periods
+_SETTLE_S, _LATE_LEAST_S = 2.0, 3.0  # what has waited in the system comes first
+
+
+class TimingResult(NamedTuple):
+    """Fields of `SensorHealth`."""
+
+    age_s: float
+    rate_hz: float
+    jitter_ms: float
+    lost: int
+    lost_percent: float
+    late_ms: float
+
+
+class Timing:
+    """Period of the samples, and what is missing between them.
+
+    Attributes:
+        period_s: mean interval between samples, gaps left out, seconds; NaN until it is known.
+    """
+
+    def __init__(self) -> None:
+        """Nothing is known."""
+        self.period_s = self._jitter_s = math.nan
+        self._lost = 0
+
+    def update(self, window: Array, fresh: int) -> None:
+        """Measure the window (n, 15), at the end of which so many rows are new."""
+        times = window[:, TIME]
+        intervals = np.diff(times)
+        middle = float(np.median(intervals))
+        if not middle > 0.0:
+            return
+        steps = intervals / middle
+        # Only where nearly all intervals are multiples of one does a long one mean that something is missing.
+        regular = np.mean(np.abs(steps - np.round(steps)) < 0.2) > 0.9
+        usual = intervals[steps < _GAP] if regular else intervals
+        self.period_s, self._jitter_s = float(usual.mean()), float(usual.std())
+        if regular:
+            steps = np.diff(times[-fresh - 1 :]) / self.period_s
+            self._lost += int(np.round(steps[steps > _GAP] - 1.0).sum())
+
+    def result(self, window: Array, samples: int, first_s: float, now_s: float) -> TimingResult:
+        """What is known at a time.
+
+        Args:
+            window: (n, 15) newest rows, at least one.
+            samples: that have come in all.
+            first_s: time of the first of all samples.
+            now_s: the time.
+        """
+        return TimingResult(
+            max(0.0, now_s - float(window[-1, TIME])),
+            1.0 / self.period_s,
+            1e3 * self._jitter_s,
+            self._lost,
+            100.0 * self._lost / (self._lost + samples),
+            1e3 * _late_s(window[window[:, TIME] > first_s + _SETTLE_S]),
+        )
+
+
+def _late_s(rows: Array) -> float:
+    """How much later than the fastest packets most come, once the device's clock is known."""
+    if not len(rows) or rows[-1, TIME] - rows[0, TIME] < _LATE_LEAST_S:
+        return math.nan
+    low, high = np.percentile(rows[:, ARRIVAL] - rows[:, TIME], [5, 95])
+    return float(high - low)

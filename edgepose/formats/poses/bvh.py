@@ -1,0 +1,81 @@
+"""Poses as BVH with SMPL's joints, in a world with the axes of T."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgepose.errors import EdgeposeError
+from edgepose.formats.bvh import salvage_bvh
+from edgepose.formats.joint_tree import JointTree
+from edgepose.formats.poses.base import PoseFormat
+from edgepose.pose import Poses
+from edgepose.skeleton import JOINTS, PARENTS, standing_place
+
+Array = NDArray[np.float64]
+
+_LIMBS = {
+    "left_knee": (0, -1, 0),
+    "right_knee": (0, -1, 0),
+    "left_elbow": (1, 0, 0),
+    "right_elbow": (-1, 0, 0),
+}
+"""Joints at the far ends of limbs, and where the limbs point in the T-pose."""
+
+_SAME_PLACE_M = 1e-5  # BVH has four decimals of a centimetre
+
+
+def read_bvh(path: Path) -> tuple[Poses, str | None]:
+    """Poses of a BVH file with SMPL's joints, whose world has the axes of T."""
+    tree, problem = salvage_bvh(path)
+    places = _smpl_joints(path, tree)
+    count = len(tree.rotations)
+    rotations = np.broadcast_to(np.eye(3), (count, len(JOINTS), 3, 3)).copy()
+    metres = _metres(tree.offsets[places["left_ankle"]])
+    offsets = np.zeros((len(JOINTS), 3))
+    for joint, name in enumerate(JOINTS):
+        if name in places:
+            rotations[:, joint] = tree.rotations[:, places[name]]
+            offsets[joint] = metres * tree.offsets[places[name]]
+    translation = metres * tree.positions[:, 0]
+    # Where `BvhSink` puts those of whom it knows no place.
+    known = np.abs(translation - standing_place(offsets)).max() > _SAME_PLACE_M
+    times = np.arange(count) / tree.rate
+    poses = Poses(np.arange(count), times, ["ok"] * count, rotations, translation if known else None)
+    return poses, problem
+
+
+def _smpl_joints(path: Path, tree: JointTree) -> dict[str, int]:
+    """Places in a tree of SMPL's joints by name; only hands may be missing, and case does not matter.
+
+    Raises:
+        EdgeposeError: it has other joints, or they turn from another pose than the T-pose.
+    """
+    places = {name.lower(): place for place, name in enumerate(tree.names)}
+    missing = [name for name in JOINTS[:22] if name not in places]
+    if missing:
+        more = " ..." if len(missing) > 3 else ""
+        raise EdgeposeError(f"{path}: its joints are not SMPL's: no {', '.join(missing[:3])}{more}")
+    for joint, parent in enumerate(PARENTS):
+        if (place := places.get(JOINTS[joint])) is not None:
+            wanted = -1 if parent < 0 else places[JOINTS[parent]]
+            if tree.parents[place] != wanted:
+                raise EdgeposeError(f"{path}: its joint {JOINTS[joint]} does not hang where SMPL's does")
+    for name, direction in _LIMBS.items():
+        offset = tree.offsets[places[name]]
+        if not offset @ direction > 0.7 * np.linalg.norm(offset):
+            raise EdgeposeError(
+                f"{path}: where all angles are zero, its {name} is not where a T-pose has it (Y up, facing Z)"
+            )
+    return places
+
+
+def _metres(shank: Array) -> float:
+    """Metres in the unit of a shank (3,): BVH names none, and m, cm and mm are common."""
+    length = max(float(np.linalg.norm(shank)), 1e-9)
+    return min((1.0, 0.01, 0.001), key=lambda metres: abs(np.log(length * metres / 0.4)))
+
+
+FORMAT = PoseFormat((".bvh",), read_bvh)

@@ -1,0 +1,234 @@
+"""Poses as CSV, in any of the representations of `edgepose run`."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from array import array
+from collections.abc import Callable, Iterator
+from functools import partial
+from io import BufferedReader
+from itertools import islice
+from pathlib import Path
+from typing import TextIO, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgepose.errors import EdgeposeError
+from edgepose.formats.poses.base import LARGEST_TIME, PoseFormat, is_absurd
+from edgepose.formats.poses.csv_columns import FORMS, pose_columns
+from edgepose.pose import Poses
+from edgepose.rotations import euler_to_matrix, nearest_rotation, quat_to_matrix, rotvec_to_matrix
+from edgepose.skeleton import JOINTS
+
+Array = NDArray[np.float64]
+
+MAX_LINE = 16_384
+"""Characters; a true row has less than 4000, and a file without line breaks must not fill the memory."""
+
+BLOCK = 4096
+"""Poses that are read from a CSV file at a time."""
+
+_HEADER = b"frame,time_s,status,"
+
+
+def read_csv(path: Path) -> tuple[Poses, str | None]:
+    """The poses before the first bad one, and what is wrong with that; "-" is standard input."""
+    blocks: list[Poses] = []
+    problem = None
+    try:
+        blocks.extend(read_blocks(path))  # one by one: what has come before an error stays
+    except EdgeposeError as error:
+        if not blocks:
+            raise
+        problem = str(error)
+    return _concatenate(blocks), problem
+
+
+def read_blocks(path: str | Path) -> Iterator[Poses]:
+    """Poses of a CSV file in blocks of up to `BLOCK`, at least one, in any of the representations, which
+    is found from its header; "-" is standard input.
+
+    Raises:
+        EdgeposeError: no such file, or not a file of poses; names the row, counted from 1 for the header.
+            All poses before that have come.
+    """
+    if str(path) == "-":
+        yield from _read_rows(sys.stdin, "standard input")
+        return
+    try:
+        # A byte that is no text spoils its row, not the block that is read with it.
+        with Path(path).open(encoding="utf-8-sig", errors="replace", newline="") as file:
+            yield from _read_rows(file, str(path))
+    except OSError as error:
+        raise EdgeposeError(f"cannot read poses from {path}: {error.strerror or error}") from error
+
+
+class _BadRowError(EdgeposeError):
+    """A row that is no pose; `row` is its number, counted from 1 for the header."""
+
+    def __init__(self, name: str, row: int, problem: str) -> None:
+        super().__init__(f"{name}, row {row}: {problem}")
+        self.row = row
+
+
+def _read_rows(file: TextIO, name: str) -> Iterator[Poses]:
+    rows = csv.reader(_lines(file))
+    first = 2
+    last: tuple[int, float] | None = None
+    try:
+        form, std, moves = _recognise(next(rows, []), name)
+        columns = len(pose_columns(form, std, moves))
+        while block := list(islice(rows, BLOCK)):
+            read = partial(_block, first=first, last=last, columns=columns, form=form, moves=moves, name=name)
+            poses, error = _good(block, first, read)
+            if poses is not None:
+                first, last = first + len(poses.frames), (int(poses.frames[-1]), float(poses.time_s[-1]))
+                yield poses
+            if error is not None:
+                raise error
+    except csv.Error as error:
+        raise EdgeposeError(f"{name}, row {rows.line_num + 1}: {error}") from error
+    except UnicodeDecodeError as error:
+        raise EdgeposeError(f"{name} is not a text file: byte {error.start} is not UTF-8") from error
+    if last is None:
+        raise EdgeposeError(f"{name} has no poses, only a header")
+
+
+def _good(
+    rows: list[list[str]], first: int, read: Callable[[list[list[str]]], Poses]
+) -> tuple[Poses | None, EdgeposeError | None]:
+    """The poses before the first bad row, and what is wrong with that; the first row has number `first`."""
+    problem = None
+    while rows:
+        try:
+            return read(rows), problem
+        except _BadRowError as error:
+            problem, rows = error, rows[: error.row - first]
+    return None, problem
+
+
+_TOO_LONG = "the line is too long for a file of poses"
+
+
+def _lines(file: TextIO) -> Iterator[str]:
+    while line := file.readline(MAX_LINE):
+        if len(line) == MAX_LINE:
+            yield _TOO_LONG  # a bad row, and the rows before it stay good
+            return
+        yield line
+
+
+def _recognise(header: list[str], name: str) -> tuple[str, bool, bool]:
+    """Representation, whether there are standard deviations and translation, as a header announces them."""
+    for form in FORMS:
+        for std in (False, True):
+            for moves in (False, True):
+                if header == pose_columns(form, std, moves):
+                    return form, std, moves
+    if any("\ufffd" in column for column in header):
+        raise EdgeposeError(f"{name} is not a text file")
+    raise EdgeposeError(
+        f"{name} is not a file of poses: its first line must be 'frame,time_s,status,pelvis_...' and name "
+        "the 24 joints in SMPL order"
+    )
+
+
+def _block(
+    rows: list[list[str]],
+    first: int,
+    last: tuple[int, float] | None,
+    columns: int,
+    form: str,
+    moves: bool,
+    name: str,
+) -> Poses:
+    """Poses of rows of which the first has number `first`, after the frame and time `last`."""
+    frame_before, time_before = last or (None, -np.inf)
+    frames, times, status, numbers = array("q"), array("d"), list[str](), array("d")
+    for number, row in enumerate(rows, start=first):
+        if row == [_TOO_LONG]:
+            raise _BadRowError(name, number, _TOO_LONG)
+        if len(row) != columns:
+            raise _BadRowError(name, number, f"{len(row)} columns, the header has {columns}")
+        try:
+            frame = int(row[0])
+            times.append(float(row[1]))
+            numbers.extend(map(float, row[3:]))
+            frames.append(frame)
+        except (ValueError, OverflowError) as error:
+            raise _BadRowError(name, number, str(error)) from error
+        if frame_before is not None and frame <= frame_before:
+            raise _BadRowError(name, number, f"frame {frame} comes after frame {frame_before}")
+        if times[-1] <= time_before:
+            raise _BadRowError(name, number, f"time {row[1]} s is not after that of the row before")
+        if not row[2].isprintable() or "," in row[2] or '"' in row[2]:
+            raise _BadRowError(name, number, "the status has a comma, a quote or a line break in it")
+        status.append(sys.intern(row[2]))
+        frame_before, time_before = frame, times[-1]
+    values = np.frombuffer(numbers).reshape(len(frames), -1)
+    seconds = np.frombuffer(times)
+    numbered = np.frombuffer(frames, np.int64)
+    bad = is_absurd(seconds, LARGEST_TIME) | is_absurd(numbered, LARGEST_TIME) | is_absurd(values).any(axis=1)
+    if bad.any():
+        what = "a number is infinite or not a number, or far too large"
+        raise _BadRowError(name, int(bad.argmax()) + first, what)
+    width = len(FORMS[form])
+    rotations, off = _rotations(
+        form, values[:, : len(JOINTS) * width].reshape(len(frames), len(JOINTS), width)
+    )
+    if (off > 1e-3).any():
+        at, joint = np.argwhere(off > 1e-3)[0].tolist()
+        raise _BadRowError(name, at + first, f"the numbers of {JOINTS[joint]} are not a rotation")
+    where = values[:, -3:] if moves else None
+    return Poses(numbered, seconds, status, rotations, where)
+
+
+def _rotations(form: str, values: Array) -> tuple[Array, Array]:
+    """Rotation matrices (T, 24, 3, 3) of the numbers (T, 24, n) of one representation, and how far (T, 24)
+    these are from any rotation's.
+    """
+    none = np.zeros(values.shape[:2])
+    if form == "axis-angle":
+        return rotvec_to_matrix(values), none
+    if form == "euler":
+        return euler_to_matrix(values, "zxy"), none
+    if form == "quat":
+        norms = np.linalg.norm(values, axis=-1, keepdims=True)
+        return quat_to_matrix(values / np.where(norms > 0.0, norms, 1.0)), np.abs(norms[..., 0] - 1.0)
+    matrices = values.reshape(*values.shape[:-1], 3, 3)
+    # Six written digits leave a matrix a little off a rotation; anything further is not one.
+    nearest = nearest_rotation(matrices)
+    return nearest, np.abs(matrices - nearest).max(axis=(-2, -1))
+
+
+def _concatenate(blocks: list[Poses]) -> Poses:
+    translations = [block.translation for block in blocks if block.translation is not None]
+    return Poses(
+        np.concatenate([block.frames for block in blocks]),
+        np.concatenate([block.time_s for block in blocks]),
+        [text for block in blocks for text in block.status],
+        np.concatenate([block.rotations for block in blocks]),
+        np.concatenate(translations) if translations else None,
+    )
+
+
+def holds_poses(path: Path) -> bool:
+    """Whether a file starts as a CSV file of poses does; "-" is standard input, which stays unread."""
+    try:
+        if str(path) == "-":
+            return _starts_as_poses(cast(BufferedReader, sys.stdin.buffer).peek(32))
+        with path.open("rb") as file:
+            return _starts_as_poses(file.read(32))
+    except OSError:
+        return False
+
+
+def _starts_as_poses(start: bytes) -> bool:
+    # Of a pipe only a few bytes may have come; recordings start with other ones.
+    start = start.removeprefix(b"\xef\xbb\xbf")[: len(_HEADER)]
+    return start != b"" and _HEADER.startswith(start)
+
+
+FORMAT = PoseFormat((".csv",), read_csv, holds_poses)

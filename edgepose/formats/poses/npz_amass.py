@@ -1,0 +1,189 @@
+"""Poses as NPZ with the keys of AMASS; the arrays are in docs/outputs.md."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgepose.errors import EdgeposeError
+from edgepose.formats.joint_tree import LARGEST
+from edgepose.formats.poses.base import LARGEST_TIME, PoseFormat, is_absurd
+from edgepose.placements import PLACEMENTS
+from edgepose.pose import FILLING_WINDOW, Poses, held_sensors, status_bits, status_text
+from edgepose.rotations import Z_UP_TO_T, matrix_to_rotvec, rotvec_to_matrix
+from edgepose.skeleton import JOINTS
+from edgepose.utils.safe_npz import BROKEN, check_size, member_names, open_npz
+
+Array = NDArray[np.float64]
+
+BETAS = 16
+"""Shape coefficients of SMPL; all are zero, the average body."""
+
+_POSE_BYTES = 8 * 9 * len(JOINTS)  # that a pose takes
+
+
+# --- reading ------------------------------------------------------------------------------------------------
+
+
+def read_npz(path: Path) -> tuple[Poses, None]:
+    """Poses of an AMASS file, in its world with Z up, or the true poses of a recording, which are in T.
+
+    Frames, times and status are there if edgepose has written the file. Of SMPL-H and SMPL-X the body's 22
+    joints are taken, hands stay at rest.
+    """
+    arrays, in_t = _load(path)
+    if "poses" not in arrays or arrays["poses"].ndim != 2 or not len(arrays["poses"]):
+        raise EdgeposeError(f"{path}: no poses in it; it needs an array 'poses' (frames, 72)")
+    count, width = arrays["poses"].shape
+    if width < 66 or width % 3:
+        raise EdgeposeError(f"{path}: 'poses' must be (frames, 72), it is {arrays['poses'].shape}")
+    check_size(path, count * _POSE_BYTES)
+    joints = len(JOINTS) if width == 72 else 22
+    vectors = _numbers(path, arrays, "poses", (count, width))[:, : 3 * joints].reshape(count, joints, 3)
+    rotations = np.broadcast_to(np.eye(3), (count, len(JOINTS), 3, 3)).copy()
+    rotations[:, :joints] = rotvec_to_matrix(vectors)
+    translation = _numbers(path, arrays, "trans", (count, 3)) if "trans" in arrays else None
+    if translation is not None and not translation.any():
+        translation = None  # AMASS wants the array where nothing is known, too
+    if not in_t:
+        rotations[:, 0] = Z_UP_TO_T @ rotations[:, 0]
+        translation = None if translation is None else translation @ Z_UP_TO_T.T
+    frames, time_s = _clock(path, arrays, count)
+    return Poses(frames, time_s, _status(path, arrays, count), rotations, translation), None
+
+
+def _load(path: Path) -> tuple[dict[str, NDArray[Any]], bool]:
+    """The arrays of a file that matter, and whether it is a recording with true poses in T."""
+    wanted = ("poses", "trans", "mocap_framerate", "mocap_frame_rate", "time_s", "frame", "held", "filling")
+    try:
+        names = member_names(path)
+        with open_npz(path) as archive:
+            return {key: archive[key] for key in wanted if f"{key}.npy" in names}, _is_recording(names)
+    except OSError as error:
+        raise EdgeposeError(f"cannot read poses from {path}: {error.strerror or error}") from error
+    except BROKEN as error:
+        reason = " ".join(str(error).split())
+        raise EdgeposeError(f"{path}: not a whole NPZ file ({reason}); copy it again") from None
+
+
+def _numbers(path: Path, arrays: Mapping[str, NDArray[Any]], key: str, shape: tuple[int, ...]) -> Array:
+    """An array as numbers, finite and not absurd."""
+    values = arrays[key]
+    if values.dtype.kind not in "fiub" or values.shape != shape:
+        raise EdgeposeError(f"{path}: {key!r} is {values.dtype} {values.shape} and not numbers {shape}")
+    numbers = values.astype(np.float64)
+    bad = is_absurd(numbers, LARGEST_TIME if key in ("time_s", "frame") else LARGEST)
+    if bad.any():
+        where = f" of frame {np.argwhere(bad)[0][0]}" if shape else ""
+        raise EdgeposeError(f"{path}: a number in {key!r}{where} is not finite, or far too large")
+    return numbers
+
+
+def _clock(path: Path, arrays: Mapping[str, NDArray[Any]], count: int) -> tuple[NDArray[np.int64], Array]:
+    """Frames (T,) and times (T,): as written, else counted from 0 at the file's rate."""
+    frames = np.arange(count)
+    if "frame" in arrays:
+        frames = _numbers(path, arrays, "frame", (count,)).astype(np.int64)
+        if (np.diff(frames) <= 0).any():
+            raise EdgeposeError(f"{path}: the numbers in 'frame' do not rise")
+    if "time_s" in arrays:
+        times = _numbers(path, arrays, "time_s", (count,))
+        if (np.diff(times) <= 0).any():
+            raise EdgeposeError(f"{path}: the times in 'time_s' do not rise")
+        return frames, times
+    key = "mocap_framerate" if "mocap_framerate" in arrays else "mocap_frame_rate"
+    if key not in arrays or arrays[key].size != 1:
+        raise EdgeposeError(f"{path}: needs one number 'mocap_framerate', frames per second")
+    rate = float(_numbers(path, {key: arrays[key].reshape(())}, key, ()))
+    if not 1e-2 < rate < 1e5:
+        raise EdgeposeError(f"{path}: a frame rate of {rate:g} Hz is not possible")
+    return frames, np.arange(count) / rate
+
+
+def _status(path: Path, arrays: Mapping[str, NDArray[Any]], count: int) -> list[str]:
+    if "held" not in arrays or "filling" not in arrays:
+        return ["ok"] * count
+    held = _numbers(path, arrays, "held", (count, len(PLACEMENTS))) != 0
+    filling = _numbers(path, arrays, "filling", (count,)) != 0
+    masks = held @ (1 << np.arange(len(PLACEMENTS)))
+    pairs = zip((filling * FILLING_WINDOW).tolist(), masks.tolist(), strict=True)
+    return [status_text(flags, mask) for flags, mask in pairs]
+
+
+def holds_poses(path: Path) -> bool:
+    """Whether an archive has poses and is no recording of sensors, which may hold true poses besides."""
+    try:
+        names = member_names(path)
+    except (OSError, *BROKEN):
+        return False
+    return "poses.npy" in names and not _is_recording(names)
+
+
+def _is_recording(names: set[str]) -> bool:
+    """Whether an archive with these members is a recording of sensors, which may hold true poses besides."""
+    return any(f"{placement}_quat.npy" in names for placement in PLACEMENTS)
+
+
+# --- writing ------------------------------------------------------------------------------------------------
+
+
+def write_npz(path: Path, blocks: Iterable[Poses], count: int, rate: float) -> None:
+    """Write poses with little of them in memory at a time.
+
+    Args:
+        path: file to write.
+        blocks: the poses, in order.
+        count: how many poses the blocks hold together.
+        rate: frames per second.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    frames, times, held, filling, places = [], [], [], [], []
+    with zipfile.ZipFile(path, "w") as archive:
+        with archive.open("poses.npy", "w", force_zip64=True) as member:
+            header = {"descr": "<f4", "fortran_order": False, "shape": (count, 72)}
+            np.lib.format.write_array_header_1_0(member, header)
+            for block in blocks:
+                member.write(_vectors(block).tobytes())
+                frames.append(block.frames)
+                times.append(block.time_s)
+                held.append(held_sensors(block.status))
+                flags = np.array([status_bits(text)[0] for text in block.status])
+                filling.append((flags & FILLING_WINDOW).astype(bool))
+                places.append(_places(block))
+        arrays: dict[str, NDArray[Any]] = {
+            "trans": np.concatenate(places),
+            "betas": np.zeros(BETAS),
+            "gender": np.array("neutral"),
+            "mocap_framerate": np.array(float(rate)),
+            "frame": np.concatenate(frames),
+            "time_s": np.concatenate(times),
+            "held": np.concatenate(held),
+            "filling": np.concatenate(filling),
+        }
+        for key, values in arrays.items():
+            with archive.open(f"{key}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, values, allow_pickle=False)
+
+
+def _vectors(block: Poses) -> NDArray[np.float32]:
+    """Axis-angle vectors (T, 72), the pelvis against AMASS's world with Z up."""
+    rotations = block.rotations.copy()
+    rotations[:, 0] = Z_UP_TO_T.T @ rotations[:, 0]
+    return matrix_to_rotvec(rotations).reshape(len(rotations), 72).astype("<f4")
+
+
+def _places(block: Poses) -> NDArray[np.float32]:
+    """Places of the pelvis (T, 3), metres, Z up; zeros where nothing is known."""
+    if block.translation is None:
+        return np.zeros((len(block.frames), 3), "<f4")
+    return (block.translation @ Z_UP_TO_T).astype("<f4")
+
+
+FORMAT = PoseFormat((".npz",), read_npz, holds_poses)

@@ -1,0 +1,244 @@
+"""What all formats of recordings share: the checks that every sample passes, and samples to and from arrays.
+
+Files are hostile until checked: what leaves `SampleTable` is finite, in time order and of unit length where
+it must be.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import inf, nan
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgepose.errors import EdgeposeError
+from edgepose.formats.plugins import FileFormat
+from edgepose.imu import ImuSample, Recording, SensorData
+from edgepose.placements import PLACEMENTS
+
+Array = NDArray[np.float64]
+
+QUANTITIES = {"quat": 4, "acc": 3, "gyr": 3, "mag": 3}
+"""Numbers in each quantity of a sample, in the order of `ImuSample` and of `SensorData`."""
+
+MAX_SAMPLES = 20_000_000
+"""Most samples that are read into memory: 9 hours of six sensors at 100 Hz."""
+
+_MAX_VALUE = 1e6  # no sensor measures more, in any of the units
+_MAX_TIME_S = 1e11
+_CHUNK = 4096
+
+
+class ReadOptions(NamedTuple):
+    """How a recording is read; formats ignore what does not concern them.
+
+    Attributes:
+        names: sensors that may occur, for formats that can hold more than the six placements.
+        salvage: leave bad rows out and say so in `Recording.damage` instead of raising. CSV and NPZ only:
+            files of other programs are always salvaged.
+        ids: placements by serial number, for formats that identify sensors by it.
+    """
+
+    names: Sequence[str] = PLACEMENTS
+    salvage: bool = False
+    ids: Mapping[int, str] | None = None
+
+
+@dataclass(frozen=True)
+class RecordingFormat(FileFormat):
+    """A format of recordings; the module of each format ends with its `FORMAT`.
+
+    Attributes:
+        read: reads a file, or folder, of the format. Raises EdgeposeError or OSError if nothing is usable.
+        is_folder: whether a folder is a recording of the format; None where recordings are files.
+    """
+
+    read: Callable[[Path, ReadOptions], Recording]
+    is_folder: Callable[[Path], bool] | None = None
+
+    def fits(self, path: Path, folder: bool) -> bool:
+        """Whether a file is of the format by its ending, or a folder by what is in it."""
+        if folder:
+            return self.is_folder is not None and self.is_folder(path)
+        return path.suffix.lower() in self.suffixes
+
+
+def samples(recording: Recording) -> Iterator[ImuSample]:
+    """All samples of a recording in time order."""
+    streams = [_sensor_samples(PLACEMENTS.index(name), data) for name, data in recording.sensors.items()]
+    return heapq.merge(*streams, key=attrgetter("time_s"))
+
+
+def from_samples(
+    rows: Iterable[ImuSample],
+    metadata: Mapping[str, str] | None = None,
+    *,
+    name: str = "samples",
+    salvage: bool = False,
+) -> Recording:
+    """Recording of samples, each sensor's in time order.
+
+    Args:
+        rows: the samples.
+        metadata: of the recording.
+        name: where they are from, for messages.
+        salvage: leave bad ones out and say so in `damage` instead of raising.
+
+    Raises:
+        EdgeposeError: there is something in them that no sensor measures.
+    """
+    table = SampleTable(name, salvage)
+    for number, sample in enumerate(rows, start=1):
+        row = [sample.time_s]
+        empty = 0
+        for quantity, size in QUANTITIES.items():
+            values = getattr(sample, quantity)
+            row += (nan,) * size if values is None else values
+            empty += size if values is None else 0
+        table.add(PLACEMENTS[sample.sensor], number, row, empty)
+    return Recording(table.sensors(), dict(metadata or {}), table.damage())
+
+
+def _sensor_samples(index: int, data: SensorData) -> Iterator[ImuSample]:
+    for start in range(0, len(data.time_s), _CHUNK):
+        rows = slice(start, start + _CHUNK)
+        times = data.time_s[rows].tolist()
+        # A number that is NaN differs from itself.
+        columns = [
+            [None] * len(times)
+            if q is None
+            else [tuple(v) if v[0] == v[0] else None for v in q[rows].tolist()]
+            for q in data[1:]
+        ]
+        for time_s, *quantities in zip(times, *columns, strict=True):
+            yield ImuSample(index, time_s, *quantities)
+
+
+def shorten(text: str) -> str:
+    """Quoted beginning of a text from a file, for a message."""
+    return repr(text.strip() if len(text) < 80 else text[:77] + "...")
+
+
+class SampleTable:
+    """Rows of numbers (time, then the quantities) by sensor, checked a block at a time.
+
+    Attributes:
+        count: good rows so far, save those of the last, unchecked blocks that turn out bad.
+    """
+
+    def __init__(self, name: str, salvage: bool = False, names: Sequence[str] = PLACEMENTS) -> None:
+        """An empty table.
+
+        Args:
+            name: of the file, for messages.
+            salvage: leave bad rows out instead of raising.
+            names: sensors that may occur, in the order of the result.
+        """
+        self._name = name
+        self._salvage = salvage
+        self._names = names
+        self._left_out = 0
+        self._problem = ""  # of the first row left out
+        self._rows: dict[str, list[list[float]]] = {}
+        self._marks: dict[str, list[tuple[int, int]]] = {}  # number and empty cells of each of these rows
+        self._blocks: dict[str, list[Array]] = {}
+        self._checked = 0
+        self.count = 0
+
+    def reject(self, problem: str) -> None:
+        """Leave a row out.
+
+        Raises:
+            EdgeposeError: nothing is to be left out.
+        """
+        if not self._salvage:
+            raise EdgeposeError(f"{self._name}: {problem}")
+        self._problem = self._problem or problem
+        self._left_out += 1
+
+    def damage(self) -> str | None:
+        """What to say of rows that were left out."""
+        if not self._left_out:
+            return None
+        return f"{self._name}: {self._left_out} bad rows left out, the first: {self._problem}"
+
+    def add(self, sensor: str, number: int, row: list[float], empty: int) -> None:
+        """Take one row: its number in the file, 14 numbers, how many of them are empty (NaN)."""
+        rows = self._rows.setdefault(sensor, [])
+        rows.append(row)
+        self._marks.setdefault(sensor, []).append((number, empty))
+        self.count += 1
+        if len(rows) == _CHUNK:
+            self._close(sensor)
+
+    def add_block(self, sensor: str, numbers: NDArray[np.int_], rows: Array, empty: NDArray[np.int_]) -> None:
+        """Take rows (n, 14) with their numbers (n,) and counts of empty cells (n,).
+
+        Raises:
+            EdgeposeError: there is something in them that no sensor measures.
+        """
+        if not len(rows):
+            return
+        blocks = self._blocks.setdefault(sensor, [])
+        before = blocks[-1][-1, 0] if blocks else -inf
+        good = np.ones(len(rows), dtype=bool)
+
+        def check(bad: Any, problem: str) -> None:
+            for row in np.flatnonzero(bad & good):
+                self.reject(f"row {numbers[row]}: {sensor} {problem}")
+            good[bad] = False
+
+        times, values = rows[:, 0], rows[:, 1:]
+        check(~(np.abs(times) < _MAX_TIME_S), "has no time")
+        check(
+            (np.abs(values) < _MAX_VALUE).sum(axis=1) + empty != values.shape[1],
+            "has a number that is NaN or absurd",
+        )
+        start = 0
+        for name, size in QUANTITIES.items():
+            there = ~np.isnan(values[:, start : start + size])
+            check(there.any(axis=1) & ~there.all(axis=1), f"has only a part of {name}")
+            start += size
+        norm = np.linalg.norm(values[:, :4], axis=1)
+        check(np.abs(norm - 1.0) > 0.1, "has a quaternion that is not of unit length")
+        reached = np.maximum.accumulate(np.concatenate([[before], np.where(good, times, -inf)]))[:-1]
+        check(good & (times < reached), "goes back in time; sort the rows by time_s")
+        if not good.all():
+            rows, norm = rows[good], norm[good]
+        rows[:, 1:5] /= norm[:, None]
+        if len(rows):
+            blocks.append(rows)
+        self._checked += len(rows)
+        if self._checked > MAX_SAMPLES:
+            raise EdgeposeError(f"{self._name}: more than {MAX_SAMPLES} samples; split the recording")
+
+    def sensors(self) -> dict[str, SensorData]:
+        """All data by sensor, in the order of the names."""
+        for sensor in self._rows:
+            self._close(sensor)
+        result = {}
+        for sensor in self._names:
+            blocks = self._blocks.get(sensor)
+            if not blocks:
+                continue
+            rows = np.concatenate(blocks)
+            quantities: list[Array | None] = []
+            start = 1
+            for size in QUANTITIES.values():
+                part = rows[:, start : start + size]
+                quantities.append(None if np.isnan(part).all() else part)
+                start += size
+            result[sensor] = SensorData(rows[:, 0], *quantities)
+        return result
+
+    def _close(self, sensor: str) -> None:
+        rows, marks = self._rows[sensor], np.array(self._marks[sensor]).reshape(-1, 2)
+        if rows:
+            self.add_block(sensor, marks[:, 0], np.array(rows), marks[:, 1])
+        self._rows[sensor], self._marks[sensor] = [], []

@@ -1,0 +1,172 @@
+"""Recordings as CSV, one row a sample."""
+
+from __future__ import annotations
+
+import csv
+import sys
+import unicodedata
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from math import nan
+from pathlib import Path
+from typing import TextIO
+
+from edgepose.errors import EdgeposeError
+from edgepose.formats.recordings.base import ReadOptions, RecordingFormat, SampleTable, samples, shorten
+from edgepose.imu import ImuSample, Recording
+from edgepose.placements import PLACEMENTS
+
+COLUMNS = "time_s,sensor,qw,qx,qy,qz,ax,ay,az,gx,gy,gz,mx,my,mz"
+"""Header of the file."""
+
+_WIDTH = COLUMNS.count(",") + 1
+_MAX_LINE = 4096
+
+
+def comments(metadata: Mapping[str, str]) -> str:
+    """Metadata as lines `# key: value`."""
+    # A line break would start a row of its own.
+    return "".join("# " + " ".join(f"{key}: {value}".splitlines()) + "\n" for key, value in metadata.items())
+
+
+def csv_header(metadata: Mapping[str, str]) -> str:
+    """First lines of a CSV recording, up to its column names; no control character is in them."""
+    clean = {
+        key: "".join("?" if unicodedata.category(c) == "Cc" else c for c in " ".join(value.splitlines()))
+        for key, value in metadata.items()
+    }
+    return comments(clean) + COLUMNS + "\n"
+
+
+def csv_row(sample: ImuSample) -> str:
+    """One line of a CSV recording: times to the microsecond, numbers to nine digits."""
+    cells = [f"{sample.time_s:.6f}", PLACEMENTS[sample.sensor]]
+    for quantity, size in ((sample.quat, 4), (sample.acc, 3), (sample.gyr, 3), (sample.mag, 3)):
+        cells += [""] * size if quantity is None else [f"{v:.9g}" for v in quantity]
+    return ",".join(cells) + "\n"
+
+
+def write_csv(path: Path | str, recording: Recording) -> None:
+    """Write a recording as CSV, all sensors merged in time order."""
+    with Path(path).open("w", encoding="utf-8", newline="") as file:
+        file.write(csv_header(recording.metadata))
+        file.writelines(map(csv_row, samples(recording)))
+
+
+def read_csv(path: Path, options: ReadOptions) -> Recording:
+    """Read a CSV file; "-" is standard input."""
+    # Bytes that are no UTF-8 become a mark that is no number either.
+    opened = (
+        nullcontext(sys.stdin)
+        if str(path) == "-"
+        else path.open(encoding="utf-8-sig", errors="replace", newline="")
+    )
+    with opened as file:
+        lines = _Lines(path, file)
+        metadata = _read_metadata(path, lines)
+        lines.unlimited = options.salvage
+        table, cut = _read_rows(path, lines, options.salvage, options.names)
+    sensors = table.sensors()  # checks the last rows
+    return Recording(sensors, metadata, table.damage() or cut)
+
+
+class _Lines:
+    """Lines of a text file, counted, none longer than a recording's can be.
+
+    Attributes:
+        number: of the present line, from 1.
+        line: the present line.
+        unlimited: give a line that is too long in pieces instead of raising.
+    """
+
+    def __init__(self, path: Path, file: TextIO) -> None:
+        self._path, self._file = path, file
+        self.number = 0
+        self.line = "\n"
+        self.unlimited = False
+
+    def __iter__(self) -> _Lines:
+        return self
+
+    def __next__(self) -> str:
+        line = self._file.readline(_MAX_LINE)
+        if not line:
+            raise StopIteration
+        self.number += not self.cut
+        self.line = line
+        if len(self.line) == _MAX_LINE and not self.unlimited:
+            raise EdgeposeError(
+                f"{self._path}: row {self.number} is longer than {_MAX_LINE} characters; is it a CSV file?"
+            )
+        return self.line
+
+    @property
+    def cut(self) -> bool:
+        """Whether the present line is the last one and has no end."""
+        return not self.line.endswith(("\n", "\r"))
+
+
+def _read_metadata(path: Path, lines: _Lines) -> dict[str, str]:
+    metadata: dict[str, str] = {}
+    for line in lines:
+        if not line.startswith("#"):
+            header = line.strip().replace('"', "").replace(" ", "")
+            if header == COLUMNS:
+                return metadata
+            raise EdgeposeError(
+                f"{path}: row {lines.number} has the columns {shorten(line)}; a recording has {COLUMNS}"
+            )
+        key, _, value = line[1:].partition(":")
+        metadata[key.strip()] = value.strip()
+    raise EdgeposeError(f"{path}: the file is empty; a recording starts with the columns {COLUMNS}")
+
+
+def _read_rows(
+    path: Path, lines: _Lines, salvage: bool, names: Sequence[str]
+) -> tuple[SampleTable, str | None]:
+    """All rows, and what to say if the last one is cut off."""
+    table = SampleTable(str(path), salvage, names)
+    rows = csv.reader(lines, quoting=csv.QUOTE_NONE)
+    while True:
+        try:
+            cells = next(rows, None)
+            if cells is None:
+                return table, None
+            if cells:
+                sensor, numbers = _parse_row(cells, lines.cut, names)
+                table.add(sensor, lines.number, numbers, cells.count(""))
+        except csv.Error as error:
+            table.reject(f"row {lines.number}: {error}")
+        except ValueError as error:
+            # The pieces of a line that is too long have no end either.
+            if not lines.cut or len(lines.line) == _MAX_LINE:
+                table.reject(f"row {lines.number} {error}")
+                continue
+            return table, (
+                f"{path}: row {lines.number} is cut off, {table.count} samples before it are good; "
+                "delete that row or copy the file again"
+            )
+
+
+def _parse_row(cells: list[str], cut: bool, names: Sequence[str]) -> tuple[str, list[float]]:
+    """Sensor and numbers (time first, NaN where empty) of a row; cut says that the row has no line end.
+
+    Raises:
+        ValueError: what is wrong with the row.
+    """
+    if len(cells) != _WIDTH:
+        raise ValueError(f"has {len(cells)} columns and not {_WIDTH}")
+    time_s, sensor, *rest = cells
+    sensor = sensor.strip('"')  # some programs quote text; a quoted line break cannot be meant here
+    if sensor not in names:
+        raise ValueError(f"names an unknown sensor {shorten(sensor)}; the names are {', '.join(names)}")
+    if cut and (rest[-1] or rest[-2]):
+        # Digits may be missing, which nobody can see.
+        raise ValueError("has no line end")
+    try:
+        return sensor, [float(time_s), *[float(cell) if cell else nan for cell in rest]]
+    except ValueError as error:
+        raise ValueError(f"holds something that is no number ({shorten(str(error))})") from None
+
+
+FORMAT = RecordingFormat((".csv",), read_csv)

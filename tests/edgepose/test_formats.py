@@ -1,0 +1,379 @@
+"""Every format of recordings through every command that takes a recording."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import pickle
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from edgepose.calibration import GRAVITY, load_calibration
+from edgepose.cli import cli
+from edgepose.convert import plan
+from edgepose.errors import EdgeposeError
+from edgepose.formats.plugins import plugin_formats
+from edgepose.formats.poses import registry as pose_registry
+from edgepose.formats.poses.registry import is_poses, read_poses
+from edgepose.formats.recordings.csv import write_csv
+from edgepose.formats.recordings.mvnx import LABELS
+from edgepose.formats.recordings.npz import write_npz
+from edgepose.formats.recordings.registry import (
+    READERS,
+    find_format,
+    read_recording,
+    salvage_recording,
+)
+from edgepose.formats.recordings.totalcapture import NAMES
+from edgepose.imu import Recording, SensorData
+from edgepose.placements import PLACEMENTS
+from edgepose.rotations import Z_UP_TO_T, angle_between, quat_rotate, quat_to_matrix
+from firmware_protocols import sample
+
+FRAMES, RATE = 90, 60
+"""1.5 s at the only rate that all formats can have; the wearer stands for the first 50 frames."""
+
+
+def cells(*values: float) -> list[str]:
+    return [f"{value:.7f}" for value in values]
+
+
+def mvnx(path: Path, recording: Recording) -> Path:
+    data = recording.sensors.values()
+    frames = []
+    for i in range(FRAMES):
+        quats = " ".join(cell for d in data for cell in cells(*d.quat[i]))
+        free = " ".join(
+            cell for d in data for cell in cells(*(quat_rotate(d.quat[i], d.acc[i]) - [0.0, 0.0, GRAVITY]))
+        )
+        frames.append(
+            f'<frame time="{1000 * i // RATE}" type="normal"><sensorOrientation>{quats}</sensorOrientation>'
+            f"<sensorFreeAcceleration>{free}</sensorFreeAcceleration></frame>\n"
+        )
+    sensors = "".join(f'<sensor label="{label}"/>' for label in LABELS)
+    path = path.with_suffix(".mvnx")
+    path.write_text(
+        f'<mvnx version="4"><subject frameRate="{RATE}"><sensors>{sensors}</sensors>\n'
+        f"<frames>{''.join(frames)}</frames></subject></mvnx>\n"
+    )
+    return path
+
+
+def xio_session(path: Path, recording: Recording) -> Path:
+    for name, data in recording.sensors.items():
+        inertial = [
+            "Timestamp (us),Gyroscope X (deg/s),Gyroscope Y (deg/s),Gyroscope Z (deg/s),"
+            "Accelerometer X (g),Accelerometer Y (g),Accelerometer Z (g)"
+        ]
+        quaternion = ["Timestamp (us),W,X,Y,Z"]
+        for time_s, quat, acc, gyr in zip(data.time_s, data.quat, data.acc, data.gyr, strict=True):
+            numbers = [*map(math.degrees, gyr), *(acc / sample.GRAVITY)]
+            inertial.append(",".join([str(round(1e6 * time_s)), *cells(*numbers)]))
+            quaternion.append(",".join([str(round(1e6 * time_s)), *cells(*quat)]))
+        folder = path / name
+        folder.mkdir(parents=True)
+        (folder / "Inertial.csv").write_text("\n".join(inertial) + "\n")
+        (folder / "Quaternion.csv").write_text("\n".join(quaternion) + "\n")
+    return path
+
+
+def mt_manager(path: Path, recording: Recording, names: tuple[str, ...] = PLACEMENTS) -> Path:
+    columns = ["PacketCounter", *(f"Acc_{x}" for x in "XYZ"), *(f"Gyr_{x}" for x in "XYZ")]
+    columns += [f"Quat_q{i}" for i in range(4)]
+    path.mkdir()
+    for name, data in zip(names, recording.sensors.values(), strict=True):
+        lines = [f"// Update Rate: {RATE:.1f}Hz", "\t".join(columns)]
+        for i in range(FRAMES):
+            lines.append("\t".join([str(i), *cells(*data.acc[i], *data.gyr[i], *data.quat[i])]))
+        (path / f"{name}.txt").write_text("\n".join(lines) + "\n")
+    return path
+
+
+def totalcapture(path: Path, recording: Recording) -> Path:
+    lines = [f"{len(NAMES)}\t{FRAMES}"]
+    for i in range(FRAMES):
+        lines.append(str(i + 1))
+        for name, data in zip(NAMES, recording.sensors.values(), strict=True):
+            lines.append("\t".join([name, *cells(*data.quat[i], *data.acc[i])]))
+    path = path.with_suffix(".sensors")
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def dip_imu(path: Path, recording: Recording) -> Path:
+    content = {"imu_ori": np.zeros((FRAMES, 17, 3, 3)), "imu_acc": np.zeros((FRAMES, 17, 3))}
+    for place, data in zip((7, 8, 11, 12, 0, 2), recording.sensors.values(), strict=True):
+        bones = Z_UP_TO_T @ quat_to_matrix(data.quat)
+        content["imu_ori"][:, place] = bones
+        content["imu_acc"][:, place] = (bones @ data.acc[..., None])[..., 0] - [0.0, GRAVITY, 0.0]
+    path = path.with_suffix(".pkl")
+    path.write_bytes(pickle.dumps(content, 2))
+    return path
+
+
+def csv(path: Path, recording: Recording) -> Path:
+    write_csv(path.with_suffix(".csv"), recording)
+    return path.with_suffix(".csv")
+
+
+def npz(path: Path, recording: Recording) -> Path:
+    write_npz(path.with_suffix(".npz"), recording)
+    return path.with_suffix(".npz")
+
+
+WRITERS: dict[str, Callable[[Path, Recording], Path]] = {
+    "csv": csv,
+    "npz": npz,
+    "mvnx": mvnx,
+    "dip-imu": dip_imu,
+    "totalcapture": totalcapture,
+    "mt-manager": mt_manager,
+    "xio-session": xio_session,
+}
+
+
+@pytest.fixture(scope="module")
+def original(wearer) -> Recording:
+    """A part of the wearer's recording, as slow as 60 Hz make it."""
+    sensors = {}
+    for name, data in read_recording(wearer.short).sensors.items():
+        assert data.gyr is not None
+        columns = [None if column is None else column[:FRAMES] for column in data[1:4]]
+        sensors[name] = SensorData(np.arange(FRAMES) / RATE, *columns)
+    return Recording(sensors, {})
+
+
+@pytest.fixture(scope="module")
+def files(original, tmp_path_factory) -> dict[str, Path]:
+    """The recording in each format."""
+    folder = tmp_path_factory.mktemp("formats")
+    return {name: write(folder / name, original) for name, write in WRITERS.items()}
+
+
+def edgepose(*words: object) -> Result:
+    return CliRunner().invoke(cli, [str(word) for word in words])
+
+
+def done(result: Result) -> Result:
+    assert result.exit_code == 0, (result.output, result.exception)
+    return result
+
+
+every_format = pytest.mark.parametrize("name", READERS)
+
+
+def test_each_format_is_tested():
+    assert set(WRITERS) == set(READERS)
+
+
+@every_format
+def test_what_is_read(name, files, original):
+    recording = read_recording(files[name])
+    assert recording.damage is None
+    assert list(recording.sensors) == list(PLACEMENTS)
+    for found, wanted in zip(recording.sensors.values(), original.sensors.values(), strict=True):
+        np.testing.assert_allclose(found.time_s, wanted.time_s, atol=1e-6)
+        np.testing.assert_allclose(found.acc, wanted.acc, atol=1e-4)
+        turns = angle_between(quat_to_matrix(found.quat), quat_to_matrix(wanted.quat))
+        assert turns.max() < 1e-5
+
+
+@every_format
+def test_calibrate(name, files, tmp_path):
+    found = []
+    for file in (files[name], files["npz"]):
+        out = tmp_path / f"{len(found)}.json"
+        done(
+            edgepose(
+                *("calibrate", "--file", file, "--from", 0, "--hold", 0.6, "--body-frame", "heading:0"),
+                *("--out", out),
+            )
+        )
+        found.append(load_calibration(out))
+    assert found[0].metadata["source"] == str(files[name])
+    turns = angle_between(*(quat_to_matrix(calibration.bone_from_sensor) for calibration in found))
+    assert turns.max() < 1e-4
+
+
+@pytest.fixture(scope="module")
+def wanted(files, wearer, tmp_path_factory) -> dict[str, np.ndarray]:
+    """Rotations that `run` and `solve` make of the recording as NPZ."""
+    folder = tmp_path_factory.mktemp("wanted")
+    return {command: poses(command, files["npz"], wearer, folder) for command in ("run", "solve")}
+
+
+def poses(command: str, file: Path, wearer, folder: Path) -> np.ndarray:
+    words = {"run": ("run", "--file", file, "--model", "rnn"), "solve": ("solve", file, "--method", "sop")}
+    out = folder / f"{command}.csv"
+    done(edgepose(*words[command], "--calibration", wearer.calibration, "--csv", out))
+    return read_poses(out).rotations
+
+
+def same_poses(found: np.ndarray, wanted: np.ndarray) -> None:
+    # Times are rounded to a microsecond, which costs the last frame where it is that of the last sample.
+    assert {len(found), len(wanted)} <= {FRAMES, FRAMES - 1}
+    count = min(len(found), len(wanted))
+    assert angle_between(found[:count], wanted[:count]).max() < 2e-3
+
+
+@every_format
+@pytest.mark.parametrize("command", ["run", "solve"])
+def test_poses(command, name, files, wearer, wanted, tmp_path):
+    same_poses(poses(command, files[name], wearer, tmp_path), wanted[command])
+
+
+@every_format
+def test_check(name, files):
+    result = edgepose("check", "--file", files[name], "--json")
+    assert result.exit_code in (0, 1)
+    shown = json.loads(result.stdout)
+    assert [sensor["placement"] for sensor in shown["sensors"]] == list(PLACEMENTS)
+    for sensor in shown["sensors"]:
+        assert sensor["rate_hz"] == pytest.approx(RATE, rel=0.05)
+
+
+def test_convert_finds_them_all(files, tmp_path):
+    folder = next(iter(files.values())).parent
+    planned = plan([folder], "npz", tmp_path)
+    assert {job.source for job in planned} == set(files.values())
+    result = done(edgepose("convert", folder, "--to", "npz", "--out", tmp_path))
+    assert result.stdout.count(f" {6 * FRAMES} ") == len(files)
+
+
+@pytest.mark.parametrize("command", ["calibrate", "check", "run"])
+def test_serial_numbers_of_a_map(command, original, wearer, tmp_path):
+    names = tuple(f"walk_00B4D7D{i}" for i in range(6))
+    session = mt_manager(tmp_path / "walk", original, names)
+    sensors = tmp_path / "map.toml"
+    sensors.write_text("".join(f"{name} = {{ id = 0x00B4D7D{i} }}\n" for i, name in enumerate(PLACEMENTS)))
+    more = {
+        "calibrate": ("--hold", 0.6, "--body-frame", "heading:0", "--out", tmp_path / "new.json"),
+        "check": ("--json",),
+        "run": ("--model", "rnn", "--calibration", wearer.calibration, "--csv", tmp_path / "poses.csv"),
+    }[command]
+    result = edgepose(command, "--file", session, *more)
+    assert "no placement in the names of its files" in str(result.exception)
+    result = edgepose(command, "--file", session, "--sensors", sensors, *more)
+    assert result.exit_code in ((0, 1) if command == "check" else (0,)), (result.output, result.exception)
+
+
+def test_a_folder_that_is_no_session(files, wearer, tmp_path):
+    sensor = files["xio-session"] / "head"
+    for file in (tmp_path, sensor):
+        for words in (
+            ("check", "--file", file),
+            ("calibrate", "--file", file, "--out", tmp_path / "calibration.json"),
+            ("solve", file, "--calibration", wearer.calibration, "--csv", tmp_path / "poses.csv"),
+        ):
+            result = edgepose(*words)
+            assert isinstance(result.exception, EdgeposeError), result
+            assert str(result.exception).startswith(
+                f"{file}: unknown kind of file (Is a directory with no rec"
+            )
+        assert find_format(file) is None
+
+
+def test_good_frames_of_a_damaged_file(files, wearer, tmp_path):
+    text = files["mvnx"].read_text()
+    cut = tmp_path / "cut.mvnx"
+    cut.write_text(text[: 9 * len(text) // 10])
+    assert salvage_recording(cut).damage.startswith(f"{cut}: breaks off (")
+    out = tmp_path / "poses.csv"
+    result = edgepose(
+        *("run", "--file", cut, "--model", "rnn", "--calibration", wearer.calibration, "--csv", out)
+    )
+    assert f"{cut}: breaks off (" in result.output + str(result.exception)
+    assert 0.8 * FRAMES < len(read_poses(out).frames) < 0.95 * FRAMES
+
+
+def test_five_sensors_are_too_few(files, tmp_path):
+    shutil.copytree(files["xio-session"], tmp_path / "walk")
+    shutil.rmtree(tmp_path / "walk" / "head")
+    with pytest.raises(EdgeposeError, match="no samples of head; a recording needs all six sensors"):
+        read_recording(tmp_path / "walk")
+    assert len(salvage_recording(tmp_path / "walk").sensors) == 5
+
+
+# --- formats of other packages ------------------------------------------------------------------------------
+
+PACKAGE = """
+from edgepose.formats.poses.base import PoseFormat
+from edgepose.formats.poses.csv import read_csv as read_poses
+from edgepose.formats.recordings.base import RecordingFormat
+from edgepose.formats.recordings.csv import read_csv
+
+RECORDINGS = RecordingFormat((".acme",), read_csv)
+POSES = PoseFormat((".acmepose",), read_poses)
+"""
+ENTRY_POINTS = """
+[edgepose.formats]
+broken = acme_formats:NOWHERE
+gone = acme_not_installed:FORMAT
+odd = acme_formats:PACKAGE
+poses = acme_formats:POSES
+recordings = acme_formats:RECORDINGS
+"""
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch) -> None:
+    """A package with formats, three of which are broken."""
+    folder = tmp_path / "site"
+    (folder / "acme_formats-1.0.dist-info").mkdir(parents=True)
+    (folder / "acme_formats.py").write_text(PACKAGE + "PACKAGE = 1\n")
+    (folder / "acme_formats-1.0.dist-info" / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: acme-formats\nVersion: 1.0\n"
+    )
+    (folder / "acme_formats-1.0.dist-info" / "entry_points.txt").write_text(ENTRY_POINTS)
+    monkeypatch.syspath_prepend(folder)
+    plugin_formats.cache_clear()
+    yield
+    plugin_formats.cache_clear()
+
+
+def test_formats_of_a_package(package, files, original, wearer, wanted, tmp_path, caplog):
+    file = tmp_path / "walk.acme"
+    shutil.copy(files["csv"], file)
+    with caplog.at_level(logging.WARNING):
+        assert len(read_recording(file).sensors) == 6
+    warnings = [record.getMessage() for record in caplog.records]
+    assert len(warnings) == 3
+    assert "cannot load the file format broken (acme_formats:NOWHERE): AttributeError" in warnings[0]
+    assert "cannot load the file format gone (acme_not_installed:FORMAT): ModuleNotFound" in warnings[1]
+    assert warnings[2] == ("the file format odd (acme_formats:PACKAGE) is no RecordingFormat or PoseFormat")
+    same_poses(poses("run", file, wearer, tmp_path), wanted["run"])
+    written = tmp_path / "poses.acmepose"
+    shutil.copy(tmp_path / "run.csv", written)
+    assert is_poses(written)
+    assert not is_poses(file)
+    same_poses(read_poses(written).rotations, wanted["run"])
+    sources = {job.source for job in plan([tmp_path], "npz", tmp_path / "out")}
+    assert {file, written} <= sources
+
+
+def test_modules_of_formats_are_imported_when_they_are_needed():
+
+    code = (
+        "import sys\nfrom pathlib import Path\n"
+        "from edgepose.formats.recordings.registry import find_format\n"
+        "find_format(Path('walk.csv'))\n"
+        "print([name for name in sys.modules if name.startswith('edgepose.formats.recordings.')])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], text=True, capture_output=True, check=True)
+    assert "recordings.csv" in result.stdout
+    assert "mvnx" not in result.stdout
+
+
+def test_tables_name_what_is_there():
+    for table in (READERS, pose_registry.READERS):
+        for place in table.values():
+            module = place.partition(":")[0]
+            assert (Path(__file__).parents[2] / f"{module.replace('.', '/')}.py").is_file()
