@@ -15,6 +15,9 @@ FILTERS = ("none", "kalman", "vqf")
 """What makes orientations of samples: the devices themselves, or a filter here."""
 
 
+GRAVITY = 9.81
+"""What a sensor at rest measures, m/s^2; in I along +Z."""
+
 GAP_S = 60.0
 """Where all sensors are silent for longer, frames restart afterwards; a minute of repeats helps nobody."""
 

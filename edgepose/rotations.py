@@ -6,6 +6,7 @@ radians.
 
 from __future__ import annotations
 
+import math
 from math import cos, sin, sqrt
 
 import numpy as np
@@ -291,3 +292,8 @@ def inverse_left_jacobian(v: ArrayLike) -> Array:
     )
     k = cross_matrix(v)
     return np.eye(3) - 0.5 * k + b * (k @ k)
+
+
+def tilt_deg(v: Array) -> float:
+    """Angle between a vector (3,) in I and the vertical, degrees."""
+    return math.degrees(math.atan2(math.hypot(v[0], v[1]), v[2]))

@@ -11,12 +11,12 @@ from typing import Any
 from firmware_protocols._numbers import int16
 from firmware_protocols.pairing import Usual
 from firmware_protocols.rotation import from_angles, to_yaw_pitch_roll
-from firmware_protocols.sample import GRAVITY, Counters, Sample, Vector3
+from firmware_protocols.sample import STANDARD_G, Counters, Sample, Vector3
 
 TIME, ACC, GYR, ANGLES, MAG, QUAT, REGISTERS = 0x50, 0x51, 0x52, 0x53, 0x54, 0x59, 0x5F
 """Types of packets."""
 
-ACC_STEP = 16 * GRAVITY / 32768
+ACC_STEP = 16 * STANDARD_G / 32768
 """Step of an acceleration, m/s^2."""
 
 GYR_STEP = radians(2000) / 32768

@@ -15,7 +15,7 @@ from firmware_protocols._numbers import int16
 from firmware_protocols._sequence import count_byte
 from firmware_protocols._stream import StreamDecoder
 from firmware_protocols.base import Protocol
-from firmware_protocols.sample import GRAVITY, Quaternion, Sample
+from firmware_protocols.sample import STANDARD_G, Quaternion, Sample
 
 FRAME_BYTES = 19
 """Bytes of a frame, header and checksum included."""
@@ -26,7 +26,7 @@ ORDERS = ("zxy", "zyx", "zyx-swapped")
 _HEADER = b"\xaa\xaa"
 _FRAME = struct.Struct("<xxB6h3xx")
 _STEP = radians(0.01)
-_MG = GRAVITY / 1000
+_MG = STANDARD_G / 1000
 _MAX_TEXT = 256
 
 

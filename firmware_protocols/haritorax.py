@@ -12,7 +12,7 @@ from collections.abc import Iterable
 
 from firmware_protocols._stream import Receiver
 from firmware_protocols.base import Protocol, uncounted
-from firmware_protocols.sample import GRAVITY, Sample, unit_quaternion
+from firmware_protocols.sample import STANDARD_G, Sample, unit_quaternion
 
 MAX_LINE = 512
 """Longest line that is read, bytes; eight wired sensors need 155."""
@@ -24,7 +24,7 @@ _BLOCK = struct.Struct("<7h")
 _QUAT_STEPS = 16384
 # Of all captured quaternions the norm is 16384 to 0.02 %, so this tells most damaged lines from good ones.
 _TOLERANCE = 0.005
-_DONGLE_STEP = GRAVITY / 2048
+_DONGLE_STEP = STANDARD_G / 2048
 _WIRED_STEP = 1 / 256  # m/s^2
 _LINE = re.compile(rb"(?:X([0-7])|P):([A-Za-z0-9+/]+={0,2})\r*\Z")
 _OTHER = re.compile(rb"[a-z][0-9]?:[ -~]*\r*\Z")

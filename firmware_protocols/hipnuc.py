@@ -31,7 +31,7 @@ from firmware_protocols._numbers import plausible
 from firmware_protocols._stream import StreamDecoder
 from firmware_protocols.base import Protocol, uncounted
 from firmware_protocols.rotation import from_angles, from_yaw_pitch_roll
-from firmware_protocols.sample import GRAVITY, Quaternion, Sample, Vector3, unit_quaternion
+from firmware_protocols.sample import STANDARD_G, Quaternion, Sample, Vector3, unit_quaternion
 
 _SYNC = b"\x5a\xa5"
 
@@ -86,7 +86,7 @@ def _block(data: bytes, start: int, sensor: int | None) -> Sample:
         node if sensor is None else sensor,
         None if sensor is None and not ms else ms * 1000,
         unit(w, x, y, z),
-        (ax * GRAVITY, ay * GRAVITY, az * GRAVITY),
+        (ax * STANDARD_G, ay * STANDARD_G, az * STANDARD_G),
         (gx * DEG, gy * DEG, gz * DEG),
         (mx, my, mz) if mx or my or mz else None,
         None if sensor is None else float(degrees),  # not in the layout that has a node id
@@ -217,7 +217,7 @@ def _single_items(data: bytes, at: dict[int, int]) -> Sample:
         quat = _integer_angles(data, at[0xD0])
     for tag in (0xA0, 0xA1):
         if tag in at:
-            acc = scaled(VECTOR_I.unpack_from(data, at[tag]), GRAVITY / 1000)
+            acc = scaled(VECTOR_I.unpack_from(data, at[tag]), STANDARD_G / 1000)
     for tag in (0xB0, 0xB1):
         if tag in at:
             gyr = scaled(VECTOR_I.unpack_from(data, at[tag]), DEG / 10)
@@ -256,7 +256,7 @@ def _dongle(payload: bytes) -> list[Sample]:
         elif 0x72 in rows:
             quat = _integer_angles(payload, rows[0x72])
         if 0x75 in rows:
-            acc = scaled(VECTOR_I.unpack_from(payload, rows[0x75]), GRAVITY / 1000)
+            acc = scaled(VECTOR_I.unpack_from(payload, rows[0x75]), STANDARD_G / 1000)
         if 0x78 in rows:
             gyr = scaled(VECTOR_I.unpack_from(payload, rows[0x78]), DEG / 10)
         if 0x7A in rows:
@@ -318,7 +318,7 @@ def encode_items(sample: Sample) -> bytes:
     """Serial frame with the single items of older models of what the sample has, no time."""
     out = bytes([0x90, sample.sensor])
     if sample.acc is not None:
-        out += b"\xa0" + vector_i(sample.acc, 1000 / GRAVITY)
+        out += b"\xa0" + vector_i(sample.acc, 1000 / STANDARD_G)
     if sample.gyr is not None:
         out += b"\xb0" + vector_i(sample.gyr, 10 / DEG)
     if sample.mag is not None:
@@ -339,7 +339,7 @@ def encode_tables(samples: Iterable[Sample], *, gateway: int = 0) -> bytes:
         bytes([0x61, 0, gateway, len(nodes), 0x71])
         + b"".join(QUAT_F.pack(*(node.quat or (0.0, *zero))) for node in nodes)
         + b"\x75"
-        + b"".join(vector_i(node.acc or zero, 1000 / GRAVITY) for node in nodes)
+        + b"".join(vector_i(node.acc or zero, 1000 / STANDARD_G) for node in nodes)
         + b"\x78"
         + b"".join(vector_i(node.gyr or zero, 10 / DEG) for node in nodes)
     )
@@ -355,7 +355,7 @@ def _write_block(sample: Sample, node_ids: bool) -> bytes:
         0 if node_ids else round(sample.temperature or 0),
         0.0,
         (sample.time_us or 0) // 1000 & 0xFFFFFFFF,
-        *(value / GRAVITY for value in sample.acc),
+        *(value / STANDARD_G for value in sample.acc),
         *(value / DEG for value in sample.gyr),
         *(sample.mag or (0.0, 0.0, 0.0)),
         *sample.quat,

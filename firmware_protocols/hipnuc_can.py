@@ -22,7 +22,7 @@ from firmware_protocols._sequence import count_byte
 from firmware_protocols._stream import Receiver
 from firmware_protocols.base import Protocol, uncounted_can
 from firmware_protocols.pairing import Usual
-from firmware_protocols.sample import GRAVITY, CanFrame, Sample, Vector3, unit_quaternion
+from firmware_protocols.sample import STANDARD_G, CanFrame, Sample, Vector3, unit_quaternion
 
 _MASK_FD = 0x17F
 
@@ -92,12 +92,12 @@ class HipnucCanopenDecoder(_CanDecoder):
             return self._bad()
         values = VECTOR_I.unpack_from(data)
         if kind == 0x180:
-            return self._add(node, "acc", scaled(values, GRAVITY / 1000))
+            return self._add(node, "acc", scaled(values, STANDARD_G / 1000))
         return self._add(node, "gyr", scaled(values, DEG / 10))
 
 
 _J1939_VECTORS = {
-    0xFF34: ("acc", GRAVITY / 2048),
+    0xFF34: ("acc", STANDARD_G / 2048),
     0xFF37: ("gyr", DEG * 2000 / 32768),
     0xFF3A: ("mag", 1000 / 32768),
 }
@@ -176,7 +176,7 @@ def encode_canopen(sample: Sample) -> list[CanFrame]:
     """CAN frames of one cycle of a CANopen node: acceleration, angular rate, quaternion."""
     frames = []
     if sample.acc is not None:
-        frames.append((0x180 + sample.sensor, vector_i(sample.acc, 1000 / GRAVITY), False))
+        frames.append((0x180 + sample.sensor, vector_i(sample.acc, 1000 / STANDARD_G), False))
     if sample.gyr is not None:
         frames.append((0x280 + sample.sensor, vector_i(sample.gyr, 10 / DEG), False))
     if sample.quat is not None:

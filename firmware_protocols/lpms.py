@@ -13,7 +13,7 @@ from math import isfinite
 
 from firmware_protocols._stream import StreamDecoder
 from firmware_protocols.base import Protocol, uncounted
-from firmware_protocols.sample import GRAVITY, Quaternion, Sample, Vector3, unit_quaternion
+from firmware_protocols.sample import STANDARD_G, Quaternion, Sample, Vector3, unit_quaternion
 
 SENSOR_DATA = 9
 """Command of a measurement."""
@@ -115,7 +115,7 @@ class LpmsDecoder(StreamDecoder):
         if at is not None:
             s = self._scale["quat"]
             quat = unit_quaternion(v[at] * s, -v[at + 1] * s, -v[at + 2] * s, -v[at + 3] * s)
-        acc = self._vector(v, "acc", -GRAVITY)
+        acc = self._vector(v, "acc", -STANDARD_G)
         gyr = self._vector(v, self._rate, 1.0)
         mag = self._vector(v, "mag", 1.0)
         temperature = None
@@ -143,7 +143,7 @@ def encode(sample: Sample, fields: Iterable[str] = USUAL_FIELDS, floats: bool = 
     w, x, y, z = sample.quat or (0.0, 0.0, 0.0, 0.0)
     known: dict[str, tuple[float, ...] | None] = {
         "gyr": sample.gyr,
-        "acc": sample.acc and tuple(-value / GRAVITY for value in sample.acc),
+        "acc": sample.acc and tuple(-value / STANDARD_G for value in sample.acc),
         "mag": sample.mag,
         "rate": sample.gyr,
         "quat": (w, -x, -y, -z),

@@ -17,13 +17,13 @@ from firmware_protocols._sequence import count_byte
 from firmware_protocols._stream import StreamDecoder
 from firmware_protocols.base import Encode, Protocol
 from firmware_protocols.pairing import Pairing
-from firmware_protocols.sample import GRAVITY, Sample, Vector3, unit_quaternion, z_up
+from firmware_protocols.sample import STANDARD_G, Sample, Vector3, unit_quaternion, z_up
 
 _V1 = 0xFE
 _SIGNED = 0x01
 _SIGNATURE_BYTES = 13
 _ATTITUDE, _SCALED, _HIGHRES = 31, 26, 105
-_MG, _UT_OF_MGAUSS, _UT_OF_GAUSS = GRAVITY / 1000, 0.1, 100.0
+_MG, _UT_OF_MGAUSS, _UT_OF_GAUSS = STANDARD_G / 1000, 0.1, 100.0
 _WRAP_US = 1000 << 32
 _HIGHRES_ACC, _HIGHRES_GYR, _HIGHRES_MAG, _HIGHRES_TEMPERATURE = 0x007, 0x038, 0x1C0, 0x1000
 

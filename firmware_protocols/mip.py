@@ -15,7 +15,7 @@ from firmware_protocols._sequence import MAX_PAUSE_US
 from firmware_protocols._stream import StreamDecoder
 from firmware_protocols.base import Protocol, uncounted
 from firmware_protocols.rotation import from_angles, from_matrix, to_yaw_pitch_roll
-from firmware_protocols.sample import GRAVITY, Sample, unit_quaternion, z_up
+from firmware_protocols.sample import STANDARD_G, Sample, unit_quaternion, z_up
 
 SENSOR_SET = 0x80
 """Descriptor set of the IMU and its own attitude."""
@@ -151,7 +151,7 @@ class MipDecoder(StreamDecoder):
                     continue
                 values = values[:-1]
             if name == "acc g":
-                acc = vector(values, GRAVITY)
+                acc = vector(values, STANDARD_G)
             elif name == "acc":
                 acc = vector(values)
             elif name == "gyr":
@@ -247,7 +247,7 @@ def encode(
             if period_us is not None:
                 parts.append((0xD6, _NANOSECONDS.pack(period_us * 1000)))
         if sample.acc is not None:
-            scale = 1.0 if filtered else 1 / GRAVITY
+            scale = 1.0 if filtered else 1 / STANDARD_G
             parts.append((0x1C if filtered else 0x04, _VECTOR.pack(*(a * scale for a in sample.acc)) + valid))
         if sample.gyr is not None:
             parts.append((0x0E if filtered else 0x05, _VECTOR.pack(*sample.gyr) + valid))

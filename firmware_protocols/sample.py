@@ -14,7 +14,7 @@ Quaternion = tuple[float, float, float, float]
 CanFrame = tuple[int, bytes, bool]
 """Identifier, data, whether the identifier has 29 bits."""
 
-GRAVITY = 9.80665
+STANDARD_G = 9.80665
 """One g of devices that send accelerations in g, m/s^2."""
 
 

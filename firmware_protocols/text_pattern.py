@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from math import isfinite, radians
 
-from firmware_protocols.sample import GRAVITY
+from firmware_protocols.sample import STANDARD_G
 
 FIELDS = (
     "sensor", "time", "w", "x", "y", "z", "yaw", "pitch", "roll",
@@ -21,7 +21,7 @@ FIELDS = (
 FRAMES = ("Z-up", "NED")
 
 UNITS: dict[str, dict[str, float]] = {
-    "acc": {"m/s2": 1.0, "g": GRAVITY, "mg": GRAVITY / 1000},
+    "acc": {"m/s2": 1.0, "g": STANDARD_G, "mg": STANDARD_G / 1000},
     "gyr": {"rad/s": 1.0, "deg/s": radians(1.0), "mrad/s": 0.001},
     "mag": {"uT": 1.0, "nT": 0.001, "mG": 0.1, "G": 100.0},
     "angle": {"deg": radians(1.0), "rad": 1.0},
@@ -197,7 +197,7 @@ PATTERNS = {
             **dict(zip(GYR, ("RawGX", "RawGY", "RawGZ"), strict=True)),
             **dict(zip(MAG, ("RawMX", "RawMY", "RawMZ"), strict=True)),
         },
-        units={"acc": GRAVITY / 8192, "gyr": radians(1 / 16.4), "mag": 0.15, "time": "clock"},
+        units={"acc": STANDARD_G / 8192, "gyr": radians(1 / 16.4), "mag": 0.15, "time": "clock"},
     ),
 }
 """Ready patterns by name."""

@@ -16,7 +16,7 @@ from firmware_protocols._recent import Recent
 from firmware_protocols._stream import Receiver
 from firmware_protocols.base import Protocol, uncounted
 from firmware_protocols.pairing import Pairing
-from firmware_protocols.sample import GRAVITY, Quaternion, Sample, Vector3, unit_quaternion, z_up
+from firmware_protocols.sample import STANDARD_G, Quaternion, Sample, Vector3, unit_quaternion, z_up
 
 FRAMES = ("NWU", "ENU", "NED")
 """Inertial frames that the device can be set to; NWU is its default."""
@@ -173,7 +173,7 @@ class Ximu3Decoder(Receiver):
                         sensor,
                         time_us,
                         None,
-                        (v[3] * GRAVITY, v[4] * GRAVITY, v[5] * GRAVITY),
+                        (v[3] * STANDARD_G, v[4] * STANDARD_G, v[5] * STANDARD_G),
                         (v[0] * _DEG, v[1] * _DEG, v[2] * _DEG),
                     ),
                     False,
@@ -189,9 +189,9 @@ class Ximu3Decoder(Receiver):
             if letter in "LE":
                 up = rotation.rotate_back(quat, (0.0, 0.0, 1.0))
                 acc = (
-                    (moved[0] + up[0]) * GRAVITY,
-                    (moved[1] + up[1]) * GRAVITY,
-                    (moved[2] + up[2]) * GRAVITY,
+                    (moved[0] + up[0]) * STANDARD_G,
+                    (moved[1] + up[1]) * STANDARD_G,
+                    (moved[2] + up[2]) * STANDARD_G,
                 )
             return self._with_slow(self._pairing.add(Sample(sensor, time_us, quat, acc), True))
         if letter == "M":
@@ -346,7 +346,7 @@ def encode(sample: Sample, *, ascii: bool = False, frame: str = "NWU") -> bytes:
     if sample.mag is not None:
         parts.append(("M", sample.mag))
     if sample.acc is not None and sample.gyr is not None:
-        parts.append(("I", (*map(degrees, sample.gyr), *(x / GRAVITY for x in sample.acc))))
+        parts.append(("I", (*map(degrees, sample.gyr), *(x / STANDARD_G for x in sample.acc))))
     if sample.quat is not None:
         # A half turn of the inertial frame is its own inverse.
         parts.append(("Q", z_up(sample.quat) if frame == "NED" else sample.quat))

@@ -17,11 +17,9 @@ from edgepose.calibration.static_pose import (
     unit_or_zero,
 )
 from edgepose.errors import CalibrationError
+from edgepose.imu import GRAVITY
 from edgepose.placements import PLACEMENTS
-from edgepose.rotations import Array
-
-GRAVITY = 9.81
-"""What a sensor at rest measures, m/s^2; in I along +Z."""
+from edgepose.rotations import Array, tilt_deg
 
 SPREAD_LIMIT_DEG = 3.0  # RMS about the mean over a hold; standing people sway 0.1 - 0.5
 DRIFT_LIMIT_DEG = 5.0  # first against last quarter of a hold
@@ -172,11 +170,6 @@ def _gravity(hold: Hold, quats: list[Array]) -> tuple[Array, list[str]]:
             "the frame or sign convention of the orientation or the acceleration is wrong"
         )
     return force, warnings
-
-
-def tilt_deg(v: Array) -> float:
-    """Angle between a vector (3,) in I and the vertical, degrees."""
-    return math.degrees(math.atan2(math.hypot(v[0], v[1]), v[2]))
 
 
 def why_not_up(quat: Array, acc: Array) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import EdgeposeError, FileFormatError
 from edgepose.formats.joint_tree import JointTree, fail, numbers
 from edgepose.pose import tidy_rate
 from edgepose.rotations import euler_to_matrix
@@ -37,12 +37,12 @@ def read_bvh(path: str | Path) -> JointTree:
     replace its offset: files that write both, write the offset into the channels again.
 
     Raises:
-        EdgeposeError: the file cannot be read, breaks the format, is cut short, or holds a number that is not
+        FileFormatError: the file cannot be read, breaks the format, is cut short, or holds a number that is no
             finite.
     """
     tree, problem = salvage_bvh(path)
     if problem is not None:
-        raise EdgeposeError(problem)
+        raise FileFormatError(problem)
     return tree
 
 
@@ -50,7 +50,7 @@ def salvage_bvh(path: str | Path) -> tuple[JointTree, str | None]:
     """The frames before the first bad one, and one line on what is wrong with the file; see `read_bvh`.
 
     Raises:
-        EdgeposeError: no frame is good.
+        FileFormatError: no frame is good.
     """
     path = Path(path)
     try:
@@ -60,9 +60,9 @@ def salvage_bvh(path: str | Path) -> tuple[JointTree, str | None]:
             frame_time, table, problem = _motion(path, lines, sum(map(len, channels)))
         check_size(path, len(table) * len(names) * _JOINT_BYTES)
     except OSError as error:
-        raise EdgeposeError(f"{path}: cannot be read: {error.strerror or error}") from None
+        raise FileFormatError(f"{path}: cannot be read: {error.strerror or error}") from None
     except UnicodeDecodeError:
-        raise EdgeposeError(f"{path}: not a text file, so not BVH") from None
+        raise FileFormatError(f"{path}: not a text file, so not BVH") from None
     rotations = np.broadcast_to(np.eye(3), (len(table), len(names), 3, 3)).copy()
     positions = np.broadcast_to(offsets, (len(table), len(names), 3)).copy()
     column = 0
@@ -163,7 +163,7 @@ def _hierarchy(
             return names, parents, table, [kinds for kinds in channels if kinds is not None]
         else:
             fail(path, number, f"{key!r} is not expected here")
-    raise EdgeposeError(
+    raise FileFormatError(
         f"{path}: ends within the hierarchy, before MOTION" if seen_header else f"{path}: empty file"
     )
 
@@ -176,7 +176,7 @@ def _motion(path: Path, lines: Iterator[tuple[int, str]], width: int) -> tuple[f
     at_count, _, count = next(filled, (0, "", []))
     at_time, _, time = next(filled, (0, "", []))
     if not time:
-        raise EdgeposeError(f"{path}: ends before the first frame")
+        raise FileFormatError(f"{path}: ends before the first frame")
     if len(count) != 2 or count[0] != "Frames:" or not count[1].isdecimal() or len(count[1]) > 15:
         fail(path, at_count, "'Frames: <count>' was expected")
     if time[:2] != ["Frame", "Time:"]:
@@ -201,5 +201,5 @@ def _motion(path: Path, lines: Iterator[tuple[int, str]], width: int) -> tuple[f
     except UnicodeDecodeError:
         problem = f"{path}: not a text file after frame {frames}"
     if not frames:
-        raise EdgeposeError(problem)
+        raise FileFormatError(problem)
     return frame_time, np.frombuffer(values)[: frames * width].reshape(frames, width), problem

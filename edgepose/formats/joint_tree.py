@@ -8,7 +8,7 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import FileFormatError
 
 Array = NDArray[np.float64]
 
@@ -51,14 +51,14 @@ def forward(tree: JointTree) -> tuple[Array, Array]:
 
 def fail(path: Path, line: int, problem: str) -> NoReturn:
     """Raise the error for a problem in a line, counted from 1."""
-    raise EdgeposeError(f"{path}, line {line}: {problem}")
+    raise FileFormatError(f"{path}, line {line}: {problem}")
 
 
 def numbers(path: Path, line: int, words: list[str], count: int) -> list[float]:
     """The numbers of a line, counted from 1.
 
     Raises:
-        EdgeposeError: a word is no number, is not finite or beyond `LARGEST`, or there are more or fewer.
+        FileFormatError: a word is no number, is not finite or beyond `LARGEST`, or there are more or fewer.
     """
     try:
         values = [float(word) for word in words]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import FileFormatError
 from edgepose.placements import PLACEMENTS
 from edgepose.skeleton import MAX_HEIGHT, MIN_HEIGHT, PARENTS, Array, Body, default_body
 from edgepose.utils.safe_pickle import Inert, numbers, read_pickle
@@ -48,7 +48,7 @@ def _regressor(value: Any, n_vertices: int, path: Path) -> Array:
     _check_shape(tuple(found.tolist()), shape, name, path)
     by_column = type(value).__name__.startswith("csc")
     n_major, n_minor = shape[::-1] if by_column else shape
-    broken = EdgeposeError(f"{path}: {name} is not a valid sparse matrix")
+    broken = FileFormatError(f"{path}: {name} is not a valid sparse matrix")
     if data.ndim != 1 or indices.shape != data.shape or indptr.shape != (n_major + 1,):
         raise broken
     if indices.dtype.kind == "f" or indptr.dtype.kind == "f":
@@ -66,7 +66,7 @@ def _regressor(value: Any, n_vertices: int, path: Path) -> Array:
 
 def _check_shape(found: tuple[Any, ...], wanted: tuple[int, ...], name: str, path: Path) -> None:
     if found != wanted:
-        raise EdgeposeError(
+        raise FileFormatError(
             f"{path}: {name} has shape {found} instead of {wanted}; "
             "SMPL with 24 joints is needed, not SMPL-H or SMPL-X"
         )
@@ -79,7 +79,7 @@ def _joints(model: Mapping[Any, Any], vertices: Array | None, path: Path) -> Arr
     elif "J_regressor" in model and vertices is not None:
         joints = _regressor(model["J_regressor"], len(vertices), path) @ vertices
     else:
-        raise EdgeposeError(f"{path}: needs J, or J_regressor and v_template")
+        raise FileFormatError(f"{path}: needs J, or J_regressor and v_template")
     _check_shape(joints.shape, (len(PARENTS), 3), "J", path)
     return joints
 
@@ -114,7 +114,7 @@ def read_smpl(path: str | Path) -> Body:
     is run.
 
     Raises:
-        EdgeposeError: the file cannot be read, asks for code, or is not a 24-joint SMPL model in metres.
+        FileFormatError: the file cannot be read, asks for code, or is not a 24-joint SMPL model in metres.
     """
     path = Path(path)
     try:
@@ -122,19 +122,19 @@ def read_smpl(path: str | Path) -> Body:
             zipped = file.read(2) == b"PK"
         model = _read_npz(path) if zipped else read_pickle(path, _WHAT, _ADVICE, _is_known)
     except OSError as error:
-        raise EdgeposeError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise FileFormatError(f"{path}: cannot be read: {error.strerror or error}") from error
     if "kintree_table" in model:
         tree = numbers(model["kintree_table"], "kintree_table", path)
         _check_shape(tree.shape, (2, len(PARENTS)), "kintree_table", path)
         # The root's parent is -1 as an unsigned number.
         if tree[0, 1:].tolist() != list(PARENTS[1:]):
-            raise EdgeposeError(f"{path}: kintree_table does not have SMPL's order of joints")
+            raise FileFormatError(f"{path}: kintree_table does not have SMPL's order of joints")
 
     vertices = None
     if "v_template" in model:
         vertices = numbers(model["v_template"], "v_template", path).astype(float)
         if vertices.ndim != 2 or vertices.shape[1] != 3 or not len(vertices):
-            raise EdgeposeError(f"{path}: v_template has shape {vertices.shape} instead of (vertices, 3)")
+            raise FileFormatError(f"{path}: v_template has shape {vertices.shape} instead of (vertices, 3)")
     joints = _joints(model, vertices, path)
     offsets = np.zeros_like(joints)
     offsets[1:] = joints[1:] - joints[list(PARENTS[1:])]
@@ -142,10 +142,10 @@ def read_smpl(path: str | Path) -> Body:
     if vertices is not None:
         height = float(np.ptp(vertices[:, 1]))
     if not MIN_HEIGHT <= height <= MAX_HEIGHT:
-        raise EdgeposeError(f"{path}: the body is {height:.3g} m tall; SMPL models are in metres with Y up")
+        raise FileFormatError(f"{path}: the body is {height:.3g} m tall; SMPL models are in metres with Y up")
     if np.any(np.linalg.norm(offsets[1:], axis=1) < MIN_BONE):
         joint = 1 + int(np.argmin(np.linalg.norm(offsets[1:], axis=1)))
-        raise EdgeposeError(f"{path}: joint {joint} coincides with its parent; these are not SMPL's joints")
+        raise FileFormatError(f"{path}: joint {joint} coincides with its parent; these are not SMPL's joints")
     return Body(offsets, sensors, height)
 
 
@@ -164,4 +164,4 @@ def _read_npz(path: Path) -> dict[Any, Any]:
         raise
     except Exception as error:  # a broken archive can fail in any way
         reason = str(error).partition("\n")[0]
-        raise EdgeposeError(f"{path}: not a readable {_WHAT}: {reason}") from error
+        raise FileFormatError(f"{path}: not a readable {_WHAT}: {reason}") from error

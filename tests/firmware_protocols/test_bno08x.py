@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from firmware_protocols.bno08x import FRAME_BYTES, ORDERS, Bno08xDecoder, encode
 from firmware_protocols.rotation import rotate
-from firmware_protocols.sample import GRAVITY, Sample
+from firmware_protocols.sample import STANDARD_G, Sample
 
 DATA = json.loads((Path(__file__).parents[1] / "data/protocols/bno08x.json").read_text(encoding="utf-8"))
 WIRE = bytes.fromhex(DATA["vectors"][0]["hex"])
@@ -47,7 +47,7 @@ def test_vector():
     (sample,) = Bno08xDecoder().feed(WIRE)
     assert sample.sensor == 0
     assert sample.time_us is sample.gyr is None
-    assert sample.acc == pytest.approx([x * GRAVITY / 1000 for x in vector["raw"][3:]])
+    assert sample.acc == pytest.approx([x * STANDARD_G / 1000 for x in vector["raw"][3:]])
     assert encode(sample, vector["index"]) == WIRE
 
 
@@ -103,9 +103,9 @@ def test_still_sensor_reads_gravity_upwards():
     rng = random.Random(8)
     for _ in range(100):
         w, x, y, z = quaternion(rng)
-        acc = rotate((w, -x, -y, -z), (0.0, 0.0, GRAVITY))
+        acc = rotate((w, -x, -y, -z), (0.0, 0.0, STANDARD_G))
         (sample,) = Bno08xDecoder().feed(encode(Sample(0, None, (w, x, y, z), acc), 0))
-        assert rotate(sample.quat, sample.acc) == pytest.approx((0, 0, GRAVITY), abs=0.02)
+        assert rotate(sample.quat, sample.acc) == pytest.approx((0, 0, STANDARD_G), abs=0.02)
 
 
 @given(st.lists(st.integers(1, 40), max_size=40))

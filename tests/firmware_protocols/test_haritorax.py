@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from firmware_protocols.haritorax import MAX_LINE, SLOTS, HaritoraxDecoder, encode, encode_wired
 from firmware_protocols.rotation import rotate
-from firmware_protocols.sample import GRAVITY, Sample
+from firmware_protocols.sample import STANDARD_G, Sample
 
 # JovannMC/haritorax-interpreter (MIT): README and data.txt; the leg line came without its label.
 TRACKER = b"X0:0Ayb3u7+DzWeBxoDVQMAAA==\n"
@@ -44,7 +44,7 @@ def test_tracker():
     (sample,) = HaritoraxDecoder().feed(TRACKER)
     w, x, y, z = (value * 16383.4 for value in sample.quat)
     assert (x, y, z, w) == pytest.approx((3280, -8549, -274, 13583), abs=0.1)
-    assert sample.acc == pytest.approx([v * GRAVITY / 2048 for v in (1950, 794, 853)])
+    assert sample.acc == pytest.approx([v * STANDARD_G / 2048 for v in (1950, 794, 853)])
     assert sample.sensor == 0
     assert sample.time_us is sample.gyr is None
 
@@ -53,7 +53,7 @@ def test_leg_tracker_has_two_sensors():
     samples = HaritoraxDecoder().feed(LEG)
     assert [sample.sensor for sample in samples] == [1, 1 + SLOTS]
     for sample in samples:
-        assert rotate(sample.quat, sample.acc) == pytest.approx((0, 0, GRAVITY), abs=0.1)
+        assert rotate(sample.quat, sample.acc) == pytest.approx((0, 0, STANDARD_G), abs=0.1)
 
 
 def test_wired_sensors_stand_upright():

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from firmware_protocols import hipnuc, hipnuc_can
 from firmware_protocols.hipnuc import HipnucDecoder
 from firmware_protocols.hipnuc_can import HipnucCanopenDecoder, HipnucJ1939Decoder
-from firmware_protocols.sample import GRAVITY, Counters, Sample
+from firmware_protocols.sample import STANDARD_G, Counters, Sample
 
 VECTORS = json.loads((Path(__file__).parents[1] / "data" / "protocols" / "hipnuc.json").read_text())
 SERIAL = {v["id"]: v for v in VECTORS if v["form"] == "serial"}
@@ -26,7 +26,7 @@ def stream(n, sensor=0, mag=True):
             sensor,
             (1000 + 10 * i) * 1000,
             (0.5, -0.5, 0.5, 0.5),
-            (GRAVITY * i / 64, GRAVITY, 0.0),
+            (STANDARD_G * i / 64, STANDARD_G, 0.0),
             (0.0, math.radians(i), 1.0),
             (20.0, float(i), -40.0) if mag else None,
             25.0,
@@ -92,7 +92,7 @@ def test_gravity_points_up(name):
     (sample,), _ = decode(bytes.fromhex(SERIAL[name]["hex"]))
     up = rotated(sample.quat, sample.acc)
     assert up == pytest.approx([0, 0, math.hypot(*sample.acc)], abs=0.4)
-    assert math.hypot(*sample.acc) == pytest.approx(GRAVITY, rel=0.03)
+    assert math.hypot(*sample.acc) == pytest.approx(STANDARD_G, rel=0.03)
 
 
 def test_canopen_vectors():
@@ -412,7 +412,7 @@ def test_lost_can_frames_in_a_row_never_mix_cycles(name, count):
         decoder = make()
         samples = run(decoder, frames[:start] + frames[start + count :])
         for sample in samples:
-            i = round(sample.acc[0] * 64 / GRAVITY)
+            i = round(sample.acc[0] * 64 / STANDARD_G)
             for name in set(names) - {"acc"}:
                 value = getattr(sample, name)
                 assert value is None or value == pytest.approx(getattr(sent[i], name), abs=0.03)
@@ -467,7 +467,7 @@ def test_j1939_layout():
         8,
         None,
         (1.0, 0.0, 0.0, 0.0),
-        (GRAVITY, -GRAVITY, GRAVITY / 2),
+        (STANDARD_G, -STANDARD_G, STANDARD_G / 2),
         (math.radians(1000), -math.radians(1000), 0.34940673),
         (500.0, -500.0, 250.0),
         25.34,

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from firmware_protocols.lpms import FIELDS, MAX_DATA, SENSOR_DATA, USUAL_FIELDS, LpmsDecoder, encode
 from firmware_protocols.rotation import rotate
-from firmware_protocols.sample import GRAVITY, Sample
+from firmware_protocols.sample import STANDARD_G, Sample
 
 # witted-research/openzen (MIT), src/test/ModbusTest.cpp
 UNIT_TEST = bytes.fromhex("3a0a000b0004000102030423000d0a")
@@ -48,8 +48,8 @@ def test_a_measurement_byte_for_byte():
     assert sample.sensor == 7
     assert sample.time_us == 1_000_000
     assert sample.quat == pytest.approx((h, h, 0, 0))
-    assert sample.acc == pytest.approx((0, GRAVITY, 0))
-    assert rotate(sample.quat, sample.acc) == pytest.approx((0, 0, GRAVITY), abs=1e-6)
+    assert sample.acc == pytest.approx((0, STANDARD_G, 0))
+    assert rotate(sample.quat, sample.acc) == pytest.approx((0, 0, STANDARD_G), abs=1e-6)
     assert sample.gyr == pytest.approx((0.1, 0.2, 0.3))
     assert sample.mag == pytest.approx((20, -30, 40))
     assert sample.temperature is None
@@ -60,7 +60,7 @@ def test_a_measurement_in_whole_numbers():
     data = struct.pack("<I10h", 1, 9, 9, 9, 250, 0, -1000, 100, -200, 300, 2150)
     (sample,) = LpmsDecoder(fields, floats=False).feed(frame(data))
     assert sample == Sample(1, 2500, None, *sample[3:5], None, 21.5)
-    assert sample.acc == pytest.approx((-0.25 * GRAVITY, 0, GRAVITY))
+    assert sample.acc == pytest.approx((-0.25 * STANDARD_G, 0, STANDARD_G))
     assert sample.gyr == pytest.approx((0.1, -0.2, 0.3))
 
 

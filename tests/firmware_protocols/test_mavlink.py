@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from firmware_protocols import mavlink
 from firmware_protocols.mavlink import Encoder, MavlinkDecoder
 from firmware_protocols.rotation import rotate
-from firmware_protocols.sample import GRAVITY, Sample, z_up
+from firmware_protocols.sample import STANDARD_G, Sample, z_up
 
 common = pytest.importorskip("pymavlink.dialects.v20.common")
 
@@ -82,7 +82,7 @@ def test_vectors(vector):
     if "quat_ned" in vector:
         assert sample.quat == pytest.approx(z_up(tuple(vector["quat_ned"])))
     else:
-        acc = vector.get("acc") or [x * GRAVITY / 1000 for x in vector["acc_mg"]]
+        acc = vector.get("acc") or [x * STANDARD_G / 1000 for x in vector["acc_mg"]]
         assert sample.acc == pytest.approx(acc)
         # HIGHRES_IMU says that its magnetometer and temperature are not new.
         assert sample.mag == (pytest.approx(vector["mag"]) if "mag" in vector else None)
@@ -95,7 +95,7 @@ def test_level_and_north():
     reading = common.MAVLink_scaled_imu_message(1000, 0, 0, -1000, 0, 0, 0, 0, 0, 0)
     decoder = MavlinkDecoder()
     (sample,) = decoder.feed(packed(reading) + packed(attitude, seq=1))
-    assert rotate(sample.quat, sample.acc) == pytest.approx((0, 0, GRAVITY))
+    assert rotate(sample.quat, sample.acc) == pytest.approx((0, 0, STANDARD_G))
     assert rotate(sample.quat, (1.0, 0.0, 0.0)) == pytest.approx((0, 1, 0), abs=1e-9)
     assert sample.mag is None
     assert decoder.counters.lost == 0

@@ -21,7 +21,7 @@ from firmware_protocols.mip import (
     fields,
 )
 from firmware_protocols.rotation import rotate, to_yaw_pitch_roll
-from firmware_protocols.sample import GRAVITY, Sample, z_up
+from firmware_protocols.sample import STANDARD_G, Sample, z_up
 
 DATA = Path(__file__).parents[1] / "data" / "protocols"
 (VECTOR,) = json.loads((DATA / "mip.json").read_text())
@@ -51,7 +51,7 @@ def test_recorded_packet():
             assert struct.unpack(">3f", data) == pytest.approx(expected, rel=1e-6)
     (sample,) = MipDecoder().feed(line)
     assert sample.time_us == 23_067_000
-    assert sample.acc == pytest.approx([a * GRAVITY for a in VECTOR["expect"]["0x4"]], rel=1e-6)
+    assert sample.acc == pytest.approx([a * STANDARD_G for a in VECTOR["expect"]["0x4"]], rel=1e-6)
     assert sample.gyr == pytest.approx(VECTOR["expect"]["0x5"], rel=1e-6)
     assert sample.quat is sample.mag is sample.temperature is None
 
@@ -75,7 +75,7 @@ def test_recording():
             assert angles[::-1] == pytest.approx(struct.unpack(">3f", euler[:12]), abs=1e-6)
         else:
             assert sample.quat is None
-        for value, field, scale in ((sample.acc, 4, GRAVITY), (sample.gyr, 5, 1), (sample.mag, 6, 100)):
+        for value, field, scale in ((sample.acc, 4, STANDARD_G), (sample.gyr, 5, 1), (sample.mag, 6, 100)):
             if sensor_set and field in here:
                 assert value == pytest.approx([v * scale for v in struct.unpack(">3f", here[field])])
             else:
@@ -134,7 +134,7 @@ def test_round_trip(descriptor, euler):
 
 
 def test_level_and_still_on_the_wire():
-    level = Sample(0, 0, (1.0, 0, 0, 0), (0.0, 0.0, GRAVITY))
+    level = Sample(0, 0, (1.0, 0, 0, 0), (0.0, 0.0, STANDARD_G))
     here = dict(fields(encode(level)))
     # Sensor Z up and X east: in NED a half turn about the line between north and east.
     assert struct.unpack(">4f", here[0x0A]) == pytest.approx((0, 0.5**0.5, 0.5**0.5, 0), abs=1e-6)
@@ -142,7 +142,7 @@ def test_level_and_still_on_the_wire():
     # A device that is level by its own axes has Z down and reads -1 g.
     down = struct.pack(">3f", 0, 0, -1)
     (sample,) = MipDecoder().feed(encode_packet(0x80, [(0x04, down), (0x0A, struct.pack(">4f", 1, 0, 0, 0))]))
-    assert rotate(sample.quat, sample.acc) == pytest.approx([0, 0, GRAVITY])
+    assert rotate(sample.quat, sample.acc) == pytest.approx([0, 0, STANDARD_G])
 
 
 @pytest.mark.parametrize(("descriptor", "field", "tail"), [(0x80, 0x09, b""), (0x82, 0x04, b"\0\1")])

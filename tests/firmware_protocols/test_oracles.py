@@ -34,7 +34,7 @@ import witmotion.protocol
 
 import firmware_protocols
 from firmware_protocols import bno08x, mip, xsens_can
-from firmware_protocols.sample import GRAVITY, Sample, z_up
+from firmware_protocols.sample import STANDARD_G, Sample, z_up
 from firmware_protocols.witmotion import WitDecoder
 
 HAS_MSCL = (
@@ -121,7 +121,7 @@ def test_witmotion(orientation):
     assert len(samples) >= COUNT - 1
     for cycle in theirs[1:]:
         sample = samples[round(cycle[0x50].timestamp * 1e3) * 1000 % 86_400_000_000]
-        acc = [x / witmotion.protocol.G * GRAVITY for x in cycle[0x51].a]
+        acc = [x / witmotion.protocol.G * STANDARD_G for x in cycle[0x51].a]
         assert sample.acc == pytest.approx(acc, rel=1e-9, abs=1e-9)
         assert sample.temperature == pytest.approx(cycle[0x51].temp_celsius)
         assert sample.gyr == pytest.approx([math.radians(x) for x in cycle[0x52].w], rel=1e-9, abs=1e-9)
@@ -214,7 +214,7 @@ if HAS_MSCL:
         """Compares all that both a sample and a packet can hold, and gives the names of it."""
         met = []
         for name, ours, scale in (
-            ("scaledAccel", sample.acc, GRAVITY),
+            ("scaledAccel", sample.acc, STANDARD_G),
             ("scaledGyro", sample.gyr, 1.0),
             ("scaledMag", sample.mag, 100.0),
             ("estCompensatedAccel", sample.acc, 1.0),

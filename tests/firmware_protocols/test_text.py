@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from firmware_protocols import text
 from firmware_protocols.rotation import rotate
-from firmware_protocols.sample import GRAVITY, Sample
+from firmware_protocols.sample import STANDARD_G, Sample
 from firmware_protocols.text import TextDecoder, encode, encode_header
 from firmware_protocols.text_pattern import PATTERNS, Pattern, pattern_from_table
 
@@ -68,7 +68,7 @@ def test_vectors(vector):
     if "quat" in vector:
         assert sample.quat == pytest.approx(vector["quat"], abs=1e-9)
     if "acc_g" in vector:
-        assert sample.acc == pytest.approx([x * GRAVITY for x in vector["acc_g"]])
+        assert sample.acc == pytest.approx([x * STANDARD_G for x in vector["acc_g"]])
     if "gyr_deg" in vector:
         assert sample.gyr == pytest.approx([math.radians(x) for x in vector["gyr_deg"]])
     if "mag" in vector:
@@ -108,10 +108,10 @@ def test_still_sensor_reads_gravity_upwards():
     decoder.feed(encode_header("artemis-dmp"))
     for _ in range(50):
         w, x, y, z = quaternion(rng)
-        acc = rotate((w, -x, -y, -z), (0.0, 0.0, GRAVITY))
+        acc = rotate((w, -x, -y, -z), (0.0, 0.0, STANDARD_G))
         (sample,) = decoder.feed(encode(Sample(0, 0, (w, x, y, z), acc, (0.0, 0.0, 0.0)), "artemis-dmp"))
         # Where w is almost 0, five decimals of the others leave it at a few thousandths.
-        assert rotate(sample.quat, sample.acc) == pytest.approx((0, 0, GRAVITY), abs=0.2)
+        assert rotate(sample.quat, sample.acc) == pytest.approx((0, 0, STANDARD_G), abs=0.2)
 
 
 def test_pattern_of_a_toml_file():
@@ -126,9 +126,9 @@ def test_pattern_of_a_toml_file():
     assert decoder.WRAP_US == 1000 << 32
     a, b = decoder.feed(b"IMU3 t=1500 q=0 0 0 1 a=0 0 1\nIMU4 t=4294967296 q=1 0 0 0 a=1 0 0 T=20.5\n")
     assert a[:2] == (3, 1_500_000)
-    assert a.acc == (0, 0, -GRAVITY)
+    assert a.acc == (0, 0, -STANDARD_G)
     assert rotate(a.quat, (1.0, 0.0, 0.0)) == pytest.approx((0, 1, 0), abs=1e-9)
-    assert rotate(a.quat, a.acc) == pytest.approx((0, 0, GRAVITY))
+    assert rotate(a.quat, a.acc) == pytest.approx((0, 0, STANDARD_G))
     assert b[:2] == (4, 0)
     assert b.temperature == 20.5
 

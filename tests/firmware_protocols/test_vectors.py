@@ -29,7 +29,7 @@ from firmware_protocols import (
     xsens,
     xsens_can,
 )
-from firmware_protocols.sample import GRAVITY, Sample, z_up
+from firmware_protocols.sample import STANDARD_G, Sample, z_up
 
 VECTORS = json.loads((Path(__file__).parents[1] / "data/protocols/vectors.json").read_text(encoding="utf-8"))
 
@@ -65,8 +65,8 @@ def read_hipnuc(wire, vector):
     got = {
         "temp": sample.temperature,
         "t_ms": sample.time_us and sample.time_us / 1000,
-        "acc_g": scaled(sample.acc, GRAVITY),
-        "acc_mg": scaled(sample.acc, GRAVITY / 1000),
+        "acc_g": scaled(sample.acc, STANDARD_G),
+        "acc_mg": scaled(sample.acc, STANDARD_G / 1000),
         "gyr_dps": scaled(sample.gyr, math.radians(1)),
         "gyr_01dps": scaled(sample.gyr, math.radians(0.1)),
         "mag_uT": scaled(sample.mag, 1.0),
@@ -90,7 +90,7 @@ def read_hipnuc_canopen(wire, vector):
     assert sample.sensor == node
     return {
         "can_id": vector["expect"]["can_id"],
-        "acc_g": scaled(sample.acc, GRAVITY),
+        "acc_g": scaled(sample.acc, STANDARD_G),
         "gyr_dps": scaled(sample.gyr, math.radians(1)),
     }
 
@@ -102,7 +102,7 @@ def read_witmotion(wire, vector):
     sample, *_ = witmotion.WitDecoder().feed((wire + level) * 2)
     yaw, pitch, roll = rotation.to_yaw_pitch_roll(sample.quat)
     steps = {
-        0x51: [value * 2048 / GRAVITY for value in sample.acc] + [sample.temperature * 100],
+        0x51: [value * 2048 / STANDARD_G for value in sample.acc] + [sample.temperature * 100],
         0x52: scaled(sample.gyr, math.radians(2000) / 32768),
         0x53: scaled((roll, pitch, yaw), math.pi / 32768),
         0x54: scaled(sample.mag, 1.0),
@@ -121,7 +121,7 @@ def read_bno08x_rvc(wire, vector):
     (sample,) = bno08x.Bno08xDecoder().feed(wire)
     (index,) = [i for i in range(256) if bno08x.encode(sample, i) == wire]
     angles = struct.unpack_from("<3h", bno08x.encode(sample, index), 3)
-    return {"index": index, "raw": [*angles, *scaled(sample.acc, GRAVITY / 1000)]}
+    return {"index": index, "raw": [*angles, *scaled(sample.acc, STANDARD_G / 1000)]}
 
 
 def read_vectornav(wire, vector):
@@ -137,7 +137,7 @@ def read_mip(wire, vector):
         for kind, data in mip.fields(wire)
     }
     assert sample.time_us == got["0xd5"] // 1000
-    assert scaled(sample.acc, GRAVITY) == pytest.approx(got["0x4"])
+    assert scaled(sample.acc, STANDARD_G) == pytest.approx(got["0x4"])
     assert sample.gyr == pytest.approx(got["0x5"])
     return got
 
@@ -161,7 +161,7 @@ def read_haritorax(wire, vector):
     w, x, y, z = (value * vector["expect"]["norm"] for value in sample.quat)
     return {
         "qxyzw_raw": [round(value) for value in (x, y, z, w)],
-        "acc_raw": scaled(sample.acc, GRAVITY / 2048),
+        "acc_raw": scaled(sample.acc, STANDARD_G / 2048),
         "norm": vector["expect"]["norm"],
     }
 

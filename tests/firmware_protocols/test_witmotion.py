@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_protocols import witmotion, witmotion_can, witmotion_modbus
-from firmware_protocols.sample import GRAVITY, Counters, Sample
+from firmware_protocols.sample import STANDARD_G, Counters, Sample
 from firmware_protocols.witmotion import WitDecoder
 from firmware_protocols.witmotion_can import WitCanDecoder
 from firmware_protocols.witmotion_modbus import WitModbusDecoder
@@ -28,7 +28,7 @@ def stream(n, sensor=0):
             sensor,
             (43_200_000 + 10 * i) * 1000,
             QUAT,
-            (GRAVITY * i / 64, 0.0, GRAVITY),
+            (STANDARD_G * i / 64, 0.0, STANDARD_G),
             (0.0, math.radians(i), 1.0),
             (100.0, float(i), -400.0),
             25.5,
@@ -128,7 +128,7 @@ def test_field_in_microtesla():
 
 def test_field_range_is_held():
     (sample, *_), _ = decode(witmotion.encode(Sample(0, 0, QUAT, (1e6, -1e6, 0.0))) * 2)
-    assert sample.acc == pytest.approx((16 * GRAVITY, -16 * GRAVITY, 0), rel=1e-4)
+    assert sample.acc == pytest.approx((16 * STANDARD_G, -16 * STANDARD_G, 0), rel=1e-4)
 
 
 def test_angles_turn_about_z_then_y_then_x():
@@ -151,7 +151,7 @@ def test_output_that_changes():
         got += decoder.feed(witmotion.encode(sample, angles=sample.mag is not None))
     assert len(got) >= 9
     for sample in got:
-        i = round(sample.acc[0] * 64 / GRAVITY)
+        i = round(sample.acc[0] * 64 / STANDARD_G)
         check(sample, {"gyr": plain[i].gyr, "quat": QUAT}, 2e-3)
 
 
@@ -239,7 +239,7 @@ def test_lost_packets_never_mix_cycles():
         for count in (1, 2, 3, 4, 6, 7, 8, 9):
             data = b"".join(frames[:start] + frames[start + count :])
             for sample in decode(data)[0]:
-                i = round(sample.acc[0] * 64 / GRAVITY)
+                i = round(sample.acc[0] * 64 / STANDARD_G)
                 check(
                     sample,
                     {k: v for k, v in sent[i]._asdict().items() if getattr(sample, k) is not None},
@@ -354,7 +354,7 @@ def test_lost_can_frames_never_mix_cycles(fine):
             # Nothing after the loss but the cycles that it touches is changed.
             assert len(samples) >= 6
             for sample in samples:
-                i = round(sample.acc[0] * 64 / GRAVITY)
+                i = round(sample.acc[0] * 64 / STANDARD_G)
                 check(
                     sample,
                     {k: v for k, v in sent[i]._asdict().items() if getattr(sample, k) is not None},

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 
 from firmware_protocols import ximu3
 from firmware_protocols.rotation import rotate
-from firmware_protocols.sample import GRAVITY, Sample, z_up
+from firmware_protocols.sample import STANDARD_G, Sample, z_up
 from firmware_protocols.ximu3 import Ximu3Decoder, encode, encode_message
 
 DATA = json.loads((Path(__file__).parents[1] / "data/protocols/ximu3.json").read_text(encoding="utf-8"))
-STILL = ((0.0, 0.0, GRAVITY), (0.0, 0.0, 0.0))
+STILL = ((0.0, 0.0, STANDARD_G), (0.0, 0.0, 0.0))
 
 
 def quaternion(rng):
@@ -78,7 +78,7 @@ def test_vectors(vector):
     assert sample.time_us == vector["time_us"]
     if vector["letter"] == "I":
         assert sample.gyr == tuple(map(math.radians, vector["values"][:3]))
-        assert sample.acc == tuple(x * GRAVITY for x in vector["values"][3:])
+        assert sample.acc == tuple(x * STANDARD_G for x in vector["values"][3:])
         assert sample.quat is None
     else:
         assert sample.quat == tuple(vector["values"])
@@ -100,7 +100,7 @@ def test_gravity_points_up_in_recordings(recorded):
     (sample,) = Ximu3Decoder().feed(wire)
     x, y, z = rotate(sample.quat, sample.acc)
     assert math.degrees(math.atan2(math.hypot(x, y), z)) < 1
-    assert z == pytest.approx(GRAVITY, abs=0.05)
+    assert z == pytest.approx(STANDARD_G, abs=0.05)
     assert math.hypot(*sample.gyr) < 0.01
 
 
@@ -126,12 +126,12 @@ def test_linear_and_earth_acceleration_with_orientation(frame):
         wire_q = z_up(q) if frame == "NED" else q
         acc = tuple(rng.gauss(0, 10) for _ in range(3))
         inertial = rotate(q, acc)
-        moved = (inertial[0], inertial[1], inertial[2] - GRAVITY)
+        moved = (inertial[0], inertial[1], inertial[2] - STANDARD_G)
         if frame == "NED":
             moved = (moved[1], moved[0], -moved[2])
         w, x, y, z = wire_q
-        linear = tuple(v / GRAVITY for v in rotate((w, -x, -y, -z), moved))
-        earth = tuple(v / GRAVITY for v in moved)
+        linear = tuple(v / STANDARD_G for v in rotate((w, -x, -y, -z), moved))
+        earth = tuple(v / STANDARD_G for v in moved)
         expected = [Sample(0, 9, q, acc)]
         assert all_close(decode(encode_message("L", 9, (*wire_q, *linear)), frame=frame), expected)
         assert all_close(decode(encode_message("E", 9, (*wire_q, *earth)), frame=frame), expected)

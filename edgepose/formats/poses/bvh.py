@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import FileFormatError
 from edgepose.formats.bvh import salvage_bvh
 from edgepose.formats.joint_tree import JointTree
 from edgepose.formats.poses.base import PoseFormat
@@ -51,22 +51,22 @@ def _smpl_joints(path: Path, tree: JointTree) -> dict[str, int]:
     """Places in a tree of SMPL's joints by name; only hands may be missing, and case does not matter.
 
     Raises:
-        EdgeposeError: it has other joints, or they turn from another pose than the T-pose.
+        FileFormatError: it has other joints, or they turn from another pose than the T-pose.
     """
     places = {name.lower(): place for place, name in enumerate(tree.names)}
     missing = [name for name in JOINTS[:22] if name not in places]
     if missing:
         more = " ..." if len(missing) > 3 else ""
-        raise EdgeposeError(f"{path}: its joints are not SMPL's: no {', '.join(missing[:3])}{more}")
+        raise FileFormatError(f"{path}: its joints are not SMPL's: no {', '.join(missing[:3])}{more}")
     for joint, parent in enumerate(PARENTS):
         if (place := places.get(JOINTS[joint])) is not None:
             wanted = -1 if parent < 0 else places[JOINTS[parent]]
             if tree.parents[place] != wanted:
-                raise EdgeposeError(f"{path}: its joint {JOINTS[joint]} does not hang where SMPL's does")
+                raise FileFormatError(f"{path}: its joint {JOINTS[joint]} does not hang where SMPL's does")
     for name, direction in _LIMBS.items():
         offset = tree.offsets[places[name]]
         if not offset @ direction > 0.7 * np.linalg.norm(offset):
-            raise EdgeposeError(
+            raise FileFormatError(
                 f"{path}: where all angles are zero, its {name} is not where a T-pose has it (Y up, facing Z)"
             )
     return places

@@ -15,7 +15,7 @@ from typing import TextIO, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import EdgeposeError, FileFormatError
 from edgepose.formats.poses.base import LARGEST_TIME, PoseFormat, is_absurd
 from edgepose.formats.poses.csv_columns import FORMS, pose_columns
 from edgepose.pose import Poses
@@ -51,7 +51,7 @@ def read_blocks(path: str | Path) -> Iterator[Poses]:
     is found from its header; "-" is standard input.
 
     Raises:
-        EdgeposeError: no such file, or not a file of poses; names the row, counted from 1 for the header.
+        FileFormatError: no such file, or not a file of poses; names the row, counted from 1 for the header.
             All poses before that have come.
     """
     if str(path) == "-":
@@ -62,7 +62,7 @@ def read_blocks(path: str | Path) -> Iterator[Poses]:
         with Path(path).open(encoding="utf-8-sig", errors="replace", newline="") as file:
             yield from _read_rows(file, str(path))
     except OSError as error:
-        raise EdgeposeError(f"cannot read poses from {path}: {error.strerror or error}") from error
+        raise FileFormatError(f"cannot read poses from {path}: {error.strerror or error}") from error
 
 
 class _BadRowError(EdgeposeError):
@@ -89,11 +89,11 @@ def _read_rows(file: TextIO, name: str) -> Iterator[Poses]:
             if error is not None:
                 raise error
     except csv.Error as error:
-        raise EdgeposeError(f"{name}, row {rows.line_num + 1}: {error}") from error
+        raise FileFormatError(f"{name}, row {rows.line_num + 1}: {error}") from error
     except UnicodeDecodeError as error:
-        raise EdgeposeError(f"{name} is not a text file: byte {error.start} is not UTF-8") from error
+        raise FileFormatError(f"{name} is not a text file: byte {error.start} is not UTF-8") from error
     if last is None:
-        raise EdgeposeError(f"{name} has no poses, only a header")
+        raise FileFormatError(f"{name} has no poses, only a header")
 
 
 def _good(
@@ -128,8 +128,8 @@ def _recognise(header: list[str], name: str) -> tuple[str, bool, bool]:
                 if header == pose_columns(form, std, moves):
                     return form, std, moves
     if any("\ufffd" in column for column in header):
-        raise EdgeposeError(f"{name} is not a text file")
-    raise EdgeposeError(
+        raise FileFormatError(f"{name} is not a text file")
+    raise FileFormatError(
         f"{name} is not a file of poses: its first line must be 'frame,time_s,status,pelvis_...' and name "
         "the 24 joints in SMPL order"
     )

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import FileFormatError
 from edgepose.formats.joint_tree import LARGEST
 from edgepose.formats.poses.base import LARGEST_TIME, PoseFormat, is_absurd
 from edgepose.placements import PLACEMENTS
@@ -38,10 +38,10 @@ def read_npz(path: Path) -> tuple[Poses, None]:
     """
     arrays, in_t = _load(path)
     if "poses" not in arrays or arrays["poses"].ndim != 2 or not len(arrays["poses"]):
-        raise EdgeposeError(f"{path}: no poses in it; it needs an array 'poses' (frames, 72)")
+        raise FileFormatError(f"{path}: no poses in it; it needs an array 'poses' (frames, 72)")
     count, width = arrays["poses"].shape
     if width < 66 or width % 3:
-        raise EdgeposeError(f"{path}: 'poses' must be (frames, 72), it is {arrays['poses'].shape}")
+        raise FileFormatError(f"{path}: 'poses' must be (frames, 72), it is {arrays['poses'].shape}")
     check_size(path, count * _POSE_BYTES)
     joints = len(JOINTS) if width == 72 else 22
     vectors = _numbers(path, arrays, "poses", (count, width))[:, : 3 * joints].reshape(count, joints, 3)
@@ -65,22 +65,22 @@ def _load(path: Path) -> tuple[dict[str, NDArray[Any]], bool]:
         with open_npz(path) as archive:
             return {key: archive[key] for key in wanted if f"{key}.npy" in names}, _is_recording(names)
     except OSError as error:
-        raise EdgeposeError(f"cannot read poses from {path}: {error.strerror or error}") from error
+        raise FileFormatError(f"cannot read poses from {path}: {error.strerror or error}") from error
     except BROKEN as error:
         reason = " ".join(str(error).split())
-        raise EdgeposeError(f"{path}: not a whole NPZ file ({reason}); copy it again") from None
+        raise FileFormatError(f"{path}: not a whole NPZ file ({reason}); copy it again") from None
 
 
 def _numbers(path: Path, arrays: Mapping[str, NDArray[Any]], key: str, shape: tuple[int, ...]) -> Array:
     """An array as numbers, finite and not absurd."""
     values = arrays[key]
     if values.dtype.kind not in "fiub" or values.shape != shape:
-        raise EdgeposeError(f"{path}: {key!r} is {values.dtype} {values.shape} and not numbers {shape}")
+        raise FileFormatError(f"{path}: {key!r} is {values.dtype} {values.shape} and not numbers {shape}")
     numbers = values.astype(np.float64)
     bad = is_absurd(numbers, LARGEST_TIME if key in ("time_s", "frame") else LARGEST)
     if bad.any():
         where = f" of frame {np.argwhere(bad)[0][0]}" if shape else ""
-        raise EdgeposeError(f"{path}: a number in {key!r}{where} is not finite, or far too large")
+        raise FileFormatError(f"{path}: a number in {key!r}{where} is not finite, or far too large")
     return numbers
 
 
@@ -90,18 +90,18 @@ def _clock(path: Path, arrays: Mapping[str, NDArray[Any]], count: int) -> tuple[
     if "frame" in arrays:
         frames = _numbers(path, arrays, "frame", (count,)).astype(np.int64)
         if (np.diff(frames) <= 0).any():
-            raise EdgeposeError(f"{path}: the numbers in 'frame' do not rise")
+            raise FileFormatError(f"{path}: the numbers in 'frame' do not rise")
     if "time_s" in arrays:
         times = _numbers(path, arrays, "time_s", (count,))
         if (np.diff(times) <= 0).any():
-            raise EdgeposeError(f"{path}: the times in 'time_s' do not rise")
+            raise FileFormatError(f"{path}: the times in 'time_s' do not rise")
         return frames, times
     key = "mocap_framerate" if "mocap_framerate" in arrays else "mocap_frame_rate"
     if key not in arrays or arrays[key].size != 1:
-        raise EdgeposeError(f"{path}: needs one number 'mocap_framerate', frames per second")
+        raise FileFormatError(f"{path}: needs one number 'mocap_framerate', frames per second")
     rate = float(_numbers(path, {key: arrays[key].reshape(())}, key, ()))
     if not 1e-2 < rate < 1e5:
-        raise EdgeposeError(f"{path}: a frame rate of {rate:g} Hz is not possible")
+        raise FileFormatError(f"{path}: a frame rate of {rate:g} Hz is not possible")
     return frames, np.arange(count) / rate
 
 

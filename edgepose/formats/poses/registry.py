@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from pkgutil import resolve_name
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import FileFormatError
 from edgepose.formats.bvh import FRAME_TIMES
 from edgepose.formats.plugins import plugin_formats
 from edgepose.formats.poses.base import PoseFormat
@@ -32,11 +32,11 @@ def read_poses(path: str | Path) -> Poses:
         path: file to read; "-" is CSV on standard input.
 
     Raises:
-        EdgeposeError: no such file, or not a file of poses.
+        FileFormatError: no such file, or not a file of poses.
     """
     poses, problem = _read(Path(path))
     if problem is not None:
-        raise EdgeposeError(problem)
+        raise FileFormatError(problem)
     return poses
 
 
@@ -44,7 +44,7 @@ def salvage_poses(path: Path) -> tuple[Poses, str | None]:
     """The poses before the first bad one, and one line on what is bad; see `read_poses`.
 
     Raises:
-        EdgeposeError: there is none.
+        FileFormatError: there is none.
     """
     poses, problem = _read(path)
     return poses, problem and f"{problem}; {len(poses.frames)} poses are taken"
@@ -72,7 +72,7 @@ def _read(path: Path) -> tuple[Poses, str | None]:
     """The poses before the first bad one, and what is wrong with the file."""
     poses, problem = find_format(path).read(path)
     if not FRAME_TIMES[0] < poses.frame_time < FRAME_TIMES[1]:
-        raise EdgeposeError(f"{path}: {poses.frame_time:g} s from pose to pose is not possible")
+        raise FileFormatError(f"{path}: {poses.frame_time:g} s from pose to pose is not possible")
     return poses, problem
 
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import FileFormatError
 from edgepose.formats.plugins import FileFormat
 from edgepose.imu import ImuSample, Recording, SensorData
 from edgepose.placements import PLACEMENTS
@@ -91,7 +91,7 @@ def from_samples(
         salvage: leave bad ones out and say so in `damage` instead of raising.
 
     Raises:
-        EdgeposeError: there is something in them that no sensor measures.
+        FileFormatError: there is something in them that no sensor measures.
     """
     table = SampleTable(name, salvage)
     for number, sample in enumerate(rows, start=1):
@@ -155,10 +155,10 @@ class SampleTable:
         """Leave a row out.
 
         Raises:
-            EdgeposeError: nothing is to be left out.
+            FileFormatError: nothing is to be left out.
         """
         if not self._salvage:
-            raise EdgeposeError(f"{self._name}: {problem}")
+            raise FileFormatError(f"{self._name}: {problem}")
         self._problem = self._problem or problem
         self._left_out += 1
 
@@ -181,7 +181,7 @@ class SampleTable:
         """Take rows (n, 14) with their numbers (n,) and counts of empty cells (n,).
 
         Raises:
-            EdgeposeError: there is something in them that no sensor measures.
+            FileFormatError: there is something in them that no sensor measures.
         """
         if not len(rows):
             return
@@ -216,7 +216,7 @@ class SampleTable:
             blocks.append(rows)
         self._checked += len(rows)
         if self._checked > MAX_SAMPLES:
-            raise EdgeposeError(f"{self._name}: more than {MAX_SAMPLES} samples; split the recording")
+            raise FileFormatError(f"{self._name}: more than {MAX_SAMPLES} samples; split the recording")
 
     def sensors(self) -> dict[str, SensorData]:
         """All data by sensor, in the order of the names."""

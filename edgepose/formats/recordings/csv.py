@@ -11,7 +11,7 @@ from math import nan
 from pathlib import Path
 from typing import TextIO
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import FileFormatError
 from edgepose.formats.recordings.base import ReadOptions, RecordingFormat, SampleTable, samples, shorten
 from edgepose.imu import ImuSample, Recording
 from edgepose.placements import PLACEMENTS
@@ -95,7 +95,7 @@ class _Lines:
         self.number += not self.cut
         self.line = line
         if len(self.line) == _MAX_LINE and not self.unlimited:
-            raise EdgeposeError(
+            raise FileFormatError(
                 f"{self._path}: row {self.number} is longer than {_MAX_LINE} characters; is it a CSV file?"
             )
         return self.line
@@ -113,12 +113,12 @@ def _read_metadata(path: Path, lines: _Lines) -> dict[str, str]:
             header = line.strip().replace('"', "").replace(" ", "")
             if header == COLUMNS:
                 return metadata
-            raise EdgeposeError(
+            raise FileFormatError(
                 f"{path}: row {lines.number} has the columns {shorten(line)}; a recording has {COLUMNS}"
             )
         key, _, value = line[1:].partition(":")
         metadata[key.strip()] = value.strip()
-    raise EdgeposeError(f"{path}: the file is empty; a recording starts with the columns {COLUMNS}")
+    raise FileFormatError(f"{path}: the file is empty; a recording starts with the columns {COLUMNS}")
 
 
 def _read_rows(

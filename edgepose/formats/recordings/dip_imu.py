@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose import rotations as rot
-from edgepose.calibration import GRAVITY
-from edgepose.errors import EdgeposeError
+from edgepose.errors import FileFormatError
 from edgepose.formats.recordings.base import RecordingFormat, from_samples, samples
-from edgepose.imu import Recording, SensorData
+from edgepose.imu import GRAVITY, Recording, SensorData
 from edgepose.placements import PLACEMENTS
 from edgepose.utils.safe_pickle import array_of, numbers, read_pickle
 
@@ -65,7 +64,7 @@ def read_dip(path: Path) -> DipTake:
     """The take in a pickle of DIP's.
 
     Raises:
-        EdgeposeError: not such a file.
+        FileFormatError: not such a file.
     """
     content = _content(path)
     ori, acc = _layout(content, path)[:2]
@@ -78,7 +77,7 @@ def read_dip(path: Path) -> DipTake:
     nearest = rot.nearest_rotation(orientation)
     worst = np.abs(nearest - orientation).max()
     if not worst < _MAX_OFF:
-        raise EdgeposeError(f"{path}: {ori!r} holds matrices that are no rotations (off by {worst:.2g})")
+        raise FileFormatError(f"{path}: {ori!r} holds matrices that are no rotations (off by {worst:.2g})")
     return DipTake(nearest, acceleration, measured, pose)
 
 
@@ -88,7 +87,7 @@ def read_recording(path: Path) -> Recording:
     Samples that were lost are not there. The true poses need not be.
 
     Raises:
-        EdgeposeError: not a pickle of DIP's.
+        FileFormatError: not a pickle of DIP's.
     """
     orientation, acceleration = _sensors(_content(path), path)
     lost = np.isnan(orientation).any(axis=(-2, -1)) | np.isnan(acceleration).any(axis=-1)
@@ -116,7 +115,7 @@ def read_true_pose(path: Path) -> Array:
     """The SMPL pose in a pickle of DIP's: local rotations (T, 24, 3, 3), joint 0 in SMPL's frame.
 
     Raises:
-        EdgeposeError: not such a file.
+        FileFormatError: not such a file.
     """
     return _true_pose(_content(path), path)
 
@@ -124,13 +123,13 @@ def read_true_pose(path: Path) -> Array:
 def _true_pose(content: dict[Any, Any], path: Path) -> Array:
     """Local rotations (T, 24, 3, 3) of what a pickle has under `gt`."""
     if "gt" not in content:
-        raise EdgeposeError(f"{path}: has no 'gt', the true poses")
+        raise FileFormatError(f"{path}: has no 'gt', the true poses")
     pose = numbers(content["gt"], "gt", path)
     if pose.ndim != 2 or pose.shape[1] != 72 or not len(pose):
-        raise EdgeposeError(f"{path}: 'gt' is {pose.shape} and not (frames, 72) angles")
+        raise FileFormatError(f"{path}: 'gt' is {pose.shape} and not (frames, 72) angles")
     angles = pose.astype(float)
     if (absurd := np.abs(angles).max(axis=1) > _MAX_ANGLE).any():
-        raise EdgeposeError(
+        raise FileFormatError(
             f"{path}: an angle in frame {absurd.argmax()} of 'gt' is more than {_MAX_ANGLE:g} rad; copy the "
             "file again"
         )
@@ -141,7 +140,7 @@ def _content(path: Path) -> dict[Any, Any]:
     try:
         return read_pickle(path, "pickle of DIP-IMU", _ADVICE)
     except OSError as error:
-        raise EdgeposeError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise FileFormatError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def _layout(content: dict[Any, Any], path: Path) -> tuple[str, str, int, tuple[int, ...]]:
@@ -149,7 +148,7 @@ def _layout(content: dict[Any, Any], path: Path) -> tuple[str, str, int, tuple[i
     for layout in _LAYOUTS:
         if layout[0] in content and layout[1] in content:
             return layout
-    raise EdgeposeError(
+    raise FileFormatError(
         f"{path}: neither DIP-IMU (imu_ori, imu_acc, gt) nor DIP's TotalCapture (ori, acc, gt): it has "
         f"{', '.join(sorted(map(str, content))) or 'nothing'}"
     )
@@ -165,7 +164,7 @@ def _sensors(content: dict[Any, Any], path: Path, frames: int | None = None) -> 
         array, shape = array_of(content[key], key, path).astype(float), (frames, count, *size)
         # Some versions have each matrix as a row of nine.
         if array.shape[:2] != shape[:2] or array.size != np.prod(shape):
-            raise EdgeposeError(f"{path}: {key!r} is {array.shape} and not {shape}, as the rest says")
+            raise FileFormatError(f"{path}: {key!r} is {array.shape} and not {shape}, as the rest says")
         found.append(array.reshape(shape)[:, list(ours)])
     return found[0], found[1]
 
@@ -175,7 +174,7 @@ def _fill(values: Array, what: str) -> NDArray[np.bool_]:
     finite = np.all(np.isfinite(values.reshape(len(values), -1)), axis=1)
     good = np.flatnonzero(finite)
     if not len(good):
-        raise EdgeposeError(f"{what}: no frame was measured")
+        raise FileFormatError(f"{what}: no frame was measured")
     rows = np.arange(len(values))
     after = np.clip(np.searchsorted(good, rows), 0, len(good) - 1)
     before = np.clip(after - 1, 0, None)

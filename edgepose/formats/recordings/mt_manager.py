@@ -12,7 +12,7 @@ from itertools import islice
 from math import isfinite
 from pathlib import Path
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import FileFormatError
 from edgepose.formats.recordings.base import RecordingFormat, from_samples
 from edgepose.formats.recordings.xio_session import by_placement
 from edgepose.imu import ImuSample, Recording
@@ -59,7 +59,7 @@ def read_session(folder: Path, ids: Mapping[int, str] | None = None) -> Recordin
             the placement in its name, such as "left_lower_leg_00B4D7D3.txt".
 
     Raises:
-        EdgeposeError: no file is of a placement, two are of one, or a file is of another kind.
+        FileFormatError: no file is of a placement, two are of one, or a file is of another kind.
     """
     places = by_placement(folder, sorted(path for path in folder.glob("*.txt") if _is_sensor(path)), ids)
     problems: list[str] = []
@@ -88,10 +88,10 @@ def _read(path: Path, index: int, problems: list[str]) -> tuple[float, list[ImuS
             rate, names = _head(path, lines)
             missing = [name for name in _QUANTITIES["acc"] + _QUANTITIES["gyr"] if name not in names]
             if missing:
-                raise EdgeposeError(f"{path}: has no columns {', '.join(missing)}; export them too")
+                raise FileFormatError(f"{path}: has no columns {', '.join(missing)}; export them too")
             samples, bad = _samples(lines, names, index)
     except OSError as error:
-        raise EdgeposeError(f"{path}: cannot read it: {error.strerror}") from None
+        raise FileFormatError(f"{path}: cannot read it: {error.strerror}") from None
     if bad:
         problems.append(f"{path}: {bad} bad rows left out")
     return rate, samples
@@ -106,9 +106,9 @@ def _head(path: Path, lines: Iterator[str]) -> tuple[float, list[str]]:
             rate = float(found[1])
         elif line.startswith(_COUNTER):
             if rate is None or not 0.1 < rate < 10_000.0:
-                raise EdgeposeError(f"{path}: no possible 'Update Rate: ... Hz' in its first lines")
+                raise FileFormatError(f"{path}: no possible 'Update Rate: ... Hz' in its first lines")
             return rate, _cells(line)
-    raise EdgeposeError(f"{path}: no line of columns that begins with {_COUNTER}")
+    raise FileFormatError(f"{path}: no line of columns that begins with {_COUNTER}")
 
 
 def _cells(line: str) -> list[str]:

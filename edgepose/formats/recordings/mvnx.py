@@ -20,10 +20,9 @@ from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
-from edgepose.calibration import GRAVITY
-from edgepose.errors import EdgeposeError
+from edgepose.errors import EdgeposeError, FileFormatError
 from edgepose.formats.recordings.base import RecordingFormat, from_samples
-from edgepose.imu import ImuSample, Recording
+from edgepose.imu import GRAVITY, ImuSample, Recording
 from firmware_protocols.rotation import rotate_back
 from firmware_protocols.sample import unit_quaternion
 
@@ -53,7 +52,7 @@ def read_mvnx(path: Path) -> Recording:
     """The recording in a file: of the sensors at the six placements, those that it has.
 
     Raises:
-        EdgeposeError: it cannot be read, is no MVNX, or has none of the six sensors.
+        FileFormatError: it cannot be read, is no MVNX, or has none of the six sensors.
     """
     frames = _Frames(path)
     problems: list[str] = []
@@ -73,12 +72,12 @@ def _samples(path: Path, frames: _Frames, problems: list[str]) -> Iterator[ImuSa
                 if broken:
                     break
     except OSError as error:
-        raise EdgeposeError(f"{path}: cannot read it: {error.strerror or error}") from None
+        raise FileFormatError(f"{path}: cannot read it: {error.strerror or error}") from None
     if not frames.count:
         why = broken or "of the type normal"
-        raise EdgeposeError(f"{path}: no frame of an MVNX recording ({why}); export it from MVN again")
+        raise FileFormatError(f"{path}: no frame of an MVNX recording ({why}); export it from MVN again")
     if frames.bad == frames.count:
-        raise EdgeposeError(
+        raise FileFormatError(
             f"{path}: no frame has whole lists of its sensors' numbers; export sensorOrientation and "
             "sensorFreeAcceleration, too"
         )
@@ -123,13 +122,13 @@ class _Frames:
         """Take the next bytes, none at the end of the file; what is wrong with them, if they are the last.
 
         Raises:
-            EdgeposeError: it is no MVNX, and there is no frame yet.
+            FileFormatError: it is no MVNX, and there is no frame yet.
         """
         self._fed += len(chunk)
         try:
             self._parser.Parse(chunk, not chunk)
             if self._fed - self._parser.CurrentByteIndex > _LONGEST:
-                raise EdgeposeError(
+                raise FileFormatError(
                     f"{self._path}: not an MVNX file: it has a tag of more than {_LONGEST} bytes"
                 )
         except EdgeposeError as error:
@@ -147,18 +146,18 @@ class _Frames:
 
     def _refuse(self, *declared: object) -> None:
         # Entities could be of any size, or in any file; MVN declares none.
-        raise EdgeposeError(f"{self._path}: not an MVNX file: it declares a document type")
+        raise FileFormatError(f"{self._path}: not an MVNX file: it declares a document type")
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         self._depth += 1
         if self._depth > _DEEPEST:
-            raise EdgeposeError(f"{self._path}: not an MVNX file: elements are too deep in one another")
+            raise FileFormatError(f"{self._path}: not an MVNX file: elements are too deep in one another")
         if name == "subject":
             self.rate = self._rate_of(attributes.get("frameRate", ""))
         elif name == "sensor":
             self._labels.append(attributes.get("label", ""))
             if len(self._labels) > _MOST_SENSORS:
-                raise EdgeposeError(f"{self._path}: has more than {_MOST_SENSORS} sensors")
+                raise FileFormatError(f"{self._path}: has more than {_MOST_SENSORS} sensors")
         elif name == "frame" and attributes.get("type") == "normal":
             if not self.count:
                 self._check()
@@ -171,7 +170,7 @@ class _Frames:
         if self._list is not None:
             self._length += len(text)
             if self._length > _LONGEST:
-                raise EdgeposeError(
+                raise FileFormatError(
                     f"{self._path}: not an MVNX file: a list has more than {_LONGEST} characters"
                 )
             self._list.append(text)
@@ -194,16 +193,18 @@ class _Frames:
         except ValueError:
             rate = 0.0
         if not 0.1 < rate < 10_000.0:
-            raise EdgeposeError(f"{self._path}: the frame rate {text[:20]!r} of its subject is not possible")
+            raise FileFormatError(
+                f"{self._path}: the frame rate {text[:20]!r} of its subject is not possible"
+            )
         return rate
 
     def _check(self) -> None:
         """Raise if what must come before the frames has not come."""
         if not self.rate:
-            raise EdgeposeError(f"{self._path}: has frames, but no subject with a frame rate before them")
+            raise FileFormatError(f"{self._path}: has frames, but no subject with a frame rate before them")
         if not any(label in self._labels for label in LABELS):
             found = ", ".join(self._labels)[:200] or "none"
-            raise EdgeposeError(f"{self._path}: has no sensor called {', '.join(LABELS)} (it has {found})")
+            raise FileFormatError(f"{self._path}: has no sensor called {', '.join(LABELS)} (it has {found})")
 
     def _frame(self, time_ms: str) -> list[ImuSample]:
         """Samples of a frame.

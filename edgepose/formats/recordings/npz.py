@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import FileFormatError
 from edgepose.formats.recordings.base import QUANTITIES, ReadOptions, RecordingFormat, SampleTable, shorten
 from edgepose.imu import Recording
 from edgepose.utils.safe_npz import BROKEN, open_npz
@@ -47,7 +47,7 @@ def read_npz(path: Path, options: ReadOptions) -> Recording:
     try:
         arrays = _load_arrays(path, options.names)
     except BROKEN as error:
-        raise EdgeposeError(
+        raise FileFormatError(
             f"{path}: not a whole NPZ file ({error}); what is left of a cut one cannot be read: copy it again"
         ) from None
     sparse = set(_lines_of(path, arrays, "sparse"))
@@ -70,7 +70,7 @@ def _load_arrays(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
             placement, _, name = key.rpartition("_")
             is_sensor = name in QUANTITIES or (name == "t" and placement)
             if is_sensor and placement not in names:
-                raise EdgeposeError(
+                raise FileFormatError(
                     f"{path}: {shorten(key)} is of an unknown sensor; the names are {', '.join(names)}"
                 )
             if is_sensor or key in ("t", "sparse", "metadata"):
@@ -81,7 +81,7 @@ def _load_arrays(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
 def _lines_of(path: Path, arrays: Mapping[str, NDArray[Any]], key: str) -> list[str]:
     lines = arrays.get(key, np.array([], dtype=str))
     if lines.ndim != 1 or lines.dtype.kind != "U":
-        raise EdgeposeError(f"{path}: {key!r} is not an array of strings")
+        raise FileFormatError(f"{path}: {key!r} is not an array of strings")
     return [str(line) for line in lines]
 
 
@@ -90,7 +90,7 @@ def _add_arrays(
 ) -> None:
     key = f"{placement}_t" if f"{placement}_t" in arrays else "t"
     if key not in arrays:
-        raise EdgeposeError(
+        raise FileFormatError(
             f"{path}: has no times of {placement}; they are in an array 't' or '{placement}_t'"
         )
     columns = [_numbers(path, arrays, key, (arrays[key].size,))[:, None]]
@@ -111,7 +111,7 @@ def _add_arrays(
 def _numbers(path: Path, arrays: Mapping[str, NDArray[Any]], key: str, shape: tuple[int, ...]) -> Array:
     array = arrays[key]
     if array.dtype.kind not in "fiu" or array.shape != shape:
-        raise EdgeposeError(f"{path}: {key!r} is {array.dtype} {array.shape} and not numbers {shape}")
+        raise FileFormatError(f"{path}: {key!r} is {array.dtype} {array.shape} and not numbers {shape}")
     return array.astype(np.float64)
 
 

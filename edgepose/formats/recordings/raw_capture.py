@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import FileFormatError
 from edgepose.formats.recordings.csv import comments
 
 COLUMNS = "time_s,end"
@@ -54,7 +54,7 @@ def read_capture(path: Path) -> Iterator[Piece]:
     time get the last one, times without bytes are left out.
 
     Raises:
-        EdgeposeError: a file cannot be read, or the times are damaged before their last line.
+        FileFormatError: a file cannot be read, or the times are damaged before their last line.
     """
     try:
         with path.open("rb") as file:
@@ -67,7 +67,7 @@ def read_capture(path: Path) -> Iterator[Piece]:
             while data := file.read(_CHUNK):
                 yield Piece(arrival_s, data)
     except OSError as error:
-        raise EdgeposeError(f"{error.filename or path}: cannot read it: {error.strerror}") from None
+        raise FileFormatError(f"{error.filename or path}: cannot read it: {error.strerror}") from None
 
 
 def _read_times(path: Path) -> Iterator[tuple[float, int]]:
@@ -87,7 +87,7 @@ def _read_times(path: Path) -> Iterator[tuple[float, int]]:
             except ValueError:
                 row = (-1.0, -1)
             if not (arrival_s <= row[0] < 1e11 and end <= row[1]):
-                raise EdgeposeError(
+                raise FileFormatError(
                     f"{path}: row {number} is damaged; delete the file to read the capture without its times"
                 )
             arrival_s, end = row

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from pkgutil import resolve_name
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import FileFormatError
 from edgepose.formats.plugins import plugin_formats
 from edgepose.formats.recordings.base import ReadOptions, RecordingFormat
 from edgepose.imu import Recording
@@ -34,13 +34,13 @@ def read_recording(path: Path | str, ids: Mapping[int, str] | None = None) -> Re
         ids: placements by serial number, for sessions whose names have no placements in them.
 
     Raises:
-        EdgeposeError: it cannot be read, or is anything else than a recording of all six sensors.
+        FileFormatError: it cannot be read, or is anything else than a recording of all six sensors.
     """
     recording = _read(Path(path), ReadOptions(ids=ids))
     missing = missing_sensors(recording)
     if missing:
         damage = f" ({recording.damage})" if recording.damage else ""
-        raise EdgeposeError(
+        raise FileFormatError(
             f"{path}: no samples of {', '.join(missing)}; a recording needs all six sensors{damage}"
         )
     return recording
@@ -54,7 +54,7 @@ def salvage_recording(path: Path | str, ids: Mapping[int, str] | None = None) ->
         ids: as of `read_recording`.
 
     Raises:
-        EdgeposeError: it cannot be read, or is no recording at all.
+        FileFormatError: it cannot be read, or is no recording at all.
     """
     return _read(Path(path), ReadOptions(salvage=True, ids=ids))
 
@@ -65,7 +65,7 @@ def read_sensors(path: Path | str, names: Sequence[str]) -> Recording:
     Only CSV and NPZ hold other sensors than the six.
 
     Raises:
-        EdgeposeError: it cannot be read, or is anything else than a recording of such sensors.
+        FileFormatError: it cannot be read, or is anything else than a recording of such sensors.
     """
     return _read(Path(path), ReadOptions(tuple(names)))
 
@@ -96,14 +96,16 @@ def _read(path: Path, options: ReadOptions) -> Recording:
         known = find_format(path)
         if known is None:
             if path.is_dir():
-                raise EdgeposeError(
+                raise FileFormatError(
                     f"{path}: unknown kind of file (Is a directory with no recording in it); give the folder "
                     "that holds the files or folders of all sensors"
                 )
             known = _built_in("csv")
         return known.read(path, options)
     except (OSError, UnicodeDecodeError) as error:
-        raise EdgeposeError(f"{path}: cannot read it: {getattr(error, 'strerror', None) or error}") from None
+        raise FileFormatError(
+            f"{path}: cannot read it: {getattr(error, 'strerror', None) or error}"
+        ) from None
 
 
 def _formats() -> Iterator[RecordingFormat]:

@@ -17,12 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose import rotations as rot
-from edgepose.calibration import GRAVITY
-from edgepose.calibration.checks import tilt_deg
-from edgepose.errors import EdgeposeError
+from edgepose.errors import FileFormatError
 from edgepose.formats.recordings.base import RecordingFormat
-from edgepose.imu import Recording, SensorData
+from edgepose.imu import GRAVITY, Recording, SensorData
 from edgepose.placements import PLACEMENTS
+from edgepose.rotations import tilt_deg
 
 Array = NDArray[np.float64]
 
@@ -49,7 +48,7 @@ def read_recording(path: Path) -> Recording:
     """The sensors of a file, as they were strapped on; rows that are no good are not there.
 
     Raises:
-        EdgeposeError: not such a file, or its inertial frame has not Z up.
+        FileFormatError: not such a file, or its inertial frame has not Z up.
     """
     readings = read_sensors(path)
     orientation, force, measured = readings.orientation, readings.force, readings.measured
@@ -62,7 +61,7 @@ def read_recording(path: Path) -> Recording:
             continue
         mean = (orientation[there, i] @ force[there, i, :, None]).mean(axis=0)[:, 0]
         if not tilt_deg(mean) < _TILT_DEG:
-            raise EdgeposeError(
+            raise FileFormatError(
                 f"{path}: {name} measures gravity along {np.round(mean, 1).tolist()} and not along Z; "
                 "the file is not laid out as TotalCapture's"
             )
@@ -90,7 +89,7 @@ def read_sensors(path: Path) -> Readings:
     """What is good in a .sensors file.
 
     Raises:
-        EdgeposeError: not such a file.
+        FileFormatError: not such a file.
     """
     rows, problems = array("d"), list[str]()
     try:
@@ -111,14 +110,14 @@ def read_sensors(path: Path) -> Readings:
                     block.pop()
                 rows.extend(_frame(block, frame, problems).ravel())
     except OSError as error:
-        raise EdgeposeError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise FileFormatError(f"{path}: cannot be read: {error.strerror or error}") from error
     damage = None
     if problems:
         damage = f"{path}, {problems[0]}; {len(problems)} such places in all, the rest is good"
     values = np.frombuffer(rows).reshape(-1, len(NAMES), _NUMBERS)
     measured = ~np.isnan(values[..., 0])
     if not measured.any():
-        raise EdgeposeError(f"{path}, {problems[0]}")
+        raise FileFormatError(f"{path}, {problems[0]}")
     values = np.where(measured[..., None], values, _AT_REST)
     quats = values[..., :4] / np.linalg.norm(values[..., :4], axis=-1, keepdims=True)
     return Readings(rot.quat_to_matrix(quats), values[..., 4:], measured, damage)
@@ -149,7 +148,7 @@ def _counts(path: Path, line: str) -> tuple[int, int]:
         sensors, frames = map(int, cells)
         if len(NAMES) <= sensors <= 100 and 0 < frames <= MAX_FRAMES:
             return sensors, frames
-    raise EdgeposeError(
+    raise FileFormatError(
         f"{path}, line 1: expected the numbers of sensors and frames, found {line.strip()[:40]!r}"
     )
 

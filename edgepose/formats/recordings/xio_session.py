@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import FileFormatError
 from edgepose.formats.recordings.base import RecordingFormat, from_samples
 from edgepose.imu import ImuSample, Recording
 from edgepose.placements import PLACEMENTS
@@ -48,7 +48,7 @@ def read_session(folder: Path, ids: Mapping[int, str] | None = None) -> Recordin
             as "Left Lower Leg 64F61CB3 (UDP)".
 
     Raises:
-        EdgeposeError: no folder is of a placement, two are of one, or a file is of another kind.
+        FileFormatError: no folder is of a placement, two are of one, or a file is of another kind.
     """
     places = by_placement(folder, sorted(path.parent for path in folder.glob(f"*/{MAIN_FILE}")), ids)
     problems: list[str] = []
@@ -73,7 +73,7 @@ def by_placement(folder: Path, sensors: Sequence[Path], ids: Mapping[int, str] |
     """Files or folders of the sensors of a session by placement; those of no placement are left out.
 
     Raises:
-        EdgeposeError: none is of a placement, or two are of one.
+        FileFormatError: none is of a placement, or two are of one.
     """
     places: dict[str, Path] = {}
     for sensor in sensors:
@@ -81,7 +81,7 @@ def by_placement(folder: Path, sensors: Sequence[Path], ids: Mapping[int, str] |
         if placement is None:
             continue
         if placement in places:
-            raise EdgeposeError(
+            raise FileFormatError(
                 f"{folder}: {places[placement].name!r} and {sensor.name!r} are both {placement}; rename one"
             )
         places[placement] = sensor
@@ -89,7 +89,9 @@ def by_placement(folder: Path, sensors: Sequence[Path], ids: Mapping[int, str] |
         how = f"in the names of its {'folders' if sensors[0].is_dir() else 'files'}"
         how = how if ids is None else "with a serial number of --sensors"
         names = ", ".join(sensor.name for sensor in sensors)
-        raise EdgeposeError(f"{folder}: no placement {how} ({names}); placements are {', '.join(PLACEMENTS)}")
+        raise FileFormatError(
+            f"{folder}: no placement {how} ({names}); placements are {', '.join(PLACEMENTS)}"
+        )
     return places
 
 
@@ -131,14 +133,14 @@ def _messages(path: Path, letter: str) -> Iterator[tuple[int, bytes]]:
         with path.open("rb") as file:
             header = file.readline(4096).decode("utf-8-sig", "replace")
             if not header.startswith(_TIME):
-                raise EdgeposeError(f"{path}: starts with {header.strip()[:40]!r} and not with {_TIME!r}")
+                raise FileFormatError(f"{path}: starts with {header.strip()[:40]!r} and not with {_TIME!r}")
             for line in file:
                 number = line.partition(b",")[0]
                 time_us = int(number) if number.isdigit() and len(number) < 20 else time_us
                 # Digits of a row without an end may be missing; the decoder has no number to read then.
                 yield time_us, letter.encode() + b"," + (line if line.endswith(b"\n") else b"\n")
     except OSError as error:
-        raise EdgeposeError(f"{path}: cannot read it: {error.strerror}") from None
+        raise FileFormatError(f"{path}: cannot read it: {error.strerror}") from None
 
 
 def _chunks(lines: Iterable[bytes]) -> Iterator[bytes]:
