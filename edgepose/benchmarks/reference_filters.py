@@ -13,7 +13,7 @@ from edgepose import rotations as rot
 from edgepose.benchmarks.broad import Trial
 from edgepose.orientation.filter import OrientationFilter
 from edgepose.orientation.smoother import smooth
-from firmware_protocols.sample import GRAVITY
+from firmware_protocols.sample import STANDARD_G
 
 Array = NDArray[np.float64]
 
@@ -93,7 +93,7 @@ def _imufusion(trial: Trial, magnetometer: bool) -> Array:
     bias_settings.sample_rate = trial.rate
     bias = imufusion.Bias()
     bias.set_settings(bias_settings)
-    rates, forces = np.rad2deg(trial.gyr), trial.acc / GRAVITY
+    rates, forces = np.rad2deg(trial.gyr), trial.acc / STANDARD_G
     result = np.empty((len(rates), 4))
     for i, (rate, force, field) in enumerate(zip(rates, forces, trial.mag, strict=True)):
         rate = bias.update(rate)

@@ -37,8 +37,8 @@ def read_bvh(path: str | Path) -> JointTree:
     replace its offset: files that write both, write the offset into the channels again.
 
     Raises:
-        FileFormatError: the file cannot be read, breaks the format, is cut short, or holds a number that is no
-            finite.
+        FileFormatError: the file cannot be read, breaks the format, is cut short, or holds no finite number
+            where one is needed.
     """
     tree, problem = salvage_bvh(path)
     if problem is not None:

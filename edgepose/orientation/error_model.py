@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from edgepose.orientation.settings import FilterSettings
 from edgepose.rotations import cross_matrix
-from firmware_protocols.sample import GRAVITY
+from firmware_protocols.sample import STANDARD_G
 
 Array = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ def transition(dt: Array, rotation: Array, gyr: Array, force: Array) -> Transiti
     matrix[VEL, BIAS] = late_pushed @ bias
     matrix[VEL, SCALE] = late_pushed @ scale
     matrix[VEL, ACC_BIAS] = -bias
-    return Transition(matrix, push - GRAVITY * dt.sum() * _UP)
+    return Transition(matrix, push - STANDARD_G * dt.sum() * _UP)
 
 
 def process_noise(
