@@ -35,7 +35,7 @@ from edgepose.placements import PLACEMENTS
 from firmware_protocols import native_can
 from firmware_protocols.native import encode
 from firmware_protocols.native_packet import Packet
-from firmware_protocols.sample import GRAVITY
+from firmware_protocols.sample import STANDARD_G
 
 REAL = Path(__file__).parents[1] / "data" / "imu" / "six-sites-3s.npz"
 DOCS = Path(__file__).parents[2] / "docs" / "guide" / "recordings.md"
@@ -170,7 +170,7 @@ def xio_session(folder: Path, names: list[str]) -> list[ImuSample]:
             "Temperature": "Timestamp (us),Temperature (degC)\n",
         }
         for time_us, row in zip(stamps, mine, strict=True):
-            inertial = [*map(math.degrees, row.gyr), *(value / GRAVITY for value in row.acc)]
+            inertial = [*map(math.degrees, row.gyr), *(value / STANDARD_G for value in row.acc)]
             lines["Inertial"] += f"{time_us}," + ",".join(f"{value:.6f}" for value in inertial) + "\n"
             lines["Quaternion"] += f"{time_us}," + ",".join(f"{value:.6f}" for value in row.quat) + "\n"
         for time_us in stamps[::5]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edgepose import rotations as rot
-from firmware_protocols.sample import GRAVITY
+from firmware_protocols.sample import STANDARD_G
 
 
 class Simulated(NamedTuple):
@@ -62,7 +62,7 @@ def simulate(times, seed=0, turn=2.0, speed=0.3, still=(), bias=0.5, push=None, 
     gyr = rot.quat_to_rotvec(rot.quat_multiply(rot.quat_conjugate(quat[:-1]), quat[1:])) / dt
     middle = quat[:-1] + quat[1:]
     middle /= np.linalg.norm(middle, axis=1, keepdims=True)
-    acc = rot.quat_rotate(rot.quat_conjugate(middle), np.diff(velocity, axis=0) / dt + [0, 0, GRAVITY])
+    acc = rot.quat_rotate(rot.quat_conjugate(middle), np.diff(velocity, axis=0) / dt + [0, 0, STANDARD_G])
     mag = rot.quat_rotate(rot.quat_conjugate(quat[1:]), np.array([0.0, 20.0, -44.0]))
     offset = np.deg2rad(bias) * np.array([1.0, -0.7, 0.5])
     gyr += offset + noise * rng.normal(size=gyr.shape) * np.deg2rad(0.01) / np.sqrt(dt)

@@ -6,7 +6,7 @@ import pytest
 from edgepose import rotations as rot
 from edgepose.orientation import FilterSettings
 from edgepose.orientation import error_model as model
-from firmware_protocols.sample import GRAVITY
+from firmware_protocols.sample import STANDARD_G
 
 DT = np.full(14, 0.01)
 
@@ -18,7 +18,7 @@ def integrate(state, gyr, acc):
     for dt, rate, force in zip(DT, gyr, acc, strict=True):
         turned = np.array(rot.turn(tuple(quat), *(((1 - scale) * rate - bias) * dt).tolist()))
         middle = (quat + turned) / np.linalg.norm(quat + turned)
-        velocity = velocity + (rot.quat_rotate(middle, force - acc_bias) - [0, 0, GRAVITY]) * dt
+        velocity = velocity + (rot.quat_rotate(middle, force - acc_bias) - [0, 0, STANDARD_G]) * dt
         quat = turned
         middles.append(middle)
     return quat, velocity, np.array(middles)
