@@ -75,7 +75,7 @@ def xio_session(path: Path, recording: Recording) -> Path:
         ]
         quaternion = ["Timestamp (us),W,X,Y,Z"]
         for time_s, quat, acc, gyr in zip(data.time_s, data.quat, data.acc, data.gyr, strict=True):
-            numbers = [*map(math.degrees, gyr), *(acc / sample.GRAVITY)]
+            numbers = [*map(math.degrees, gyr), *(acc / sample.STANDARD_G)]
             inertial.append(",".join([str(round(1e6 * time_s)), *cells(*numbers)]))
             quaternion.append(",".join([str(round(1e6 * time_s)), *cells(*quat)]))
         folder = path / name
