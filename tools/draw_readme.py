@@ -52,7 +52,7 @@ BEHIND = ("head", "pelvis")
 
 HOLD_S = 6.0
 FILM_FROM_S, FILM_S, FILM_FPS = 10.0, 4.0, 15
-FILM_PIXELS, FILM_METRES = (640, 440), 2.9
+FILM_PIXELS, FILM_METRES = (640, 440), 3.1
 """Width and height of the film, and the metres that its width shows."""
 
 
@@ -193,7 +193,7 @@ def film_frame(predicted: FlatBody, true: FlatBody, second: float) -> NDArray[np
     for centre, body, colours, title in columns:
         axes.plot([centre - 0.55, centre + 0.55], [0, 0], color=GROUND, linewidth=1.2, zorder=0)
         draw_body(axes, body, np.array([centre, 0.0]), colours, scale)
-        axes.text(centre, height_m - 0.2, title, ha="center", va="center", fontsize=10, color=INK)
+        axes.text(centre, height_m - 0.21, title, ha="center", va="center", fontsize=10, color=INK)
     axes.text(0.0, -0.06, f"{second:.1f} s", ha="center", va="center", fontsize=9, color=INK)
     agg = FigureCanvasAgg(figure)
     agg.draw()
@@ -207,8 +207,11 @@ def film_colours() -> list[int]:
 
     pure = np.array([to_rgb(c) for c in (*PREDICTION.values(), *REFERENCE.values(), INK, GROUND)])
     share = np.linspace(0.0, 1.0, 9)[1:, None, None]
-    shades = np.concatenate([np.ones((1, 3)), (1.0 - share * (1.0 - pure)).reshape(-1, 3)])
-    return (shades * 255.0).round().astype(int).ravel().tolist()
+    shades = (1.0 - share * (1.0 - pure)).reshape(-1, 3)
+    shades = shades[shades.min(axis=1) < 0.94]  # Pillow would take what is nearly white for white
+    colours = np.concatenate([np.ones((1, 3)), shades]) * 255.0
+    levels: list[int] = colours.round().astype(int).ravel().tolist()
+    return levels
 
 
 def film(path: Path) -> None:
