@@ -54,8 +54,8 @@ WIDTH_IN, DPI = 8.0, 200
 """A strip is 1600 pixels wide."""
 
 
-class _Figure(NamedTuple):
-    """A figure on the picture plane, metres.
+class FlatBody(NamedTuple):
+    """A body on the picture plane, metres.
 
     Attributes:
         points: (28, 2) joints and `EXTRA_POINTS`, right and up.
@@ -66,13 +66,14 @@ class _Figure(NamedTuple):
     depths: Array
 
 
-def project(points: ArrayLike) -> tuple[Array, Array]:
+def project(points: ArrayLike, azimuth: float = AZIMUTH) -> tuple[Array, Array]:
     """Points (..., 3) in the body frame T as (..., 2), right and up, and depths (...) towards the viewer.
 
-    The figure faces the viewer, so its left (+X) is at the viewer's right.
+    The figure faces the viewer, so its left (+X) is at the viewer's right. The viewer stands `azimuth`
+    radians round from its front towards its left side.
     """
     x, y, z = np.moveaxis(np.asarray(points, float), -1, 0)
-    c, s = np.cos(AZIMUTH), np.sin(AZIMUTH)
+    c, s = np.cos(azimuth), np.sin(azimuth)
     return np.stack([c * x - s * z, y], axis=-1), s * x + c * z
 
 
@@ -147,9 +148,9 @@ def skeleton_strip(
     from matplotlib.figure import Figure
 
     times = np.asarray(times, float)
-    rows = [(_figures(poses, offsets), PREDICTION)]
+    rows = [(flatten(poses, offsets), PREDICTION)]
     if reference is not None:
-        rows.append((_figures(reference, offsets), REFERENCE))
+        rows.append((flatten(reference, offsets), REFERENCE))
     if any(len(figures) != len(times) for figures, _ in rows) or not len(times):
         raise ValueError("poses, times and reference must be for the same instants, at least one")
 
@@ -173,7 +174,7 @@ def skeleton_strip(
         ground = -i * height
         axes.plot([0.1, width - 0.1], [ground, ground], color="#DDDDDD", linewidth=1.0, zorder=0)
         for figure_2d, centre in zip(figures, centres, strict=True):
-            _draw(axes, figure_2d, np.array([centre, ground]), colours, 72.0 * scale)
+            draw_body(axes, figure_2d, np.array([centre, ground]), colours, 72.0 * scale)
     for centre, time in zip(centres, times, strict=True):
         y = -(len(rows) - 1) * height - 0.05
         axes.text(centre, y, f"{time:.2f} s", ha="center", va="top", fontsize=8, color=INK)
@@ -185,23 +186,23 @@ def skeleton_strip(
     save_picture(figure, path, overwrite=True, dpi=DPI)
 
 
-def _figures(poses: ArrayLike, offsets: ArrayLike) -> list[_Figure]:
+def flatten(poses: ArrayLike, offsets: ArrayLike, azimuth: float = AZIMUTH) -> list[FlatBody]:
     """Poses (K, 24, 3, 3) on the picture plane, pelvis at x = 0, lowest point on the ground line y = 0."""
     offsets = np.array(offsets, float)
     offsets[0] = 0.0
     rotations, joints = forward_kinematics(poses, offsets)
     extra = [joints[:, j] + rotations[:, j] @ np.array(place) for j, place in EXTRA_POINTS]
-    points, depths = project(np.concatenate([joints, np.stack(extra, axis=1)], axis=1))
+    points, depths = project(np.concatenate([joints, np.stack(extra, axis=1)], axis=1), azimuth)
     lowest = np.minimum(points[:, :24, 1].min(axis=1) - 0.03, points[:, HEAD_CENTRE, 1] - HEAD_RADIUS)
     points[..., 1] -= lowest[:, None]
-    return [_Figure(*figure) for figure in zip(points, depths, strict=True)]
+    return [FlatBody(*figure) for figure in zip(points, depths, strict=True)]
 
 
-def _top(figure: _Figure) -> float:
+def _top(figure: FlatBody) -> float:
     return float(max(figure.points[:24, 1].max(), figure.points[HEAD_CENTRE, 1] + HEAD_RADIUS))
 
 
-def _columns(rows: list[list[_Figure]]) -> tuple[list[float], float]:
+def _columns(rows: list[list[FlatBody]]) -> tuple[list[float], float]:
     """Where the pelvis of each column stands, so that no figure touches the next, and the width; metres."""
     gap, centres, edge = 0.22, [], 0.0
     for column in zip(*rows, strict=True):
@@ -212,8 +213,13 @@ def _columns(rows: list[list[_Figure]]) -> tuple[list[float], float]:
     return centres, edge
 
 
-def _draw(axes: Any, figure: _Figure, at: Array, colours: dict[str, str], points_per_metre: float) -> None:
-    """One figure, what is nearer to the viewer over what is further, each part with a white rim."""
+def draw_body(
+    axes: Any, figure: FlatBody, at: Array, colours: dict[str, str], points_per_metre: float
+) -> None:
+    """One body, moved by `at`.
+
+    What is nearer to the viewer lies over what is further, each part with a white rim.
+    """
     from matplotlib.patches import Circle, Polygon
 
     points = figure.points + at
