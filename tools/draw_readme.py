@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
+from edgepose.formats.poses.reading import read_poses
 from numpy.typing import NDArray
 
 from edgepose import rotations as rot
 from edgepose.analysis.figures import INK, PREDICTION, REFERENCE, FlatBody, draw_body, flatten, save_picture
 from edgepose.errors import EdgeposeError
-from edgepose.formats.poses.reading import read_poses
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import default_body, forward_kinematics
 

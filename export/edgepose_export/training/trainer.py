@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,20 +16,28 @@ from edgepose.errors import EdgeposeError
 from edgepose.inference.features import ACCELERATIONS, rotation_to_6d
 from edgepose.placements import ROOT
 from edgepose.skeleton import PARENTS
-from edgepose.utils.durable_files import reason, write_whole
 from edgepose_export.archive.torchscript import Statistics, new_network
 from edgepose_export.networks.normalisation import network_inputs, seen_from_first
 from edgepose_export.networks.shape import NetworkShape, smoothed
 from edgepose_export.synthesis.augmentation import augment
 from edgepose_export.synthesis.posture_variation import AFTER, BEFORE, Batch, other_postures
-from edgepose_export.training.config import TrainConfig, config_from, config_values
+from edgepose_export.training.checkpoints import (
+    CHECKPOINT,
+    WEIGHTS_ONLY,
+    mean_of,
+    read_checkpoint,
+    save_checkpoint,
+    shape_of,
+)
+from edgepose_export.training.config import TrainConfig, config_values
 from edgepose_export.training.dataset import Tape, describe
 from edgepose_export.training.distributed import ALONE, Processes
+from edgepose_export.training.losses import likelihood_loss, tremble_loss
 
-CHECKPOINT = "checkpoint.pt"
+__all__ = ["CHECKPOINT", "Trainer", "fit", "mean_of", "read_checkpoint", "save_checkpoint"]
 
-
-# --- targets and loss ---------------------------------------------------------------------------------------
+Starts = tuple[Tensor, Tensor]
+"""First frames of windows: of other takes, of CMU's."""
 
 
 def pose_targets(relative: Tensor, shape: NetworkShape) -> Tensor:
@@ -72,33 +79,6 @@ def statistics_of(tape: Tape, shape: NetworkShape, processes: Processes = ALONE)
     if shape.targets == "global-6d":
         target_std = target_std.square().mean().sqrt().expand_as(target_std)
     return Statistics(input_mean.clone(), input_std.clamp_min(1e-3), target_mean.clone(), target_std.clone())
-
-
-def likelihood_loss(mean: Tensor, deviation: Tensor, target: Tensor, beta: float) -> Tensor:
-    """Negative Gaussian log-likelihood (DIP eq. 4 and 5), each term weighted by deviation^(2 beta) without
-    gradient; a scalar.
-    """
-    loss = torch.log(deviation) + 0.5 * ((target - mean) / deviation).square()
-    if beta:
-        loss = loss * deviation.detach() ** (2.0 * beta)
-    return loss.mean()
-
-
-def tremble_loss(mean: Tensor, target: Tensor) -> Tensor:
-    """Mean square of the second differences in time of the error of (B, T, numbers); a scalar.
-
-    Of two poses that are as wrong it prefers that whose error changes slowly, so that motion stays as smooth
-    as it was.
-    """
-    error = mean - target
-    return (error[:, 2:] - 2.0 * error[:, 1:-1] + error[:, :-2]).square().mean()
-
-
-# --- batches ------------------------------------------------------------------------------------------------
-
-
-Starts = tuple[Tensor, Tensor]
-"""First frames of windows: of other takes, of CMU's."""
 
 
 def window_starts(
@@ -372,93 +352,9 @@ class Trainer:
 
     def _check_shape(self, state: dict[str, Any], **other: Any) -> None:
         """The checkpoint's network is the config's, apart from `other` fields."""
-        shape = _shape_of(state)
+        shape = shape_of(state)
         if shape._replace(**other) != self.config.network:
             raise EdgeposeError(f"the checkpoint holds {shape}, the config asks for {self.config.network}")
-
-
-def save_checkpoint(state: dict[str, Any], path: Path) -> None:
-    """Writes a checkpoint so that a crash leaves the old one or the new one, never half of one.
-
-    Raises:
-        EdgeposeError: it cannot be written (disk full).
-    """
-    content = io.BytesIO()
-    torch.save(state, content)
-    try:
-        write_whole(path, content.getbuffer(), "the checkpoint", overwrite=True)
-    except EdgeposeError as error:
-        raise EdgeposeError(f"{path}: cannot be written: {reason(error)}") from error
-
-
-def read_checkpoint(path: Path) -> dict[str, Any]:
-    """A checkpoint's state, read without running pickled code.
-
-    Raises:
-        EdgeposeError: missing or not a checkpoint.
-    """
-    try:
-        state = torch.load(path, weights_only=True, map_location="cpu")
-    except OSError as error:
-        raise EdgeposeError(f"{path}: {error.strerror or error}") from error
-    except Exception as error:
-        raise EdgeposeError(f"{path}: not a checkpoint of edgepose train ({type(error).__name__})") from error
-    if not isinstance(state, dict) or not set(_WEIGHTS_ONLY) <= set(state):
-        raise EdgeposeError(f"{path}: not a checkpoint of edgepose train (entries are missing)")
-    try:
-        network = new_network(_shape_of(state))
-        network.load_state_dict(state["averaged"])
-        Statistics(**state["statistics"])
-    except (TypeError, ValueError, RuntimeError, AttributeError) as error:
-        reason = str(error).splitlines()[0]
-        raise EdgeposeError(f"{path}: not a checkpoint that this edgepose reads ({reason})") from error
-    return state
-
-
-RELATED = 0.9
-"""Least cosine between the weights of checkpoints that have a mean. Those that began from one another have
-0.97 and more, trainings of one seed from scratch up to 0.77, those of two seeds 0.02; their mean is nothing.
-"""
-
-
-def mean_of(states: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
-    """The first of some checkpoints by name, with the mean of their averaged weights (Wortsman et al. 2022).
-
-    What the longest of them was trained on, and the licences of all, are noted.
-
-    Raises:
-        EdgeposeError: they did not begin from one another: networks, but for `smoothing`, or statistics
-            differ, or weights are unlike.
-    """
-    (name, first), *others = states.items()
-    for other, state in others:
-        if not _related(first, state):
-            raise EdgeposeError(
-                f"{other}: did not begin from {name}, nor the reverse (train --init); they have no mean"
-            )
-    weights = [state["averaged"] for state in states.values()]
-    mean = {key: torch.stack([one[key] for one in weights]).mean(dim=0) for key in weights[0]}
-    about = [state["data"] for state in states.values()]
-    licenses = sorted({text for data in about for text in data["licenses"]})
-    data = max(about, key=lambda data: float(data["hours"])) | {"licenses": licenses}
-    return first | {"averaged": mean, "data": data}
-
-
-def _related(one: dict[str, Any], other: dict[str, Any]) -> bool:
-    shape = _shape_of(one)
-    if _shape_of(other)._replace(smoothing=shape.smoothing) != shape:
-        return False
-    numbers = zip(one["statistics"].values(), other["statistics"].values(), strict=True)
-    a, b = (torch.cat([w.flatten() for w in state["averaged"].values()]) for state in (one, other))
-    return all(torch.equal(x, y) for x, y in numbers) and bool(torch.cosine_similarity(a, b, dim=0) > RELATED)
-
-
-def _shape_of(state: dict[str, Any]) -> NetworkShape:
-    return config_from(json.loads(state["config"])).network
-
-
-_WEIGHTS_ONLY = ("config", "statistics", "averaged", "step", "data")
-"""Entries of `best.pt`: what `export` and fine-tuning need."""
 
 
 def fit(
@@ -502,6 +398,6 @@ def fit(
 def _write(state: dict[str, Any], better: bool, line: dict[str, float], folder: Path) -> None:
     save_checkpoint(state, folder / CHECKPOINT)
     if better:
-        save_checkpoint({k: state[k] for k in _WEIGHTS_ONLY}, folder / "best.pt")
+        save_checkpoint({k: state[k] for k in WEIGHTS_ONLY}, folder / "best.pt")
     with (folder / "log.jsonl").open("a") as log:
         log.write(json.dumps(line) + "\n")
