@@ -40,6 +40,7 @@ from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseFrame
 from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.udp import UdpSink, encode_binary, encode_json
+from edgepose.sources import Batch
 from firmware_protocols.registry import PROTOCOLS, Decoder
 from firmware_protocols.sample import Sample
 
@@ -167,17 +168,18 @@ class Latency(NamedTuple):
 
 def whole_walk(engine: Engine, paced: bool) -> Latency:
     """Runs packets to datagrams through all steps, at full speed or at 60 frames a second."""
-    decoder, arrived = PROTOCOLS["native"].decoder(), [0.0]
+    decoder = PROTOCOLS["native"].decoder()
     chunks = _chunks()[: int(RATE) * _PACED_S] if paced else _chunks()
 
-    def source() -> Iterator[tuple[float, list[ImuSample]]]:
+    def source() -> Iterator[Batch]:
         started = time.perf_counter()
         for k, chunk in enumerate(chunks):
             if paced:
                 time.sleep(max(0.0, started + k / RATE - time.perf_counter()))
-            arrived[0] = time.perf_counter()
+            arrived = time.perf_counter()
             samples = _decode(decoder, chunk)
-            yield (samples[-1].time_s if samples else 0.0), samples
+            now_s = samples[-1].time_s if samples else 0.0
+            yield Batch(now_s, samples, backlog_s=time.perf_counter() - arrived)
 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
         listener.bind(("127.0.0.1", 0))
@@ -186,7 +188,6 @@ def whole_walk(engine: Engine, paced: bool) -> Latency:
                 Walk(FrameClock(RATE), Headings(_calibration()), [sink]),
                 source(),
                 engine,
-                behind_s=lambda: time.perf_counter() - arrived[0],
             )
     if summary.error:
         raise summary.error

@@ -76,7 +76,7 @@ def imu_frame(*held):
 
 
 def test_what_waited_to_be_taken_counts_as_latency(walk):
-    summary = walk(behind_s=lambda: 2.5)
+    summary = walk(lambda batches: (batch._replace(backlog_s=2.5) for batch in batches))
     assert summary.behind_s == 2.5
     assert min(summary.latencies_s) >= 2.5
     assert max(walk().latencies_s) < 2.5
@@ -146,8 +146,9 @@ def test_what_came_before_an_error_of_the_source_comes_out(walk):
 
 def test_what_came_before_a_sample_without_orientation_comes_out(walk):
     def bare(batches):
-        for i, (now_s, samples) in enumerate(batches):
-            yield now_s, [s._replace(quat=None) for s in samples] if i == 100 else samples
+        for i, batch in enumerate(batches):
+            samples = [s._replace(quat=None) for s in batch.samples] if i == 100 else batch.samples
+            yield batch._replace(samples=samples)
 
     shelf = Shelf()
     summary = walk(bare, [shelf])
@@ -169,8 +170,9 @@ def test_a_sensor_that_stops_is_held_and_counted(walk):
     silent = PLACEMENTS.index("head")
 
     def without_head(batches):
-        for i, (now_s, samples) in enumerate(batches):
-            yield now_s, [s for s in samples if s.sensor != silent or not 100 <= i < 200]
+        for i, batch in enumerate(batches):
+            samples = [s for s in batch.samples if s.sensor != silent or not 100 <= i < 200]
+            yield batch._replace(samples=samples)
 
     shelf = Shelf()
     summary = walk(without_head, [shelf])
@@ -185,7 +187,7 @@ def test_a_sensor_that_stops_is_held_and_counted(walk):
 
 def test_sensors_that_never_report(walk):
     def four(batches):
-        return ((now_s, [s for s in samples if s.sensor < 4]) for now_s, samples in batches)
+        return (b._replace(samples=[s for s in b.samples if s.sensor < 4]) for b in batches)
 
     shelf = Shelf()
     summary = walk(four, [shelf])
