@@ -35,9 +35,8 @@ from edgepose.inference.features import INPUTS
 from edgepose.inference.quantisation import PRECISIONS, pack
 from edgepose.orientation import Orienter
 from edgepose.pipeline.frame_synchronizer import FrameClock
-from edgepose.pipeline.run import Walk, run, status
+from edgepose.pipeline.run import Walk, pose_frame, run
 from edgepose.placements import PLACEMENTS
-from edgepose.pose import PoseFrame
 from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.udp import UdpSink, encode_binary, encode_json
 from edgepose.sources import Batch
@@ -136,11 +135,7 @@ def step_costs(engine: Engine, folder: Path) -> dict[str, float]:
     made, costs["frames"] = _each(to_frames, samples)
     bodies, costs["calibration"] = _each(calibrated, [frame for frames in made for frame in frames])
     outputs, costs["network"] = _each(lambda body: engine.push(*body), bodies)
-    poses = [
-        PoseFrame(o.tag.index, o.tag.time_s, status(o.tag, o.filling), o.rotations, o.std)
-        for some in outputs
-        for o in some
-    ]
+    poses = [pose_frame(output) for some in outputs for output in some]
     _, costs["UDP binary, not yet sent"] = _each(encode_binary, poses)
     _, costs["UDP JSON, not yet sent"] = _each(encode_json, poses)
     with CsvSink(folder / "poses.csv") as sink:

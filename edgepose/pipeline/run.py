@@ -64,16 +64,11 @@ class RunSummary:
         self.poses += 1
 
 
-def status(frame: ImuFrame, filling: bool) -> str:
-    """The `status` of a pose, see `PoseFrame`."""
-    parts = []
-    if frame.held.any():
-        parts.append(
-            "held " + " ".join(name for name, held in zip(PLACEMENTS, frame.held, strict=True) if held)
-        )
-    if filling:
-        parts.append("filling window")
-    return "; ".join(parts) or "ok"
+def pose_frame(output: EngineOutput) -> PoseFrame:
+    """The pose of a frame that went through the network."""
+    frame: ImuFrame = output.tag
+    held = frozenset(name for name, held in zip(PLACEMENTS, frame.held.tolist(), strict=True) if held)
+    return PoseFrame(frame.index, frame.time_s, output.rotations, output.std, None, held, output.filling)
 
 
 class Walk:
@@ -135,9 +130,7 @@ class Walk:
         summary = self.summary
         for output in outputs:
             frame: ImuFrame = output.tag
-            pose = PoseFrame(
-                frame.index, frame.time_s, status(frame, output.filling), output.rotations, output.std
-            )
+            pose = pose_frame(output)
             for sink in self._sinks:
                 sink.write(pose)
             summary.filling += output.filling

@@ -14,10 +14,11 @@ from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.reading import read_poses
 from edgepose.imu import ImuFrame
 from edgepose.inference import archive
-from edgepose.inference.engine import StreamEngine
+from edgepose.inference.engine import EngineOutput, StreamEngine
 from edgepose.pipeline.frame_synchronizer import FrameClock
-from edgepose.pipeline.run import LATENCIES, RunSummary, Walk, run, status
+from edgepose.pipeline.run import LATENCIES, RunSummary, Walk, pose_frame, run
 from edgepose.placements import PLACEMENTS
+from edgepose.pose import parse_status
 from edgepose.sinks.base import Sink
 from edgepose.sinks.csv import CsvSink
 from edgepose.sources import open_source
@@ -92,7 +93,9 @@ def test_what_waited_to_be_taken_counts_as_latency(walk):
     ],
 )
 def test_status(held, filling, text):
-    assert status(imu_frame(*held), filling) == text
+    pose = pose_frame(EngineOutput(imu_frame(*held), np.zeros((24, 3, 3)), np.zeros(24), filling))
+    assert (pose.held, pose.warming_up, pose.status) == (set(held), filling, text)
+    assert parse_status(text) == (pose.held, pose.warming_up)
 
 
 def test_every_frame_comes_out_once_and_in_order(walk):
@@ -113,7 +116,8 @@ def test_all_sinks_get_the_same(walk, tmp_path):
     shelf, file = Shelf(), tmp_path / "poses.csv"
     with CsvSink(file, "matrix") as sink:
         walk(sinks=[shelf, sink])
-    frames, time_s, texts, rotations = read_poses(file)[:4]
+    read = read_poses(file)
+    frames, time_s, texts, rotations = read.frames, read.time_s, read.status, read.rotations
     assert frames.tolist() == indices(shelf)
     assert texts == [pose.status for pose in shelf.poses]
     np.testing.assert_allclose(time_s, [pose.time_s for pose in shelf.poses], atol=1e-6)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.formats.poses.reading import Poses
-from edgepose.pose import FILLING_WINDOW, held_sensors, status_bits
+from edgepose.pose import held_sensors
 from edgepose.rotations import Z_UP_TO_T, matrix_to_rotvec
 
 BETAS = 16
@@ -39,9 +39,8 @@ def write_npz(path: Path, blocks: Iterable[Poses], count: int, rate: float) -> N
                 member.write(_vectors(block).tobytes())
                 frames.append(block.frames)
                 times.append(block.time_s)
-                held.append(held_sensors(block.status))
-                flags = np.array([status_bits(text)[0] for text in block.status])
-                filling.append((flags & FILLING_WINDOW).astype(bool))
+                held.append(held_sensors(block.held))
+                filling.append(np.array(block.warming_up, bool))
                 places.append(_places(block))
         arrays: dict[str, NDArray[Any]] = {
             "trans": np.concatenate(places),

@@ -25,7 +25,7 @@ from edgepose.formats.joint_tree import LARGEST, JointTree
 from edgepose.formats.poses.csv_columns import FORMS, pose_columns
 from edgepose.formats.recordings import dip_imu
 from edgepose.placements import PLACEMENTS
-from edgepose.pose import FILLING_WINDOW, PoseFrame, status_text
+from edgepose.pose import PoseFrame, format_status, parse_status
 from edgepose.rotations import (
     Z_UP_TO_T,
     euler_to_matrix,
@@ -58,16 +58,23 @@ class Poses(NamedTuple):
     Attributes:
         frames: (T,) numbers of the frames, rising.
         time_s: (T,) on the source's clock, seconds.
-        status: T texts, see `PoseFrame`.
         rotations: (T, 24, 3, 3) local rotations, joint 0 against T.
         translation: (T, 3) place of the pelvis in T, metres, if the file has it.
+        held: T sets, see `PoseFrame`.
+        warming_up: T, see `PoseFrame`.
     """
 
     frames: NDArray[np.int64]
     time_s: Array
-    status: list[str]
     rotations: Array
     translation: Array | None
+    held: list[frozenset[str]]
+    warming_up: list[bool]
+
+    @property
+    def status(self) -> list[str]:
+        """T texts, see `format_status`."""
+        return [format_status(*state) for state in zip(self.held, self.warming_up, strict=True)]
 
     @property
     def frame_time(self) -> float:
@@ -86,7 +93,8 @@ class Poses(NamedTuple):
         unknown = np.full(len(JOINTS), np.nan, np.float32)
         for i, (frame, time_s) in enumerate(zip(self.frames.tolist(), self.time_s.tolist(), strict=True)):
             where = None if self.translation is None else self.translation[i]
-            yield PoseFrame(frame, time_s, self.status[i], self.rotations[i], unknown, where)
+            state = self.held[i], self.warming_up[i]
+            yield PoseFrame(frame, time_s, self.rotations[i], unknown, where, *state)
 
 
 def read_poses(path: str | Path) -> Poses:
@@ -128,9 +136,10 @@ def _joined(blocks: list[Poses]) -> Poses:
     return Poses(
         np.concatenate([block.frames for block in blocks]),
         np.concatenate([block.time_s for block in blocks]),
-        [text for block in blocks for text in block.status],
         np.concatenate([block.rotations for block in blocks]),
         np.concatenate(translations) if translations else None,
+        [names for block in blocks for names in block.held],
+        [warm for block in blocks for warm in block.warming_up],
     )
 
 
@@ -276,7 +285,8 @@ def _block(
 ) -> Poses:
     """Poses of rows of which the first has number `first`, after the frame and time `last`."""
     frame_before, time_before = last or (None, -np.inf)
-    frames, times, status, numbers = array("q"), array("d"), list[str](), array("d")
+    frames, times, numbers = array("q"), array("d"), array("d")
+    held, warming_up = list[frozenset[str]](), list[bool]()
     for number, row in enumerate(rows, start=first):
         if row == [_TOO_LONG]:
             raise _BadRowError(name, number, _TOO_LONG)
@@ -295,7 +305,9 @@ def _block(
             raise _BadRowError(name, number, f"time {row[1]} s is not after that of the row before")
         if not row[2].isprintable() or "," in row[2] or '"' in row[2]:
             raise _BadRowError(name, number, "the status has a comma, a quote or a line break in it")
-        status.append(sys.intern(row[2]))
+        names, warm = parse_status(row[2])
+        held.append(names)
+        warming_up.append(warm)
         frame_before, time_before = frame, times[-1]
     values = np.frombuffer(numbers).reshape(len(frames), -1)
     seconds = np.frombuffer(times)
@@ -312,7 +324,7 @@ def _block(
         at, joint = np.argwhere(off > 1e-3)[0].tolist()
         raise _BadRowError(name, at + first, f"the numbers of {JOINTS[joint]} are not a rotation")
     where = values[:, -3:] if moves else None
-    return Poses(numbered, seconds, status, rotations, where)
+    return Poses(numbered, seconds, rotations, where, held, warming_up)
 
 
 def _rotations(form: str, values: Array) -> tuple[Array, Array]:
@@ -365,7 +377,7 @@ def _read_npz(path: Path) -> tuple[Poses, None]:
         rotations[:, 0] = Z_UP_TO_T @ rotations[:, 0]
         translation = None if translation is None else translation @ Z_UP_TO_T.T
     frames, time_s = _clock(path, arrays, count)
-    return Poses(frames, time_s, _status(path, arrays, count), rotations, translation), None
+    return Poses(frames, time_s, rotations, translation, *_states(path, arrays, count)), None
 
 
 def _load(path: Path) -> tuple[dict[str, NDArray[Any]], bool]:
@@ -416,14 +428,23 @@ def _clock(path: Path, arrays: Mapping[str, NDArray[Any]], count: int) -> tuple[
     return frames, np.arange(count) / rate
 
 
-def _status(path: Path, arrays: Mapping[str, NDArray[Any]], count: int) -> list[str]:
+def _all_new(count: int) -> tuple[list[frozenset[str]], list[bool]]:
+    """`held` and `warming_up` of poses of which nothing is known to be missing."""
+    return [frozenset()] * count, [False] * count
+
+
+def _states(
+    path: Path, arrays: Mapping[str, NDArray[Any]], count: int
+) -> tuple[list[frozenset[str]], list[bool]]:
+    """`held` and `warming_up` of T poses."""
     if "held" not in arrays or "filling" not in arrays:
-        return ["ok"] * count
+        return _all_new(count)
     held = _numbers(path, arrays, "held", (count, len(PLACEMENTS))) != 0
     filling = _numbers(path, arrays, "filling", (count,)) != 0
-    masks = held @ (1 << np.arange(len(PLACEMENTS)))
-    pairs = zip((filling * FILLING_WINDOW).tolist(), masks.tolist(), strict=True)
-    return [status_text(flags, mask) for flags, mask in pairs]
+    places = np.arange(len(PLACEMENTS))
+    masks = (held @ (1 << places)).tolist()
+    sets = {mask: frozenset(PLACEMENTS[i] for i in places if mask >> i & 1) for mask in set(masks)}
+    return [sets[mask] for mask in masks], filling.tolist()
 
 
 # --- other files --------------------------------------------------------------------------------------------
@@ -454,7 +475,8 @@ def _read_bvh(path: Path) -> tuple[Poses, str | None]:
     # Where `BvhSink` puts those of whom it knows no place.
     known = np.abs(translation - standing_place(offsets)).max() > _SAME_PLACE_M
     times = np.arange(count) / tree.rate
-    poses = Poses(np.arange(count), times, ["ok"] * count, rotations, translation if known else None)
+    place = translation if known else None
+    poses = Poses(np.arange(count), times, rotations, place, *_all_new(count))
     return poses, problem
 
 
@@ -493,7 +515,8 @@ def _read_dip(path: Path) -> tuple[Poses, None]:
     """True poses of DIP-IMU or of DIP's TotalCapture."""
     rotations = dip_imu.read_true_pose(path)
     count = len(rotations)
-    return Poses(np.arange(count), np.arange(count) / dip_imu.RATE, ["ok"] * count, rotations, None), None
+    frames = np.arange(count)
+    return Poses(frames, frames / dip_imu.RATE, rotations, None, *_all_new(count)), None
 
 
 _READERS: dict[str, Callable[[Path], tuple[Poses, str | None]]] = {
