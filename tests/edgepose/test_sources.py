@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import serial
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import DeviceError, EdgeposeError
 from edgepose.formats.recordings.csv_npz import csv_header, csv_row, read_recording, samples, write_csv
 from edgepose.formats.recordings.raw_capture import times_header, times_path, times_row
 from edgepose.pipeline.frame_synchronizer import FrameClock
@@ -582,6 +582,22 @@ def test_batches_carry_what_came_over_the_line(port):
     decoder = PROTOCOLS["native"].decoder()
     assert len([s for _, data in raw for s in decoder.feed(data)]) == source.counters.packets
     assert all(b[0] >= a[0] for a, b in pairwise(raw))
+
+
+def test_what_came_before_an_error_is_in_a_batch(port, monkeypatch):
+    def refuse(*_):
+        raise DeviceError("nobody can tell")
+
+    monkeypatch.setattr("edgepose.sources.line_decoder.Stream.feed", refuse)
+    master, name = port
+    raw = []
+    with (
+        open_source(port=name) as source,
+        Device(master, chunks(100)),
+        pytest.raises(DeviceError, match="nobody"),
+    ):
+        raw.extend(piece for batch in source for piece in batch.raw)
+    assert len(raw) == 1
 
 
 # --- files --------------------------------------------------------------------------------------------------
