@@ -244,7 +244,7 @@ def _samples(path: Path, protocol: str, sensors: Path | None, problems: list[str
     """Samples of a capture or a log; an error ends them and is added to the problems."""
     with open_source(file=path, protocol=protocol, sensors=sensors) as source:
         try:
-            yield from chain.from_iterable(samples for _, samples in source)
+            yield from chain.from_iterable(batch.samples for batch in source)
         except EdgeposeError as error:
             problems.append(str(error))
         if source.damage:

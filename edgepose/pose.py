@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import PLACEMENTS, SITES
 from edgepose.skeleton import JOINTS
 
 Array = NDArray[np.float64]
+
+_ORDER = {name: i for i, name in enumerate(SITES)}
 
 
 class PoseFrame(NamedTuple):
@@ -21,52 +23,55 @@ class PoseFrame(NamedTuple):
     Attributes:
         index: frame number, that of the `ImuFrame` it belongs to.
         time_s: time of the frame on the source's clock, seconds (live: Unix time).
-        status: "ok"; or, joined by "; ", "held NAME [NAME ...]" for sensors whose last values were repeated
-            and "filling window" while the network has seen fewer frames than its window holds.
         rotations: (24, 3, 3) rotation of each joint against its parent, joint 0 against the body frame T.
         std: (24,) standard deviation that the network gives for each joint, radians; 0 for measured and
             resting joints.
         translation: (3,) place of the pelvis in T, metres, where something estimates it.
+        held: placements or sites of sensors that had nothing new; their last values were repeated.
+        warming_up: the network has seen fewer frames than its window holds.
     """
 
     index: int  # type: ignore[assignment]  # hides tuple.index, which nobody wants here
     time_s: float
-    status: str
     rotations: NDArray[np.float32]
     std: NDArray[np.float32]
     translation: NDArray[np.float64] | None = None
+    held: frozenset[str] = frozenset()
+    warming_up: bool = False
+
+    @property
+    def status(self) -> str:
+        """`held` and `warming_up` in text, see `format_status`."""
+        return format_status(self.held, self.warming_up)
 
 
-FILLING_WINDOW = 1
-"""Bit of a status' flags: the network has seen fewer frames than its window holds."""
+_HELD, _WARMING_UP, _OK = "held", "filling window", "ok"
+_LONGEST = 1000  # characters of a text that are read; of all sites it is shorter
 
 
 @lru_cache(maxsize=256)
-def status_bits(status: str) -> tuple[int, int]:
-    """Flags and held sensors (bit i: PLACEMENTS[i]) of a status text; what it does not know it leaves out."""
-    flags = held = 0
-    for part in status.split("; "):
-        if part == "filling window":
-            flags |= FILLING_WINDOW
-        elif part.startswith("held "):
-            names = set(part.split()[1:])
-            held |= sum(1 << i for i, name in enumerate(PLACEMENTS) if name in names)
-    return flags, held
+def format_status(held: frozenset[str], warming_up: bool) -> str:
+    """What a pose's `held` and `warming_up` are in text: "ok"; or, joined by "; ", "held NAME [NAME ...]" and
+    "filling window". Names are in the order of SITES, after any that are not of them.
+    """
+    names = sorted(held, key=lambda name: (_ORDER.get(name, -1), name))
+    parts = [" ".join([_HELD, *names])] if names else []
+    parts += [_WARMING_UP] if warming_up else []
+    return "; ".join(parts) or _OK
 
 
-def status_text(flags: int, held: int) -> str:
-    """Inverse of `status_bits`."""
-    names = [name for i, name in enumerate(PLACEMENTS) if held >> i & 1]
-    parts = [" ".join(["held", *names])] if names else []
-    if flags & FILLING_WINDOW:
-        parts.append("filling window")
-    return "; ".join(parts) or "ok"
+@lru_cache(maxsize=256)
+def parse_status(text: str) -> tuple[frozenset[str], bool]:
+    """`held` and `warming_up` of a text of `format_status`; what it does not know it leaves out."""
+    parts = text[:_LONGEST].split("; ")
+    held = [name for part in parts if part.startswith(_HELD + " ") for name in part.split()[1:]]
+    return frozenset(held), _WARMING_UP in parts
 
 
-def held_sensors(status: Sequence[str]) -> NDArray[np.bool_]:
-    """Whether each sensor is held, (T, 6) in the order of PLACEMENTS, of T status texts."""
-    masks = np.array([status_bits(text)[1] for text in status], int)
-    return (masks[:, None] >> np.arange(len(PLACEMENTS)) & 1).astype(bool)
+def held_sensors(held: Sequence[Set[str]]) -> NDArray[np.bool_]:
+    """Whether each sensor is held, (T, 6) in the order of PLACEMENTS, of the `held` of T poses."""
+    flags = [[name in names for name in PLACEMENTS] for names in held]
+    return np.array(flags, bool).reshape(-1, len(PLACEMENTS))
 
 
 def longest_holds(held: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -81,16 +86,23 @@ class Poses(NamedTuple):
     Attributes:
         frames: (T,) numbers of the frames, rising.
         time_s: (T,) on the source's clock, seconds.
-        status: T texts, see `PoseFrame`.
         rotations: (T, 24, 3, 3) local rotations, joint 0 against T.
         translation: (T, 3) place of the pelvis in T, metres, if the file has it.
+        held: T sets, see `PoseFrame`.
+        warming_up: T, see `PoseFrame`.
     """
 
     frames: NDArray[np.int64]
     time_s: Array
-    status: list[str]
     rotations: Array
     translation: Array | None
+    held: list[frozenset[str]]
+    warming_up: list[bool]
+
+    @property
+    def status(self) -> list[str]:
+        """T texts, see `format_status`."""
+        return [format_status(*state) for state in zip(self.held, self.warming_up, strict=True)]
 
     @property
     def frame_time(self) -> float:
@@ -109,7 +121,8 @@ class Poses(NamedTuple):
         unknown = np.full(len(JOINTS), np.nan, np.float32)
         for i, (frame, time_s) in enumerate(zip(self.frames.tolist(), self.time_s.tolist(), strict=True)):
             where = None if self.translation is None else self.translation[i]
-            yield PoseFrame(frame, time_s, self.status[i], self.rotations[i], unknown, where)
+            state = self.held[i], self.warming_up[i]
+            yield PoseFrame(frame, time_s, self.rotations[i], unknown, where, *state)
 
 
 def tidy_rate(frame_time: float) -> float:

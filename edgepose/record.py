@@ -20,7 +20,7 @@ from edgepose.formats.recordings.raw_capture import times_header, times_path, ti
 from edgepose.formats.recordings.registry import salvage_recording
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
-from edgepose.sources import Source
+from edgepose.sources import Batch, Source
 from edgepose.sources.replay import CAPTURES
 from edgepose.utils.durable_files import replace_file
 from edgepose.utils.growing_files import Appender
@@ -134,7 +134,6 @@ def open_output(path: str, metadata: Mapping[str, str], overwrite: bool = True) 
 def record(
     source: Source,
     output: Output,
-    raw: list[tuple[float, Any]],
     seconds: float = inf,
     on_batch: Callable[[RecordSummary], None] = lambda summary: None,
     stopped: Callable[[], bool] = lambda: False,
@@ -147,7 +146,6 @@ def record(
     Args:
         source: the source.
         output: where to; closed at the end. Nothing appears, and nothing is replaced, if nothing came.
-        raw: what came on the line since the last batch; the source fills it, it is emptied here.
         seconds: length of the recording on the source's clock.
         on_batch: called after each batch.
         stopped: asked after each batch whether to end.
@@ -156,21 +154,16 @@ def record(
     start_s = None
     something = False
     try:
-        try:
-            for now_s, samples in source:
-                something = something or bool(samples or raw)
-                _write(output, samples, raw)
-                for sample in samples:
-                    summary.samples[sample.sensor] += 1
-                if start_s is None and samples:
-                    start_s = samples[0].time_s
-                summary.seconds = 0.0 if start_s is None else max(0.0, now_s - start_s)
-                on_batch(summary)
-                if summary.seconds >= seconds or stopped():
-                    break
-        finally:
-            something = something or bool(raw)
-            _write(output, [], raw)
+        for batch in source:
+            something |= _write(output, batch)
+            for sample in batch.samples:
+                summary.samples[sample.sensor] += 1
+            if start_s is None and batch.samples:
+                start_s = batch.samples[0].time_s
+            summary.seconds = 0.0 if start_s is None else max(0.0, batch.now_s - start_s)
+            on_batch(summary)
+            if summary.seconds >= seconds or stopped():
+                break
     except EdgeposeError as error:
         summary.error = error
     finally:
@@ -188,12 +181,13 @@ def record(
     return summary
 
 
-def _write(output: Output, samples: list[ImuSample], raw: list[tuple[float, Any]]) -> None:
-    if samples:
-        output.samples(samples)
-    pieces, raw[:] = list(raw), []
-    for arrival_s, piece in pieces:
+def _write(output: Output, batch: Batch) -> bool:
+    """Write a batch, and whether there was something to keep in it."""
+    if batch.samples:
+        output.samples(batch.samples)
+    for arrival_s, piece in batch.raw:
         output.raw(arrival_s, piece)
+    return bool(batch.samples or (batch.raw and output.raw is not _ignore))
 
 
 # --- kinds --------------------------------------------------------------------------------------------------

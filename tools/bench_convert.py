@@ -62,7 +62,7 @@ def write_poses(path: Path, seconds: float) -> None:
     with CsvSink(path) as sink:
         for i in range(round(seconds * POSE_RATE)):
             turns = 0.3 * np.sin(np.arange(72).reshape(24, 3) + i / POSE_RATE)
-            sink.write(PoseFrame(i, i / POSE_RATE, "ok", rotvec_to_matrix(turns), np.zeros(24)))
+            sink.write(PoseFrame(i, i / POSE_RATE, rotvec_to_matrix(turns), np.zeros(24)))
 
 
 def spread(path: Path, folder: Path, count: int) -> None:

@@ -141,7 +141,8 @@ def follow(process: subprocess.Popen[str], source: list[str], out: Path) -> tupl
 
 def report(begin: float, end: float, listener: Listener, truth: Truth, out: Path) -> None:
     """Prints error, latency and rate over the clip and draws it."""
-    frames, time_s, status, poses = read_poses(out / "poses.csv")[:4]
+    read = read_poses(out / "poses.csv")
+    frames, time_s, status, poses = read.frames, read.time_s, read.status, read.rotations
     missing = np.sum(np.diff(frames) - 1)
     click.echo(
         f"\nposes.csv: {len(frames)} frames at 60 Hz, {missing} numbers missing between first and last"

@@ -28,7 +28,7 @@ def nearest(times: NDArray[np.float64], wanted: NDArray[np.float64], name: str) 
 
 def draw(poses: str, out: Path, wanted: list[float] | None, count: int, reference: str | None) -> None:
     """Read, choose the instants (seconds since the first pose) and draw."""
-    _, times, _, rotations = read_poses(poses)[:4]
+    _, times, rotations = read_poses(poses)[:3]
     start = times[0]
     times = times - start
     if wanted:
@@ -37,7 +37,7 @@ def draw(poses: str, out: Path, wanted: list[float] | None, count: int, referenc
         chosen = np.unique(np.linspace(0, len(times) - 1, count).round().astype(int))
     beside = None
     if reference:
-        _, reference_times, _, reference_rotations = read_poses(reference)[:4]
+        _, reference_times, reference_rotations = read_poses(reference)[:3]
         beside = reference_rotations[nearest(reference_times - start, times[chosen], reference)]
     offsets = default_body(HEIGHT_M).offsets
     skeleton_strip(out, rotations[chosen], times[chosen], offsets, beside)

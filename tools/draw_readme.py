@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
-from edgepose.formats.poses.reading import read_poses
+from edgepose.formats.poses.registry import read_poses
 from numpy.typing import NDArray
 
 from edgepose import rotations as rot

@@ -58,7 +58,7 @@ def soak(minutes: float, model: str, core: int) -> None:
             raise click.ClickException(told)
         click.echo(told.splitlines()[-1])
         poses = read_poses(folder / "poses.csv")
-        held = sum("held" in status for status in poses.status)
+        held = sum(map(bool, poses.held))
         lost = int(np.sum(np.diff(poses.frames) - 1))
         wanted = round(float(poses.time_s[-1] - poses.time_s[0]) * RATE) + 1
         click.echo(

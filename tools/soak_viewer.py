@@ -67,7 +67,7 @@ def soak(minutes: float) -> None:
         if run.wait():
             raise click.ClickException((folder / "errors.txt").read_text())
         poses = read_poses(folder / "poses.csv")
-        held = sum("held" in status for status in poses.status)
+        held = sum(map(bool, poses.held))
         wanted = round(length_s * RATE)
         click.echo(f"{len(poses.frames)} of {wanted} frames came out, {held} with a repeated value")
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from edgepose.analysis.figures import INK, PREDICTION, require_matplotlib, skeleton_strip
 from edgepose.analysis.joint_angles import ANGLES, LIMBS, Walk, joint_angles, walks
 from edgepose.placements import PLACEMENTS
-from edgepose.pose import FILLING_WINDOW, Poses, held_sensors, longest_holds, status_bits
+from edgepose.pose import Poses, held_sensors, longest_holds
 from edgepose.skeleton import Body
 from edgepose.utils.durable_files import write_whole
 
@@ -70,7 +70,7 @@ def write_report(path: Path, poses: Poses, body: Body, name: str, overwrite: boo
         "<h2>Range of motion</h2>",
         _ranges(angles),
         "<h2>Sensors</h2>",
-        *_sensors(poses.status, poses.rate),
+        *_sensors(poses),
     ]
     page = (
         f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{html.escape(name)}</title>"
@@ -165,14 +165,14 @@ def _steps(found: Sequence[Walk], times: Array, rate: float) -> list[str]:
     return [_table(("walking", ""), rows)]
 
 
-def _sensors(status: Sequence[str], rate: float) -> list[str]:
+def _sensors(poses: Poses) -> list[str]:
     """How often each sensor's last values were repeated."""
-    held = held_sensors(status)
+    held, rate = held_sensors(poses.held), poses.rate
     rows = [
         (name.replace("_", " "), str(column.sum()), f"{100 * column.mean():.1f} %", f"{longest / rate:.2f} s")
         for name, column, longest in zip(PLACEMENTS, held.T, longest_holds(held), strict=True)
     ]
-    filling = sum(status_bits(text)[0] & FILLING_WINDOW for text in status)
+    filling = sum(poses.warming_up)
     result = [_table(("sensor", "poses with repeated values", "of all", "longest"), rows)]
     if filling:
         result.append(f"<p class='note'>In {filling} poses the window was filling.</p>")

@@ -35,11 +35,11 @@ from edgepose.inference.features import INPUTS
 from edgepose.inference.quantisation import PRECISIONS, pack
 from edgepose.orientation import Orienter
 from edgepose.pipeline.frame_synchronizer import FrameClock
-from edgepose.pipeline.run import Walk, run, status
+from edgepose.pipeline.run import Walk, pose_frame, run
 from edgepose.placements import PLACEMENTS
-from edgepose.pose import PoseFrame
 from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.udp import UdpSink, encode_binary, encode_json
+from edgepose.sources import Batch
 from firmware_protocols.registry import PROTOCOLS, Decoder
 from firmware_protocols.sample import Sample
 
@@ -135,11 +135,7 @@ def step_costs(engine: Engine, folder: Path) -> dict[str, float]:
     made, costs["frames"] = _each(to_frames, samples)
     bodies, costs["calibration"] = _each(calibrated, [frame for frames in made for frame in frames])
     outputs, costs["network"] = _each(lambda body: engine.push(*body), bodies)
-    poses = [
-        PoseFrame(o.tag.index, o.tag.time_s, status(o.tag, o.filling), o.rotations, o.std)
-        for some in outputs
-        for o in some
-    ]
+    poses = [pose_frame(output) for some in outputs for output in some]
     _, costs["UDP binary, not yet sent"] = _each(encode_binary, poses)
     _, costs["UDP JSON, not yet sent"] = _each(encode_json, poses)
     with CsvSink(folder / "poses.csv") as sink:
@@ -167,17 +163,18 @@ class Latency(NamedTuple):
 
 def whole_walk(engine: Engine, paced: bool) -> Latency:
     """Runs packets to datagrams through all steps, at full speed or at 60 frames a second."""
-    decoder, arrived = PROTOCOLS["native"].decoder(), [0.0]
+    decoder = PROTOCOLS["native"].decoder()
     chunks = _chunks()[: int(RATE) * _PACED_S] if paced else _chunks()
 
-    def source() -> Iterator[tuple[float, list[ImuSample]]]:
+    def source() -> Iterator[Batch]:
         started = time.perf_counter()
         for k, chunk in enumerate(chunks):
             if paced:
                 time.sleep(max(0.0, started + k / RATE - time.perf_counter()))
-            arrived[0] = time.perf_counter()
+            arrived = time.perf_counter()
             samples = _decode(decoder, chunk)
-            yield (samples[-1].time_s if samples else 0.0), samples
+            now_s = samples[-1].time_s if samples else 0.0
+            yield Batch(now_s, samples, backlog_s=time.perf_counter() - arrived)
 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
         listener.bind(("127.0.0.1", 0))
@@ -186,7 +183,6 @@ def whole_walk(engine: Engine, paced: bool) -> Latency:
                 Walk(FrameClock(RATE), Headings(_calibration()), [sink]),
                 source(),
                 engine,
-                behind_s=lambda: time.perf_counter() - arrived[0],
             )
     if summary.error:
         raise summary.error

@@ -66,7 +66,7 @@ def live(source: SourceConfig, plan: Plan, orient: OrientationStage, say: Guide)
     """The hold and the heading reset of a wearer in front of a live source."""
     reset = _side_by_side(source, plan, orient, say)
     with open_source(**source.arguments()) as opened:
-        batches = all_reporting(((now_s, orient(came)) for now_s, came in opened), say)
+        batches = all_reporting((b._replace(samples=orient(b.samples)) for b in opened), say)
         if plan.heading_reset == "live":
             reset = held(batches, "lying", plan.countdown_s, plan.hold_s, say, calibration.heading_offsets)
             wait_for_enter(batches, say)
@@ -163,7 +163,9 @@ def _read(source: SourceConfig, orient: OrientationStage) -> tuple[Hold, str | N
         )
         return everything, recording.damage, {}
     with open_source(**dataclasses.replace(source, realtime=False).arguments()) as opened:
-        everything = calibration.hold_from_samples(chain.from_iterable(orient(came) for _, came in opened))
+        everything = calibration.hold_from_samples(
+            chain.from_iterable(orient(batch.samples) for batch in opened)
+        )
         return everything, opened.damage, opened.devices
 
 

@@ -49,7 +49,7 @@ def all_reporting(batches: Iterator[Batch], say: Guide) -> Iterator[Batch]:
     passed, said = 0.0, 0
     start_s: float | None = None
     missing = set(range(len(PLACEMENTS)))
-    for now_s, samples in batches:
+    for now_s, samples, *_ in batches:
         start_s = now_s if start_s is None else start_s
         passed = now_s - start_s
         missing -= {sample.sensor for sample in samples}
@@ -99,7 +99,7 @@ def _during(
     """Samples that come within some seconds of the source's clock; `step` hears how many by now."""
     collected: list[ImuSample] = []
     start_s: float | None = None
-    for now_s, samples in batches:
+    for now_s, samples, *_ in batches:
         start_s = now_s if start_s is None else start_s
         collected += samples
         if step is not None:

@@ -57,7 +57,7 @@ class Wearer:
         try:
             batch = next(self._batches, None)
             if batch is not None:
-                self._put(self.walk.take(*batch, self._source.behind_s))
+                self._put(self.walk.take(batch))
                 return
         except Exception as error:
             self._fail(error)

@@ -22,6 +22,7 @@ from edgepose.pipeline.frame_synchronizer import FrameClock
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseFrame
 from edgepose.sinks.base import Sink
+from edgepose.sources import Batch
 
 LATENCIES = 216_000
 """Latencies that are kept: those of the last hour at 60 Hz. A run may last for weeks."""
@@ -63,16 +64,11 @@ class RunSummary:
         self.poses += 1
 
 
-def status(frame: ImuFrame, filling: bool) -> str:
-    """The `status` of a pose, see `PoseFrame`."""
-    parts = []
-    if frame.held.any():
-        parts.append(
-            "held " + " ".join(name for name, held in zip(PLACEMENTS, frame.held, strict=True) if held)
-        )
-    if filling:
-        parts.append("filling window")
-    return "; ".join(parts) or "ok"
+def pose_frame(output: EngineOutput) -> PoseFrame:
+    """The pose of a frame that went through the network."""
+    frame: ImuFrame = output.tag
+    held = frozenset(name for name, held in zip(PLACEMENTS, frame.held.tolist(), strict=True) if held)
+    return PoseFrame(frame.index, frame.time_s, output.rotations, output.std, None, held, output.filling)
 
 
 class Walk:
@@ -114,13 +110,13 @@ class Walk:
         self._silences = Silences()
         self._bones: NDArray[np.float64] | None = None  # of the frame before
 
-    def take(self, now_s: float, samples: list[ImuSample], behind_s: float) -> Iterator[Body]:
-        """Bodies of the frames that are ready after a batch that has waited for so long, seconds."""
-        self.summary.behind_s = behind_s
-        self.arrived = time.perf_counter() - behind_s
-        if samples:
-            self.clock.push(self._orient(samples), now_s)
-        return self._bodies(self.clock.frames(now_s))
+    def take(self, batch: Batch) -> Iterator[Body]:
+        """Bodies of the frames that are ready after a batch."""
+        self.summary.behind_s = batch.backlog_s
+        self.arrived = time.perf_counter() - batch.backlog_s
+        if batch.samples:
+            self.clock.push(self._orient(batch.samples), batch.now_s)
+        return self._bodies(self.clock.frames(batch.now_s))
 
     def flush(self) -> Iterator[Body]:
         """Bodies of the last frames."""
@@ -134,9 +130,7 @@ class Walk:
         summary = self.summary
         for output in outputs:
             frame: ImuFrame = output.tag
-            pose = PoseFrame(
-                frame.index, frame.time_s, status(frame, output.filling), output.rotations, output.std
-            )
+            pose = pose_frame(output)
             for sink in self._sinks:
                 sink.write(pose)
             summary.filling += output.filling
@@ -177,10 +171,9 @@ class Walk:
 
 def run(
     walk: Walk,
-    source: Iterable[tuple[float, list[ImuSample]]],
+    source: Iterable[Batch],
     engine: Engine,
     stopped: Callable[[], bool] = lambda: False,
-    behind_s: Callable[[], float] = lambda: 0.0,
 ) -> RunSummary:
     """Runs a source to its end, or until `stopped`, and writes every pose to every sink.
 
@@ -189,17 +182,16 @@ def run(
 
     Args:
         walk: of one wearer.
-        source: batches (time on the source's clock, samples that came).
+        source: batches of samples.
         engine: makes poses.
         stopped: asked after each batch whether to end the run. An interrupt would lose the frame under way.
-        behind_s: how long the newest batch had waited for this function, seconds.
     """
 
     def bodies() -> Iterator[Body]:
         """All bodies; an error of the source or the clock ends the samples, not the frames made of them."""
         try:
-            for now_s, samples in source:
-                yield from walk.take(now_s, samples, behind_s())
+            for batch in source:
+                yield from walk.take(batch)
                 if stopped():
                     break
         except Exception as error:

@@ -14,6 +14,7 @@ from edgepose.pipeline.frame_synchronizer import FrameClock
 from edgepose.pipeline.run import RunSummary, Walk
 from edgepose.pose import PoseFrame
 from edgepose.sinks.base import Sink
+from edgepose.sources import Batch
 
 if TYPE_CHECKING:
     from edgepose.inference.model import Model
@@ -62,12 +63,12 @@ class Pipeline:
         self._model = model if isinstance(model, Model) else Model(model, trust=trust)
         self.summary = RunSummary()
 
-    def poses(self, source: Iterable[tuple[float, list[ImuSample]]]) -> Iterator[PoseFrame]:
+    def poses(self, source: Iterable[Batch | tuple[float, list[ImuSample]]]) -> Iterator[PoseFrame]:
         """Poses as they become ready, to the end of the source.
 
         Args:
-            source: batches (time on the source's clock in seconds, samples), as `edgepose.open_source` gives
-                them once it is entered.
+            source: batches as `edgepose.open_source` gives them once it is entered, or pairs (time in
+                seconds up to which everything has been delivered, samples).
 
         Raises:
             EdgeposeError: the source ended in an error; all poses before it have been given.
@@ -78,8 +79,8 @@ class Pipeline:
         walk = Walk(FrameClock(self._model.rate_hz), Headings(calibration), [latest], orient)
         self.summary = walk.summary
         try:
-            for now_s, samples in source:
-                for body in walk.take(now_s, samples, 0.0):
+            for batch in source:
+                for body in walk.take(Batch(*batch)):
                     walk.write(engine.push(*body), walk.arrived)
                 yield from latest.take()
         finally:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.csv_columns import FORMS, numbers, pose_columns
-from edgepose.pose import PoseFrame
+from edgepose.pose import PoseFrame, format_status
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.utils.growing_files import FLUSH_S, GrowingFile
 
@@ -80,7 +80,8 @@ class CsvSink(Sink):
             if pose.translation is None:
                 raise ValueError(f"pose {pose.index} has no translation")
             values += pose.translation.tolist()
-        self._rows.append(self._format % (pose.index, pose.time_s, pose.status, *values))
+        status = format_status(pose.held, pose.warming_up)
+        self._rows.append(self._format % (pose.index, pose.time_s, status, *values))
         if not self._file.regular or time.monotonic() - self._flushed >= FLUSH_S:
             self._flush()
 

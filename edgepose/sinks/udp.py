@@ -12,7 +12,8 @@ from functools import lru_cache
 import numpy as np
 
 from edgepose.errors import EdgeposeError
-from edgepose.pose import PoseFrame, status_bits, status_text
+from edgepose.placements import PLACEMENTS
+from edgepose.pose import PoseFrame, format_status, parse_status
 from edgepose.rotations import matrix_to_quat, matrix_to_rotvec, quat_to_matrix, rotvec_to_matrix
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.skeleton import JOINTS
@@ -20,6 +21,9 @@ from edgepose.utils.sockets import Destination, resolve
 
 MAGIC = b"EPOS"
 VERSION = 1
+
+_FILLING_WINDOW = 1
+"""Bit of a datagram's flags: the network has seen fewer frames than its window holds."""
 
 _JSON = '{"frame":%d,"time_s":%.6f,"status":%s,"pose":[' + ",".join(["%.6f"] * 72) + "]}\n"
 # Magic, version, flags, held sensors, joints, time, frame, quaternions: each at a multiple of its size.
@@ -29,12 +33,14 @@ _BINARY = struct.Struct("<4sBBBBdI96f")
 def encode_json(pose: PoseFrame) -> bytes:
     """One line of JSON: frame, time_s, status, pose (72 axis-angle numbers in SMPL order, radians)."""
     numbers = matrix_to_rotvec(pose.rotations).ravel().tolist()
-    return (_JSON % (pose.index, pose.time_s, _quoted(pose.status), *numbers)).encode()
+    status = _quoted(format_status(pose.held, pose.warming_up))
+    return (_JSON % (pose.index, pose.time_s, status, *numbers)).encode()
 
 
 def encode_binary(pose: PoseFrame) -> bytes:
     """The binary datagram of a pose, 404 bytes."""
-    flags, held = status_bits(pose.status)
+    flags = _FILLING_WINDOW if pose.warming_up else 0
+    held = sum(1 << i for i, name in enumerate(PLACEMENTS) if name in pose.held)
     quats = matrix_to_quat(pose.rotations).ravel().tolist()
     index = pose.index & 0xFFFFFFFF  # Wraps after two years at 60 Hz.
     return _BINARY.pack(MAGIC, VERSION, flags, held, len(JOINTS), pose.time_s, index, *quats)
@@ -60,9 +66,9 @@ def decode_binary(datagram: bytes) -> PoseFrame:
             f"damaged pose datagram: time or quaternions of frame {index} are not valid numbers"
         )
     rotations = quat_to_matrix(quats / norms).astype(np.float32)
-    return PoseFrame(
-        index, time_s, status_text(flags, held), rotations, np.full(len(JOINTS), np.nan, np.float32)
-    )
+    names = frozenset(name for i, name in enumerate(PLACEMENTS) if held >> i & 1)
+    std = np.full(len(JOINTS), np.nan, np.float32)
+    return PoseFrame(index, time_s, rotations, std, None, names, bool(flags & _FILLING_WINDOW))
 
 
 def decode_json(datagram: bytes) -> PoseFrame:
@@ -73,14 +79,16 @@ def decode_json(datagram: bytes) -> PoseFrame:
     """
     try:
         message = json.loads(datagram)
-        index, time_s, status = int(message["frame"]), float(message["time_s"]), str(message["status"])
+        index, time_s = int(message["frame"]), float(message["time_s"])
+        held, warming_up = parse_status(str(message["status"]))
         vectors = np.array(message["pose"], float)
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         raise EdgeposeError(f"not a pose datagram: {len(datagram)} bytes, {type(error).__name__}") from None
     if vectors.shape != (3 * len(JOINTS),) or not (np.abs(vectors) < 1e3).all() or not np.isfinite(time_s):
         raise EdgeposeError(f"damaged pose datagram: time or angles of frame {index} are not valid numbers")
     rotations = rotvec_to_matrix(vectors.reshape(-1, 3)).astype(np.float32)
-    return PoseFrame(index, time_s, status, rotations, np.full(len(JOINTS), np.nan, np.float32))
+    std = np.full(len(JOINTS), np.nan, np.float32)
+    return PoseFrame(index, time_s, rotations, std, None, held, warming_up)
 
 
 def decode(datagram: bytes) -> PoseFrame:

@@ -1,17 +1,17 @@
 """Where samples come from. A source is a context manager to iterate over once; it yields batches of samples.
 
     with open_source(port="/dev/ttyUSB0") as source:
-        for now_s, samples in source:
+        for batch in source:
             ...
 
-`now_s` is the time on the source's clock up to which everything has been delivered. Live: Unix time, taken
-once in a process and carried on by the monotonic clock, so that it never jumps; a batch comes at least every
-20 ms, empty if need be, also while a line has disappeared. Files: their own times.
+A live source's clock is Unix time, taken once in a process and carried on by the monotonic clock, so that it
+never jumps; a batch comes at least every 20 ms, empty if need be, also while a line has disappeared. Files
+have their own times.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -20,7 +20,23 @@ from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.sources.clock_sync import DeviceClock
 
-Batch = tuple[float, list[ImuSample]]
+
+class Batch(NamedTuple):
+    """What came together.
+
+    Attributes:
+        now_s: time on the source's clock up to which everything has been delivered, seconds.
+        samples: in the order in which they came.
+        raw: what came over live lines: Unix time of arrival, s, and bytes or a CAN message; nothing in files.
+        backlog_s: how long the batch had waited to be taken, at most, seconds; 0 for files unless they come
+            at their own pace.
+    """
+
+    now_s: float
+    samples: list[ImuSample]
+    raw: Sequence[tuple[float, Any]] = ()
+    backlog_s: float = 0.0
+
 
 Batches = Generator[Batch, None, None]
 """Closing it ends the reading, without waiting for what is under way."""
@@ -64,14 +80,7 @@ class Device(NamedTuple):
 
 
 class Source(AbstractContextManager["Source"], Protocol):
-    """See the module's text.
-
-    Attributes:
-        behind_s: how long the batch given last had waited to be taken, at most, seconds; 0 for files unless
-            they come at their own pace.
-    """
-
-    behind_s: float
+    """See the module's text."""
 
     @property
     def counters(self) -> Counters:
@@ -114,7 +123,6 @@ def open_source(
     realtime: bool = False,
     protocol: str = "auto",
     sensors: Path | str | None = None,
-    raw: list[tuple[float, Any]] | None = None,
     lenient: bool = False,
     waits: bool = True,
 ) -> Source:
@@ -131,7 +139,6 @@ def open_source(
         realtime: deliver a file at its own pace.
         protocol: name of a wire format, a TOML file that describes text lines, or "auto".
         sensors: map of devices to placements; ports and buses that it names need no `port` and `can`.
-        raw: filled with what comes over live lines: Unix time of arrival, s, and bytes or a CAN message.
         lenient: take what there is: of a recording the good rows of any sensors, of lines those that speak;
             those that do not are told and waited for.
         waits: a batch may take as long as the module's text says; if not, it is there at once, empty where
@@ -153,4 +160,4 @@ def open_source(
     from edgepose.sources.line_config import links
     from edgepose.sources.live import LiveSource
 
-    return LiveSource(links(port, baud, can, bitrate, fd, protocol, sensor_map), raw, lenient, waits)
+    return LiveSource(links(port, baud, can, bitrate, fd, protocol, sensor_map), lenient, waits)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Protocol
 from edgepose.errors import DeviceError, EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
-from edgepose.sources import POLL_S, Batches, Counters, Device, total
+from edgepose.sources import POLL_S, Batch, Batches, Counters, Device, total
 from edgepose.sources.clock_sync import DeviceClock, HostClocks
 from edgepose.sources.line_decoder import Clock, Places, Stream
 from edgepose.sources.protocol_detection import Chunk
@@ -219,7 +219,6 @@ class LiveSource:
     def __init__(
         self,
         links: Sequence[Link],
-        raw: list[tuple[float, Any]] | None = None,
         lenient: bool = False,
         waits: bool = True,
     ) -> None:
@@ -227,15 +226,12 @@ class LiveSource:
 
         Args:
             links: what to listen to.
-            raw: filled with what comes: arrival in Unix time, seconds, and bytes or a CAN message.
             lenient: warn of a line on which nothing usable comes, and go on with the others.
             waits: see `open_source`.
         """
-        self.behind_s = 0.0
         self._waits = waits
         self._lenient = lenient
         self._links = links
-        self._raw = raw
         self._lines: list[_Line] = []
         self._queue: SimpleQueue = SimpleQueue()
         self._open = ExitStack()
@@ -300,14 +296,14 @@ class LiveSource:
             line.start()
         try:
             for came, since_s, emptied in self._waited() if self._waits else self._looks():
-                samples: list[ImuSample] = []
-                for line, arrival_s, chunk in came:
-                    samples += self._feed(line, arrival_s, chunk)
+                samples, raw, error = _fed(came)
                 # On a machine that is behind, what has not been taken from queue or line is not missing yet.
                 if emptied:
                     now_s = max(now_s, *(arrival_s for _, arrival_s, _ in came)) if came else _now()
-                self.behind_s = _now() - min(now_s, since_s)
-                yield now_s, samples
+                if raw or error is None:
+                    yield Batch(now_s, samples, raw, _now() - min(now_s, since_s))
+                if error is not None:
+                    raise error
                 for line in self._lines:
                     self._check_start(line, now_s, start_s)
                 if now_s - checked_s > 1.0:
@@ -317,14 +313,6 @@ class LiveSource:
         finally:
             for line in self._lines:
                 line.stop()
-
-    def _feed(self, line: _Line, arrival_s: float, chunk: Any) -> list[ImuSample]:
-        if isinstance(chunk, BaseException):
-            raise chunk
-        if self._raw is not None:
-            pieces = [chunk] if isinstance(chunk, bytes) else chunk
-            self._raw += [(arrival_s, piece) for piece in pieces]
-        return line.stream.feed(chunk, arrival_s)
 
     def _waited(self) -> Iterator[_Came]:
         """The next that comes, or nothing where nothing comes within POLL_S."""
@@ -360,6 +348,21 @@ class LiveSource:
                 raise
             line.told = True
             _log.warning("%s", error)
+
+
+def _fed(came: list[Arrival]) -> tuple[list[ImuSample], list[tuple[float, Any]], BaseException | None]:
+    """Samples of what came and what it was, up to an error."""
+    samples: list[ImuSample] = []
+    raw: list[tuple[float, Any]] = []
+    for line, arrival_s, chunk in came:
+        if isinstance(chunk, BaseException):
+            return samples, raw, chunk
+        raw += [(arrival_s, piece) for piece in ([chunk] if isinstance(chunk, bytes) else chunk)]
+        try:
+            samples += line.stream.feed(chunk, arrival_s)
+        except Exception as error:
+            return samples, raw, error
+    return samples, raw, None
 
 
 def _now() -> float:

@@ -18,7 +18,7 @@ from edgepose.formats.recordings.registry import (
     salvage_recording,
 )
 from edgepose.imu import ImuSample, Recording
-from edgepose.sources import Batches, Counters, Device, Source, total
+from edgepose.sources import Batch, Batches, Counters, Device, Source, total
 from edgepose.sources.clock_sync import CaptureClock, DeviceClock, HostClocks
 from edgepose.sources.line_decoder import Clock, Places, Stream
 from edgepose.sources.protocol_detection import Chunk, candidates, protocol_named
@@ -56,7 +56,6 @@ class RecordingSource:
             waits: see `open_source`.
             ids: placements by serial number, see `read_recording`.
         """
-        self.behind_s = 0.0
         self._path = path
         self._read = salvage_recording if lenient else read_recording
         self._realtime, self._waits, self._ids = realtime, waits, ids
@@ -102,9 +101,8 @@ class RecordingSource:
         assert self._recording is not None, "the source has not been entered"
         rows = samples(self._recording)
         for now_s, batch, late_s in _batches(rows, self._realtime, self._waits):
-            self.behind_s = late_s
             self._packets += len(batch)
-            yield now_s, batch
+            yield Batch(now_s, batch, backlog_s=late_s)
 
 
 class LogSource:
@@ -127,7 +125,6 @@ class LogSource:
             stream: makes the stream of a line.
             waits: see `open_source`.
         """
-        self.behind_s = 0.0
         self._path = path
         self._realtime, self._waits = realtime, waits
         self._chunks = chunks
@@ -185,8 +182,7 @@ class LogSource:
             EdgeposeError: the file cannot be read to its end, or there is no packet in it.
         """
         for now_s, batch, late_s in _batches(self._samples(), self._realtime, self._waits):
-            self.behind_s = late_s
-            yield now_s, batch
+            yield Batch(now_s, batch, backlog_s=late_s)
         if not self.counters.packets:
             raise EdgeposeError(f"{self._path}: {self._problem()}")
 

@@ -152,7 +152,7 @@ class Viewer:
                 have no time in common.
             stopped: asked for every picture.
         """
-        times = poses.time_s - poses.time_s[0]
+        times, status = poses.time_s - poses.time_s[0], poses.status
         line = _TimeLine(self._server.gui, float(times[-1]))
         text = self._server.gui.add_markdown("")
         track = _Track(self.figure, poses, self._body)
@@ -160,7 +160,7 @@ class Viewer:
         if reference is not None:
             figure = Figure(self._server, "reference", self._body, REFERENCE, 0.4)
             second = _Track(figure, reference, self._body)
-        held = held_sensors(poses.status)
+        held = held_sensors(poses.held)
         window = max(1, round(WINDOW_S * poses.rate))
         shown = -1
         while not stopped():
@@ -178,7 +178,7 @@ class Viewer:
                 table = sensor_table(held[max(0, i + 1 - window) : i + 1], poses.rate)
                 text.content = (
                     f"pose {i + 1} of {len(times)}, {poses.rate:g} poses/s\n\n"
-                    f"**{plain(poses.status[i])}**\n\n{table}"
+                    f"**{plain(status[i])}**\n\n{table}"
                 )
             time.sleep(max(0.0, FRAME_S - (time.monotonic() - now)))
 
@@ -259,7 +259,7 @@ class Stream:
         """Nothing has come yet."""
         self.poses, self.lost, self.bad = 0, 0, 0
         self._last: PoseFrame | None = None
-        self._recent: deque[tuple[float, str]] = deque()
+        self._recent: deque[tuple[float, frozenset[str]]] = deque()
         self._newest_s = 0.0
 
     def take(self, receiver: socket.socket, now: float) -> PoseFrame | None:
@@ -286,7 +286,7 @@ class Stream:
             self.lost += max(0, step - 1)
         self.poses += 1
         self._last, self._newest_s = pose, now
-        self._recent.append((now, pose.status))
+        self._recent.append((now, pose.held))
         return pose
 
     def text(self, now: float) -> str:
@@ -296,7 +296,7 @@ class Stream:
             return f"waiting for poses{bad}"
         span = min(WINDOW_S, max(1.0, now - self._recent[0][0])) if self._recent else WINDOW_S
         rate = len(self._recent) / span
-        held = held_sensors([status for _, status in self._recent])
+        held = held_sensors([held for _, held in self._recent])
         silent = now - self._newest_s
         state = plain(self._last.status) if silent < 1.0 else f"nothing for {silent:.0f} s"
         counts = [f"{rate:.0f} poses/s", f"{self.poses} poses", f"{self.lost} lost"]

@@ -62,6 +62,14 @@ def test_the_example_of_a_recording_gives_the_poses_of_run(command, wearer, tmp_
     np.testing.assert_array_equal(one.time_s, other.time_s)
 
 
+def test_a_pipeline_takes_pairs_of_time_and_samples(wearer):
+    pipeline = edgepose.Pipeline(edgepose.load_calibration(wearer.calibration), model="rnn")
+    with edgepose.open_source(file=wearer.short) as source:
+        poses = list(pipeline.poses((batch.now_s, batch.samples) for batch in source))
+    assert [pose.index for pose in poses] == list(range(180))
+    assert [pose.status for pose in poses].count("ok") == sum(not pose.warming_up for pose in poses)
+
+
 def test_the_example_of_arrays():
     assert re.fullmatch(
         r"\(120, 24, 3, 3\), left knee bent by \d+\.\d deg\n", run_example("poses_of_arrays.py")

@@ -74,7 +74,7 @@ class Devices(threading.Thread):
 
 def collect(source, n):
     got = []
-    for now_s, samples in source:
+    for now_s, samples, *_ in source:
         got += samples
         assert abs(now_s - time.time()) < 5.0
         if len(got) >= n:
@@ -97,7 +97,7 @@ def test_a_live_bus_of_any_protocol(bus, protocol):
     with open_source(can=name) as source, Devices(sender.send, protocol):
         got = []
         clock = FrameClock()
-        for now_s, samples in source:
+        for now_s, samples, *_ in source:
             got += samples
             clock.push(samples, now_s)
             frames += clock.frames(now_s)
@@ -215,7 +215,7 @@ def test_a_bus_that_goes_and_comes_back(tmp_path, monkeypatch, caplog):
             before = collect(batches, 100)
         adapter.unplug()
         while "gone" not in caplog.text or len(gap) < 5:
-            now_s, samples = next(batches)
+            now_s, samples, *_ = next(batches)
             before += samples
             gap.append(now_s)
         assert all(b > a for a, b in pairwise(gap))
@@ -255,7 +255,7 @@ def write_log(path, name="native-can", n=100, **options):
 
 def everything(**options):
     with open_source(**options) as source:
-        return source, [sample for _, samples in source for sample in samples]
+        return source, [sample for _, samples, *_ in source for sample in samples]
 
 
 @pytest.mark.parametrize("suffix", [".log", ".asc", ".blf", ".csv", ".trc", ".log.gz"])
@@ -312,7 +312,7 @@ def test_damaged_logs(tmp_path):
     (tmp_path / "cut.log").write_text("".join(whole[:600]) + whole[600][:-12].replace("#", "") + "\n")
     got = []
     with open_source(file=tmp_path / "cut.log") as source, pytest.raises(EdgeposeError) as info:
-        got.extend(sample for _, samples in source for sample in samples)
+        got.extend(sample for _, samples, *_ in source for sample in samples)
     assert re.match(rf"{tmp_path}/cut.log: cannot read it as a log of a CAN bus: ", str(info.value))
     assert len(got) > 100
     (tmp_path / "no.mf4").write_bytes(b"nothing of the kind")

@@ -173,7 +173,7 @@ def test_a_silent_line_is_told_once_and_does_not_end_the_others(monkeypatch, cap
     monkeypatch.setattr("edgepose.sources.live.SILENCE_S", 0.2)
     sensors = set()
     with rig() as port, silent_port() as other, open_source(port=f"{port},{other}", lenient=True) as source:
-        for _, batch in source:
+        for _, batch, *_ in source:
             sensors |= {sample.sensor for sample in batch}
             if sensors == set(range(6)) and caplog.records:
                 break

@@ -31,8 +31,8 @@ def poses(count: int, where: bool = False) -> list[PoseFrame]:
     for i in range(count):
         turns = Rotation.from_rotvec(0.3 * np.sin(np.arange(72).reshape(24, 3) + i / 10))
         place = np.array([0.0, 0.9, 0.01 * i]) if where else None
-        status = "held head" if i % 5 == 3 else "ok"
-        result.append(PoseFrame(i, 1.7e9 + i / 60, status, turns.as_matrix(), np.zeros(24), place))
+        held = frozenset(["head"] if i % 5 == 3 else [])
+        result.append(PoseFrame(i, 1.7e9 + i / 60, turns.as_matrix(), np.zeros(24), place, held))
     return result
 
 

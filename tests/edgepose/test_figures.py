@@ -101,7 +101,7 @@ def test_tool(tmp_path):
     source = tmp_path / "poses.csv"
     with CsvSink(source) as sink:
         for i in range(60):
-            sink.write(PoseFrame(i, 1.7e9 + i / 60, "ok", left_arm_up(), np.zeros(24)))
+            sink.write(PoseFrame(i, 1.7e9 + i / 60, left_arm_up(), np.zeros(24)))
     out = tmp_path / "strip.png"
     result = CliRunner().invoke(
         main, [str(source), "--times", "0,0.5", "--reference", str(source), "--out", str(out)]

@@ -37,7 +37,7 @@ OLD = b"what was there before\n"
 
 
 def make_pose(index: int) -> PoseFrame:
-    return PoseFrame(index, index / 60, "ok", np.tile(np.eye(3, dtype=np.float32), (24, 1, 1)), np.zeros(24))
+    return PoseFrame(index, index / 60, np.tile(np.eye(3, dtype=np.float32), (24, 1, 1)), np.zeros(24))
 
 
 def part(recording: Recording, start_s: float, end_s: float) -> Recording:

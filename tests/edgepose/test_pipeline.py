@@ -14,10 +14,11 @@ from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.registry import read_poses
 from edgepose.imu import ImuFrame
 from edgepose.inference import archive
-from edgepose.inference.engine import StreamEngine
+from edgepose.inference.engine import EngineOutput, StreamEngine
 from edgepose.pipeline.frame_synchronizer import FrameClock
-from edgepose.pipeline.run import LATENCIES, RunSummary, Walk, run, status
+from edgepose.pipeline.run import LATENCIES, RunSummary, Walk, pose_frame, run
 from edgepose.placements import PLACEMENTS
+from edgepose.pose import parse_status
 from edgepose.sinks.base import Sink
 from edgepose.sinks.csv import CsvSink
 from edgepose.sources import open_source
@@ -76,7 +77,7 @@ def imu_frame(*held):
 
 
 def test_what_waited_to_be_taken_counts_as_latency(walk):
-    summary = walk(behind_s=lambda: 2.5)
+    summary = walk(lambda batches: (batch._replace(backlog_s=2.5) for batch in batches))
     assert summary.behind_s == 2.5
     assert min(summary.latencies_s) >= 2.5
     assert max(walk().latencies_s) < 2.5
@@ -92,7 +93,9 @@ def test_what_waited_to_be_taken_counts_as_latency(walk):
     ],
 )
 def test_status(held, filling, text):
-    assert status(imu_frame(*held), filling) == text
+    pose = pose_frame(EngineOutput(imu_frame(*held), np.zeros((24, 3, 3)), np.zeros(24), filling))
+    assert (pose.held, pose.warming_up, pose.status) == (set(held), filling, text)
+    assert parse_status(text) == (pose.held, pose.warming_up)
 
 
 def test_every_frame_comes_out_once_and_in_order(walk):
@@ -113,7 +116,8 @@ def test_all_sinks_get_the_same(walk, tmp_path):
     shelf, file = Shelf(), tmp_path / "poses.csv"
     with CsvSink(file, "matrix") as sink:
         walk(sinks=[shelf, sink])
-    frames, time_s, texts, rotations = read_poses(file)[:4]
+    read = read_poses(file)
+    frames, time_s, texts, rotations = read.frames, read.time_s, read.status, read.rotations
     assert frames.tolist() == indices(shelf)
     assert texts == [pose.status for pose in shelf.poses]
     np.testing.assert_allclose(time_s, [pose.time_s for pose in shelf.poses], atol=1e-6)
@@ -146,8 +150,9 @@ def test_what_came_before_an_error_of_the_source_comes_out(walk):
 
 def test_what_came_before_a_sample_without_orientation_comes_out(walk):
     def bare(batches):
-        for i, (now_s, samples) in enumerate(batches):
-            yield now_s, [s._replace(quat=None) for s in samples] if i == 100 else samples
+        for i, batch in enumerate(batches):
+            samples = [s._replace(quat=None) for s in batch.samples] if i == 100 else batch.samples
+            yield batch._replace(samples=samples)
 
     shelf = Shelf()
     summary = walk(bare, [shelf])
@@ -169,8 +174,9 @@ def test_a_sensor_that_stops_is_held_and_counted(walk):
     silent = PLACEMENTS.index("head")
 
     def without_head(batches):
-        for i, (now_s, samples) in enumerate(batches):
-            yield now_s, [s for s in samples if s.sensor != silent or not 100 <= i < 200]
+        for i, batch in enumerate(batches):
+            samples = [s for s in batch.samples if s.sensor != silent or not 100 <= i < 200]
+            yield batch._replace(samples=samples)
 
     shelf = Shelf()
     summary = walk(without_head, [shelf])
@@ -185,7 +191,7 @@ def test_a_sensor_that_stops_is_held_and_counted(walk):
 
 def test_sensors_that_never_report(walk):
     def four(batches):
-        return ((now_s, [s for s in samples if s.sensor < 4]) for now_s, samples in batches)
+        return (b._replace(samples=[s for s in b.samples if s.sensor < 4]) for b in batches)
 
     shelf = Shelf()
     summary = walk(four, [shelf])

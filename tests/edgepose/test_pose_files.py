@@ -21,7 +21,7 @@ from edgepose.formats.poses.csv import BLOCK, read_blocks
 from edgepose.formats.poses.registry import is_poses, read_poses, salvage_poses
 from edgepose.formats.recordings.csv import write_csv
 from edgepose.formats.recordings.registry import read_recording
-from edgepose.pose import PoseFrame, Poses
+from edgepose.pose import PoseFrame, Poses, parse_status
 from edgepose.sinks.bvh import BvhSink, depth_first
 from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.npz import NpzSink
@@ -46,7 +46,7 @@ def motion(count: int, moves: bool = True) -> list[PoseFrame]:
         rotations = (Rotation.from_rotvec(axes * i * 0.02) * start).as_matrix().astype(np.float32)
         where = np.array([0.01 * i, 0.9 + 0.1 * np.sin(i / 9), -0.02 * i]) if moves else None
         std = np.full(24, np.nan, np.float32)
-        result.append(PoseFrame(i, 1.7e9 + i / 60, STATUSES[i % 4], rotations, std, where))
+        result.append(PoseFrame(i, 1.7e9 + i / 60, rotations, std, where, *parse_status(STATUSES[i % 4])))
     return result
 
 
@@ -277,7 +277,7 @@ def test_bvh_angles_do_not_leap(tmp_path):
 
 
 def test_bvh_without_translation_stands_on_the_ground(tmp_path):
-    straight = PoseFrame(0, 0.0, "ok", np.tile(np.eye(3, dtype=np.float32), (24, 1, 1)), np.zeros(24))
+    straight = PoseFrame(0, 0.0, np.tile(np.eye(3, dtype=np.float32), (24, 1, 1)), np.zeros(24))
     written(BvhSink(tmp_path / "a.bvh"), [straight])
     places = forward(read_bvh(tmp_path / "a.bvh"))[1][0] / 100.0
     assert places[:, 1].min() == pytest.approx(0.0, abs=1e-4)
@@ -288,11 +288,11 @@ def test_bvh_without_translation_stands_on_the_ground(tmp_path):
 
 PRELUDE = """
 import sys, signal, time, numpy as np
-from edgepose.pose import PoseFrame
+from edgepose.pose import PoseFrame, parse_status
 from edgepose.errors import EdgeposeError
 from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.npz import NpzSink
-def pose(i): return PoseFrame(i, i / 60, 'ok', np.tile(np.eye(3), (24, 1, 1)), np.zeros(24))
+def pose(i): return PoseFrame(i, i / 60, np.tile(np.eye(3), (24, 1, 1)), np.zeros(24))
 kind = BvhSink if sys.argv[1].endswith('bvh') else NpzSink
 """
 
@@ -393,7 +393,7 @@ def test_npz_without_poses(tmp_path):
 
 
 def standing(index):
-    return PoseFrame(index, index / 60, "ok", np.tile(np.eye(3), (24, 1, 1)), np.zeros(24))
+    return PoseFrame(index, index / 60, np.tile(np.eye(3), (24, 1, 1)), np.zeros(24))
 
 
 def test_times_that_do_not_rise(tmp_path):

@@ -95,7 +95,7 @@ def test_poses_from_raw_samples_are_true(command, rig, tmp_path):
     result = command("run", "--file", rig.raw, *words)
     assert result.returncode == 0, result.stderr
     assert "warning" not in result.stderr
-    _, time_s, _, found = read_poses(poses)[:4]
+    _, time_s, found = read_poses(poses)[:3]
     moving = time_s >= CLIP_S
     assert joint_angle_error(found[moving], true_poses(time_s[moving])).mean() < 9.0
 
@@ -265,7 +265,7 @@ def test_a_live_run_begins_with_the_pose_and_re_zeroes_on_request(rig, tmp_path)
         os.close(terminal.inside)
         terminal.join(5)
         os.close(terminal.master)
-    frames, time_s, _, found = read_poses(poses)[:4]
+    frames, time_s, found = read_poses(poses)[:3]
     assert frames.tolist() == list(range(frames[0], frames[0] + len(frames)))
     assert frames[0] >= 120  # those before the pose are not written
     moving = (time_s >= begin + 1.6) & (time_s <= end)

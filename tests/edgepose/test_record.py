@@ -113,7 +113,7 @@ def good(recording) -> int:
 
 def everything(**options: object) -> list[ImuSample]:
     with open_source(**options) as source:
-        return [sample for _, batch in source for sample in batch]
+        return [sample for batch in source for sample in batch.samples]
 
 
 def same(a, b, tolerance: float = 1e-6) -> None:
@@ -231,15 +231,14 @@ def two_outputs(first: Output, second: Output) -> Output:
 
 @pytest.mark.parametrize(("protocol", "seconds"), [("auto", 1.5), ("native", 0.7)])
 def test_a_capture_decoded_again_equals_the_samples(tmp_path, protocol, seconds):
-    raw: list = []
     live: list[ImuSample] = []
-    with Rig() as rig, open_source(port=rig.port, protocol=protocol, raw=raw) as source:
+    with Rig() as rig, open_source(port=rig.port, protocol=protocol) as source:
         output = two_outputs(
             open_output(str(tmp_path / "walk.csv"), {}), open_output(str(tmp_path / "walk.bin"), {"a": "b"})
         )
         keep = output.samples
         output = output._replace(samples=lambda batch: (live.extend(batch), keep(batch)))
-        summary = record(source, output, raw, seconds)
+        summary = record(source, output, seconds)
     assert summary.error is None
     written = read_recording(tmp_path / "walk.csv")
     again = everything(file=tmp_path / "walk.bin", protocol=protocol)
@@ -285,12 +284,11 @@ def test_can_logs(tmp_path, ending, fd):
         Packet(row.sensor, i // 6, int(row.time_s * 1e6), row.quat, row.acc, row.gyr)
         for i, row in enumerate(list(samples(read_recording(REAL)))[:300])
     ]
-    raw: list = []
     live: list[ImuSample] = []
     file = tmp_path / f"walk{ending}"
     with (
         can.Bus(channel, "virtual") as bus,
-        open_source(can=f"virtual:{channel}", protocol="native-can", fd=fd, raw=raw) as source,
+        open_source(can=f"virtual:{channel}", protocol="native-can", fd=fd) as source,
     ):
         output = open_output(str(file), {})
         output = output._replace(samples=live.extend)
@@ -306,7 +304,7 @@ def test_can_logs(tmp_path, ending, fd):
 
         sender = threading.Thread(target=send)
         sender.start()
-        summary = record(source, output, raw, stopped=lambda: len(live) == len(packets))
+        summary = record(source, output, stopped=lambda: len(live) == len(packets))
         sender.join()
     assert summary.error is None
     assert [path.name for path in tmp_path.iterdir()] == [file.name]
@@ -396,7 +394,7 @@ def test_no_room_for_the_whole_file_leaves_its_journal(tmp_path):
         output = open_output(str(tmp_path / "walk.npz"), {})
         # No file can be put where a folder is.
         (tmp_path / "walk.npz").mkdir()
-        summary = record(source, output, [])
+        summary = record(source, output)
     assert f"the recording is whole in {tmp_path / 'walk.part.csv'}" in str(summary.error)
     assert good(read_recording(tmp_path / "walk.part.csv")) == 1800
     assert sorted(path.name for path in tmp_path.iterdir()) == ["walk.npz", "walk.part.csv"]
@@ -405,11 +403,10 @@ def test_no_room_for_the_whole_file_leaves_its_journal(tmp_path):
 def test_nothing_came(tmp_path, monkeypatch):
     monkeypatch.setattr("edgepose.sources.live.SILENCE_S", 0.2)
     for name in ("walk.csv", "walk.npz", "walk.bin"):
-        raw: list = []
         with Rig() as rig:
             rig.silent = set(range(6))
-            with open_source(port=rig.port, raw=raw) as source:
-                summary = record(source, open_output(str(tmp_path / name), {}), raw)
+            with open_source(port=rig.port) as source:
+                summary = record(source, open_output(str(tmp_path / name), {}))
         assert "nothing came" in str(summary.error)
     assert list(tmp_path.iterdir()) == []
 

@@ -20,7 +20,7 @@ from edgepose.analysis.report import POINTS, extremes, write_report
 from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.registry import read_poses
-from edgepose.pose import PoseFrame, longest_holds
+from edgepose.pose import PoseFrame, longest_holds, parse_status
 from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.csv import CsvSink
 from edgepose.skeleton import JOINTS, default_body, local_from_global
@@ -158,7 +158,8 @@ def write(path: Path, local: np.ndarray, rate: float) -> None:
     with CsvSink(path) as sink:
         for i, rotations in enumerate(local):
             status = "held head" if 10 <= i < 16 else "filling window" if i < 4 else "ok"
-            sink.write(PoseFrame(i, 1.7e9 + i / rate, status, rotations, np.zeros(24)))
+            state = parse_status(status)
+            sink.write(PoseFrame(i, 1.7e9 + i / rate, rotations, np.zeros(24), None, *state))
 
 
 def test_short_peaks_are_drawn():
@@ -215,7 +216,7 @@ def test_page_of_a_bvh_file(command, tmp_path):
     local, rate = motion(WALK)
     with BvhSink(tmp_path / "a.bvh", rate) as sink:
         for i, rotations in enumerate(local):
-            sink.write(PoseFrame(i, i / rate, "ok", rotations, np.zeros(24)))
+            sink.write(PoseFrame(i, i / rate, rotations, np.zeros(24)))
     result = command("report", tmp_path / "a.bvh")
     assert result.returncode == 0, result.stderr
     page = Page((tmp_path / "a.html").read_text(encoding="utf-8"))

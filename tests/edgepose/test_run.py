@@ -83,7 +83,8 @@ class Listener(threading.Thread):
 def whole(path: Path) -> tuple[np.ndarray, np.ndarray, list[str], np.ndarray]:
     """Frames, times, status and rotations of a CSV of poses, after the checks that every run must pass."""
     assert path.read_bytes().endswith(b"\n")
-    frames, time_s, status, rotations = read_poses(path)[:4]
+    read = read_poses(path)
+    frames, time_s, status, rotations = read.frames, read.time_s, read.status, read.rotations
     assert frames.tolist() == list(range(len(frames)))
     np.testing.assert_allclose(time_s, time_s[0] + frames / 60.0, atol=1.1e-6)
     unit = np.eye(3)

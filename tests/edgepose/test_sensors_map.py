@@ -192,7 +192,7 @@ def test_a_capture_with_ids_of_its_own(read, tmp_path):
     rig = read(IDS)
     file = capture(tmp_path / "a.bin", [25, 24, 23, 22, 21, 20, 7])
     with open_source(file=file, sensors=rig.path) as source:
-        got = [sample.sensor for _, samples in source for sample in samples]
+        got = [sample.sensor for _, samples, *_ in source for sample in samples]
     assert got == [5, 4, 3, 2, 1, 0] * 30
     assert source.counters.unknown == 30
     with open_source(file=file) as source, pytest.raises(EdgeposeError, match="only of sensor ids 7, 20, 21"):

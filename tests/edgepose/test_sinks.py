@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.registry import read_poses
 from edgepose.placements import PLACEMENTS
-from edgepose.pose import PoseFrame
+from edgepose.pose import PoseFrame, parse_status
 from edgepose.rotations import matrix_to_euler_zxy
 from edgepose.sinks import csv as csv_file
 from edgepose.sinks.csv import CsvSink, pose_columns
@@ -31,7 +31,8 @@ STATUSES = ("ok", "held head", "held left_forearm pelvis; filling window", "fill
 def make_pose(index: int, status: str = "ok") -> PoseFrame:
     rng = np.random.default_rng(index)
     rotations = Rotation.random(24, random_state=rng).as_matrix().astype(np.float32)
-    return PoseFrame(index, 1.7e9 + index / 60, status, rotations, rng.random(24).astype(np.float32))
+    std, state = rng.random(24).astype(np.float32), parse_status(status)
+    return PoseFrame(index, 1.7e9 + index / 60, rotations, std, None, *state)
 
 
 def run_python(code: str, *args: str, **options) -> subprocess.Popen:
@@ -40,7 +41,7 @@ def run_python(code: str, *args: str, **options) -> subprocess.Popen:
         "from edgepose.pose import PoseFrame\n"
         "from edgepose.errors import EdgeposeError\n"
         "from edgepose.sinks.csv import CsvSink\n"
-        "def pose(i): return PoseFrame(i, i / 60, 'ok', np.tile(np.eye(3), (24, 1, 1)), np.zeros(24))\n"
+        "def pose(i): return PoseFrame(i, i / 60, np.tile(np.eye(3), (24, 1, 1)), np.zeros(24))\n"
     )
     return subprocess.Popen([sys.executable, "-c", prelude + code, *args], text=True, **options)
 
@@ -56,7 +57,8 @@ def test_csv_comes_back(tmp_path, form, std):
     with CsvSink(path, form, std) as sink:
         for pose in poses:
             sink.write(pose)
-    frames, times, status, rotations = read_poses(path)[:4]
+    read = read_poses(path)
+    frames, times, status, rotations = read.frames, read.time_s, read.status, read.rotations
     assert frames.tolist() == list(range(10))
     np.testing.assert_allclose(times, [p.time_s for p in poses], atol=1e-6)
     assert status == [p.status for p in poses]
@@ -298,7 +300,8 @@ def test_udp_binary(receiver, status):
         data = receiver.recv(2048)
     assert len(data) == 404
     back = decode_binary(data)
-    assert back[:3] == pose[:3]
+    assert (back.index, back.time_s, back.status) == (7, pose.time_s, status)
+    assert (back.held, back.warming_up) == (pose.held, pose.warming_up)
     np.testing.assert_allclose(back.rotations, pose.rotations, atol=1e-6)
     assert np.isnan(back.std).all()
 
@@ -332,7 +335,8 @@ def test_decode_binary_refuses_what_it_does_not_know():
 
 
 def test_json_quotes_the_status():
-    assert json.loads(encode_json(make_pose(0, 'a "quoted" name')))["status"] == 'a "quoted" name'
+    pose = make_pose(0)._replace(held=frozenset(['a "quoted" name']))
+    assert json.loads(encode_json(pose))["status"] == 'held a "quoted" name'
 
 
 def test_udp_nobody_listens_and_then_somebody_does(receiver):

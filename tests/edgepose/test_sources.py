@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import serial
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import DeviceError, EdgeposeError
 from edgepose.formats.recordings.base import samples
 from edgepose.formats.recordings.csv import csv_header, csv_row, write_csv
 from edgepose.formats.recordings.raw_capture import times_header, times_path, times_row
@@ -93,7 +93,7 @@ def test_live_packets_become_samples_and_frames(port):
     got, frames = [], []
     with open_source(port=name) as source, Device(master, chunks(200, start_us=(1 << 32) - 500_000)):
         clock = FrameClock()
-        for now_s, batch in source:
+        for now_s, batch, *_ in source:
             assert abs(now_s - time.time()) < 1.0
             got += batch
             clock.push(batch, now_s)
@@ -118,7 +118,7 @@ def test_silent_port_still_gives_batches(port):
     with open_source(port=port[1]) as source:
         batches = iter(source)
         times = [next(batches) for _ in range(5)]
-    assert all(batch == [] for _, batch in times)
+    assert all(batch.samples == [] for batch in times)
     assert all(b[0] > a[0] for a, b in pairwise(times))
 
 
@@ -129,7 +129,7 @@ def test_a_source_that_does_not_wait(port, caplog):
 
     def look_until(wanted):
         while not wanted():
-            now_s, batch = next(batches)
+            now_s, batch, *_ = next(batches)
             assert abs(now_s - time.time()) < 1.0
             got.extend(batch)
             time.sleep(0.004)
@@ -169,7 +169,7 @@ def test_what_waits_behind_a_full_buffer_is_not_said_to_be_delivered(port):
         written_s = time.time()
         time.sleep(0.1)
         while len(got) < before + 300:
-            now_s, batch = next(batches)
+            now_s, batch, *_ = next(batches)
             got += batch
             assert now_s < written_s or len(got) == before + 300
             time.sleep(0.01)
@@ -193,7 +193,7 @@ def test_a_line_that_is_never_empty_does_not_stop_the_time(port, monkeypatch):
                 break
             fill()
             time.sleep(0.02)
-            now_s, _ = next(batches)
+            now_s, *_ = next(batches)
         else:
             pytest.fail("the time stands still")
 
@@ -208,18 +208,18 @@ def test_the_time_until_a_look_counts_as_waiting(port):
             got += next(batches)[1]
         os.write(master, encode(packets(2)[6]))
         time.sleep(0.3)
-        assert len(next(batches)[1]) == 1
-        assert source.behind_s >= 0.3
-        next(batches)
-        assert source.behind_s < 0.3
+        late = next(batches)
+        assert len(late.samples) == 1
+        assert late.backlog_s >= 0.3
+        assert next(batches).backlog_s < 0.3
 
 
 def test_sources_share_a_clock_that_nobody_sets(port, monkeypatch):
     with open_source(port=port[1], waits=False) as source:
-        first_s, _ = next(iter(source))
+        first_s, *_ = next(iter(source))
     monkeypatch.setattr(time, "time", lambda: 0.0)
     with open_source(port=port[1], waits=False) as source:
-        second_s, _ = next(iter(source))
+        second_s, *_ = next(iter(source))
     assert first_s < second_s < first_s + 60.0
 
 
@@ -241,7 +241,7 @@ def drain(name, monkeypatch, seconds=0.3, **options):
     monkeypatch.setattr("edgepose.sources.live.NOISE_S", seconds)
     got = []
     with open_source(port=name, baud=9600, **options) as source, pytest.raises(EdgeposeError) as info:
-        got.extend(sample for _, batch in source for sample in batch)
+        got.extend(sample for _, batch, *_ in source for sample in batch)
     assert str(info.value).startswith(f"{name}: ")
     assert "\n" not in str(info.value)
     return str(info.value), got
@@ -313,7 +313,7 @@ def test_a_port_that_goes_and_comes_back(link, caplog):
                 before += next(batches)[1]
         link.unplug()
         while "gone" not in caplog.text or len(gap) < 10:
-            now_s, batch = next(batches)
+            now_s, batch, *_ = next(batches)
             before += batch
             gap.append(now_s)
         assert all(b > a for a, b in pairwise(gap))
@@ -433,7 +433,7 @@ def listen(n, **options):
     got, frames, clock = [], [], FrameClock()
     missing = Counter(dict.fromkeys(range(6), n))
     with open_source(**options) as source:
-        for now_s, batch in source:
+        for now_s, batch, *_ in source:
             got += batch
             if batch and all(sample.acc and sample.quat for sample in batch):
                 clock.push(batch, now_s)
@@ -573,16 +573,33 @@ def test_lines_of_text_as_a_file_describes_them(tmp_path):
         open_source(port="a", protocol=str(pattern))
 
 
-def test_raw_data_are_kept_on_demand(port):
+def test_batches_carry_what_came_over_the_line(port):
     master, name = port
     raw = []
-    with open_source(port=name, raw=raw) as source, Device(master, chunks(100)):
-        for _ in source:
+    with open_source(port=name) as source, Device(master, chunks(100)):
+        for batch in source:
+            raw += batch.raw
             if source.counters.packets > 100:
                 break
     decoder = PROTOCOLS["native"].decoder()
     assert len([s for _, data in raw for s in decoder.feed(data)]) == source.counters.packets
     assert all(b[0] >= a[0] for a, b in pairwise(raw))
+
+
+def test_what_came_before_an_error_is_in_a_batch(port, monkeypatch):
+    def refuse(*_):
+        raise DeviceError("nobody can tell")
+
+    monkeypatch.setattr("edgepose.sources.line_decoder.Stream.feed", refuse)
+    master, name = port
+    raw = []
+    with (
+        open_source(port=name) as source,
+        Device(master, chunks(100)),
+        pytest.raises(DeviceError, match="nobody"),
+    ):
+        raw.extend(piece for batch in source for piece in batch.raw)
+    assert len(raw) == 1
 
 
 # --- files --------------------------------------------------------------------------------------------------
@@ -591,7 +608,7 @@ def test_raw_data_are_kept_on_demand(port):
 def everything(**options):
     with open_source(**options) as source:
         batches = list(source)
-    return source, batches, [s for _, batch in batches for s in batch]
+    return source, batches, [s for _, batch, *_ in batches for s in batch]
 
 
 @pytest.mark.parametrize("kind", ["npz", "csv"])
@@ -603,7 +620,7 @@ def test_recording(tmp_path, kind):
     source, batches, got = everything(file=path)
     assert len(got) == source.counters.packets == 1800
     assert source.damage is None
-    for now_s, batch in batches:
+    for now_s, batch, *_ in batches:
         assert now_s == max(s.time_s for s in batch)
     assert all(a[0] < b[0] for a, b in pairwise(batches))
 
@@ -652,8 +669,8 @@ def test_realtime_without_waiting_gives_the_same_and_empty_batches_between(tmp_p
     with open_source(file=tmp_path / "a.bin", realtime=True, waits=False) as source:
         batches = list(source)
     _, _, alone = everything(file=tmp_path / "a.bin")
-    assert [sample for _, batch in batches for sample in batch] == alone
-    assert [] in [batch for _, batch in batches]
+    assert [sample for _, batch, *_ in batches for sample in batch] == alone
+    assert [] in [batch for _, batch, *_ in batches]
     assert all(b[0] >= a[0] for a, b in pairwise(batches))
 
 
@@ -663,7 +680,7 @@ def test_realtime_takes_its_time(tmp_path):
     _, batches, got = everything(file=tmp_path / "a.bin", realtime=True)
     assert time.monotonic() - start >= 0.27
     assert len(got) == 180
-    assert all(s.time_s <= now_s for now_s, batch in batches for s in batch)
+    assert all(s.time_s <= now_s for now_s, batch, *_ in batches for s in batch)
     assert len(batches) >= 28
 
 
@@ -674,8 +691,7 @@ def test_a_recording_at_its_own_pace_says_how_late_it_is_taken(tmp_path, kind):
         batches = iter(source)
         next(batches)
         time.sleep(0.15)
-        next(batches)
-        assert 0.13 < source.behind_s < 10.0
+        assert 0.13 < next(batches).backlog_s < 10.0
 
 
 def test_options():

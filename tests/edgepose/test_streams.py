@@ -24,13 +24,13 @@ def pose(index: int = 0, where: np.ndarray | None = None, **turns: tuple[str, fl
     rotations = np.tile(np.eye(3, dtype=np.float32), (24, 1, 1))
     for joint, (axis, angle) in turns.items():
         rotations[JOINTS.index(joint)] = Rotation.from_euler(axis, angle, degrees=True).as_matrix()
-    return PoseFrame(index, 1.7e9 + index / 60, "ok", rotations, np.zeros(24, np.float32), where)
+    return PoseFrame(index, 1.7e9 + index / 60, rotations, np.zeros(24, np.float32), where)
 
 
 def anything(index: int) -> PoseFrame:
     rotations = Rotation.random(24, random_state=index).as_matrix().astype(np.float32)
     where = np.random.default_rng(index).normal(size=3)
-    return PoseFrame(index, 1.7e9 + index / 60, "ok", rotations, np.zeros(24, np.float32), where)
+    return PoseFrame(index, 1.7e9 + index / 60, rotations, np.zeros(24, np.float32), where)
 
 
 # --- VMC ----------------------------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ from websockets.sync.client import connect
 from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.registry import read_poses
-from edgepose.pose import PoseFrame, held_sensors
+from edgepose.pose import PoseFrame, held_sensors, parse_status
 from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.udp import UdpSink, decode, encode_binary, encode_json
@@ -49,7 +49,8 @@ def standing(index: int = 0, status: str = "ok") -> PoseFrame:
     rotations[16] = Rotation.from_euler("z", -75, degrees=True).as_matrix()
     rotations[17] = Rotation.from_euler("z", 75, degrees=True).as_matrix()
     rotations[18] = Rotation.from_euler("y", -index % 90, degrees=True).as_matrix()
-    return PoseFrame(index, 1.7e9 + index / 60, status, rotations, np.zeros(24, np.float32))
+    state = parse_status(status)
+    return PoseFrame(index, 1.7e9 + index / 60, rotations, np.zeros(24, np.float32), None, *state)
 
 
 def free_port(kind: int = socket.SOCK_STREAM) -> int:
@@ -114,7 +115,8 @@ def test_table_of_sensors():
     assert [cell.strip() for cell in rows[4]] == ["head", "45", "0.25 s", "ok"]
     assert [cell.strip() for cell in rows[5]] == ["pelvis", "50", "0.17 s", "held"]
     assert "| pelvis | 0 | - | ok |" in sensor_table(np.zeros((0, 6), bool), 60.0)
-    flags = held_sensors(["held head pelvis; filling window", "held tail; and what nobody knows"])
+    texts = ["held head pelvis; filling window", "held tail; and what nobody knows"]
+    flags = held_sensors([parse_status(text)[0] for text in texts])
     assert flags.tolist() == [[False] * 4 + [True] * 2, [False] * 6]
 
 

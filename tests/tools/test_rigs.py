@@ -95,7 +95,7 @@ def test_the_same_poses_over_every_wire(clip, tmp_path):
         results = list(pool.map(lambda name: follow(recording, name, tmp_path / name), RIGS))
     errors = {}
     for name, (begin, end, path) in zip(RIGS, results, strict=True):
-        frames, time_s, _, poses = read_poses(path)[:4]
+        frames, time_s, poses = read_poses(path)[:3]
         assert frames.tolist() == list(range(len(frames))), name
         moving = (time_s >= begin + 1.0) & (time_s <= end - 0.1)
         assert moving.sum() in range(262, 266), name

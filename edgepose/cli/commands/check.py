@@ -146,7 +146,7 @@ def _listen(
         return State(0.0 if start_s is None else now_s - start_s, source.counters, sensors)
 
     try:
-        for now_s, samples in source:
+        for now_s, samples, *_ in source:
             start_s = now_s if start_s is None else start_s
             health.add(samples, now_s if live else math.nan)
             if time.monotonic() - shown_s >= REDRAW_S:

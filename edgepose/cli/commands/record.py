@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from datetime import datetime, timezone
 from math import inf
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -58,21 +58,17 @@ def record(source: SourceConfig, out: str, seconds: float | None, overwrite: boo
         )
     if kind == "bus" and (source.can is None or source.port is not None):
         raise click.UsageError(f"{out} takes the frames of a CAN bus: give --can, or name it .csv or .npz")
-    raw: list[tuple[float, Any]] = []
     with ExitStack() as stack:
         written = {"OUT": out, "OUT (while it grows)": recorder.growing(out)}
         check_files(written, {"--file": source.file, "--sensors": source.sensors})
         recorder.check_free(out, overwrite)
-        opened = stack.enter_context(
-            open_source(**source.arguments(), raw=raw if kind != "samples" else None)
-        )
+        opened = stack.enter_context(open_source(**source.arguments()))
         stop = stack.enter_context(Stop())
         output = recorder.open_output(out, _metadata(source), overwrite)
         say(f"recording to {out}; Ctrl-C ends it. Samples are counted in the order {', '.join(PLACEMENTS)}")
         summary = recorder.record(
             opened,
             output,
-            raw,
             inf if seconds is None else seconds,
             _progress(opened),
             stopped=lambda: stop.asked,

@@ -190,8 +190,7 @@ def _walks(
         wearers = [Wearer(rig.source, walk, rig.say) for rig, walk in zip(opened, walks, strict=True)]
         run_together(wearers, engine, LOOK_S if live else 0.0, lambda: stop.asked, progress)
     else:
-        source = opened[0].source
-        run_alone(walks[0], source, engine, lambda: stop.asked, lambda: source.behind_s)
+        run_alone(walks[0], opened[0].source, engine, lambda: stop.asked)
         walks[0].close()
     return walks
 

@@ -230,9 +230,8 @@ def _write(sinks: list[Sink], solution: Solution, measurements: Measurements, pa
 
     rotations, std = solution.rotations.astype(np.float32), np.zeros(24, np.float32)
     for i, (matrices, place) in enumerate(zip(rotations, path, strict=True)):
-        held = [n for n, h in zip(measurements.names, measurements.held[i], strict=True) if h]
-        status = " ".join(["held", *held]) if held else "ok"
-        pose = PoseFrame(i, float(measurements.time_s[i]), status, matrices, std, place)
+        held = frozenset(n for n, h in zip(measurements.names, measurements.held[i], strict=True) if h)
+        pose = PoseFrame(i, float(measurements.time_s[i]), matrices, std, place, held)
         for sink in sinks:
             sink.write(pose)
 

@@ -33,6 +33,11 @@ class PoseFormat(FileFormat):
     holds_poses: Callable[[Path], bool] = lambda path: True
 
 
+def all_new(count: int) -> tuple[list[frozenset[str]], list[bool]]:
+    """`held` and `warming_up` of poses of which nothing is known to be missing."""
+    return [frozenset()] * count, [False] * count
+
+
 def is_absurd(values: NDArray[Any], most: float = LARGEST) -> NDArray[np.bool_]:
     """Which of the numbers are NaN, or too large to be true."""
     return ~(np.abs(values.astype(np.float64)) <= most)

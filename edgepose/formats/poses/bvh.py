@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from edgepose.errors import FileFormatError
 from edgepose.formats.bvh import salvage_bvh
 from edgepose.formats.joint_tree import JointTree
-from edgepose.formats.poses.base import PoseFormat
+from edgepose.formats.poses.base import PoseFormat, all_new
 from edgepose.pose import Poses
 from edgepose.skeleton import JOINTS, PARENTS, standing_place
 
@@ -43,7 +43,8 @@ def read_bvh(path: Path) -> tuple[Poses, str | None]:
     # Where `BvhSink` puts those of whom it knows no place.
     known = np.abs(translation - standing_place(offsets)).max() > _SAME_PLACE_M
     times = np.arange(count) / tree.rate
-    poses = Poses(np.arange(count), times, ["ok"] * count, rotations, translation if known else None)
+    place = translation if known else None
+    poses = Poses(np.arange(count), times, rotations, place, *all_new(count))
     return poses, problem
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from edgepose.errors import EdgeposeError, FileFormatError
 from edgepose.formats.poses.base import LARGEST_TIME, PoseFormat, is_absurd
 from edgepose.formats.poses.csv_columns import FORMS, pose_columns
-from edgepose.pose import Poses
+from edgepose.pose import Poses, parse_status
 from edgepose.rotations import euler_to_matrix, nearest_rotation, quat_to_matrix, rotvec_to_matrix
 from edgepose.skeleton import JOINTS
 
@@ -146,7 +146,8 @@ def _block(
 ) -> Poses:
     """Poses of rows of which the first has number `first`, after the frame and time `last`."""
     frame_before, time_before = last or (None, -np.inf)
-    frames, times, status, numbers = array("q"), array("d"), list[str](), array("d")
+    frames, times, numbers = array("q"), array("d"), array("d")
+    held, warming_up = list[frozenset[str]](), list[bool]()
     for number, row in enumerate(rows, start=first):
         if row == [_TOO_LONG]:
             raise _BadRowError(name, number, _TOO_LONG)
@@ -165,7 +166,9 @@ def _block(
             raise _BadRowError(name, number, f"time {row[1]} s is not after that of the row before")
         if not row[2].isprintable() or "," in row[2] or '"' in row[2]:
             raise _BadRowError(name, number, "the status has a comma, a quote or a line break in it")
-        status.append(sys.intern(row[2]))
+        names, warm = parse_status(row[2])
+        held.append(names)
+        warming_up.append(warm)
         frame_before, time_before = frame, times[-1]
     values = np.frombuffer(numbers).reshape(len(frames), -1)
     seconds = np.frombuffer(times)
@@ -182,7 +185,7 @@ def _block(
         at, joint = np.argwhere(off > 1e-3)[0].tolist()
         raise _BadRowError(name, at + first, f"the numbers of {JOINTS[joint]} are not a rotation")
     where = values[:, -3:] if moves else None
-    return Poses(numbered, seconds, status, rotations, where)
+    return Poses(numbered, seconds, rotations, where, held, warming_up)
 
 
 def _rotations(form: str, values: Array) -> tuple[Array, Array]:
@@ -208,9 +211,10 @@ def _concatenate(blocks: list[Poses]) -> Poses:
     return Poses(
         np.concatenate([block.frames for block in blocks]),
         np.concatenate([block.time_s for block in blocks]),
-        [text for block in blocks for text in block.status],
         np.concatenate([block.rotations for block in blocks]),
         np.concatenate(translations) if translations else None,
+        [names for block in blocks for names in block.held],
+        [warm for block in blocks for warm in block.warming_up],
     )
 
 

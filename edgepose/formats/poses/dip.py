@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from edgepose.formats.poses.base import PoseFormat
+from edgepose.formats.poses.base import PoseFormat, all_new
 from edgepose.formats.recordings import dip_imu
 from edgepose.pose import Poses
 
@@ -15,7 +15,8 @@ def read_dip(path: Path) -> tuple[Poses, None]:
     """True poses of DIP-IMU or of DIP's TotalCapture."""
     rotations = dip_imu.read_true_pose(path)
     count = len(rotations)
-    return Poses(np.arange(count), np.arange(count) / dip_imu.RATE, ["ok"] * count, rotations, None), None
+    frames = np.arange(count)
+    return Poses(frames, frames / dip_imu.RATE, rotations, None, *all_new(count)), None
 
 
 # Such a file is a recording of sensors; its poses are read where poses are asked for.

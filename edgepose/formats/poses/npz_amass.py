@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from edgepose.errors import FileFormatError
 from edgepose.formats.joint_tree import LARGEST
-from edgepose.formats.poses.base import LARGEST_TIME, PoseFormat, is_absurd
+from edgepose.formats.poses.base import LARGEST_TIME, PoseFormat, all_new, is_absurd
 from edgepose.placements import PLACEMENTS
-from edgepose.pose import FILLING_WINDOW, Poses, held_sensors, status_bits, status_text
+from edgepose.pose import Poses, held_sensors
 from edgepose.rotations import Z_UP_TO_T, matrix_to_rotvec, rotvec_to_matrix
 from edgepose.skeleton import JOINTS
 from edgepose.utils.safe_npz import BROKEN, check_size, member_names, open_npz
@@ -54,7 +54,7 @@ def read_npz(path: Path) -> tuple[Poses, None]:
         rotations[:, 0] = Z_UP_TO_T @ rotations[:, 0]
         translation = None if translation is None else translation @ Z_UP_TO_T.T
     frames, time_s = _clock(path, arrays, count)
-    return Poses(frames, time_s, _status(path, arrays, count), rotations, translation), None
+    return Poses(frames, time_s, rotations, translation, *_states(path, arrays, count)), None
 
 
 def _load(path: Path) -> tuple[dict[str, NDArray[Any]], bool]:
@@ -105,14 +105,18 @@ def _clock(path: Path, arrays: Mapping[str, NDArray[Any]], count: int) -> tuple[
     return frames, np.arange(count) / rate
 
 
-def _status(path: Path, arrays: Mapping[str, NDArray[Any]], count: int) -> list[str]:
+def _states(
+    path: Path, arrays: Mapping[str, NDArray[Any]], count: int
+) -> tuple[list[frozenset[str]], list[bool]]:
+    """`held` and `warming_up` of T poses."""
     if "held" not in arrays or "filling" not in arrays:
-        return ["ok"] * count
+        return all_new(count)
     held = _numbers(path, arrays, "held", (count, len(PLACEMENTS))) != 0
     filling = _numbers(path, arrays, "filling", (count,)) != 0
-    masks = held @ (1 << np.arange(len(PLACEMENTS)))
-    pairs = zip((filling * FILLING_WINDOW).tolist(), masks.tolist(), strict=True)
-    return [status_text(flags, mask) for flags, mask in pairs]
+    places = np.arange(len(PLACEMENTS))
+    masks = (held @ (1 << places)).tolist()
+    sets = {mask: frozenset(PLACEMENTS[i] for i in places if mask >> i & 1) for mask in set(masks)}
+    return [sets[mask] for mask in masks], filling.tolist()
 
 
 def holds_poses(path: Path) -> bool:
@@ -153,9 +157,8 @@ def write_npz(path: Path, blocks: Iterable[Poses], count: int, rate: float) -> N
                 member.write(_vectors(block).tobytes())
                 frames.append(block.frames)
                 times.append(block.time_s)
-                held.append(held_sensors(block.status))
-                flags = np.array([status_bits(text)[0] for text in block.status])
-                filling.append((flags & FILLING_WINDOW).astype(bool))
+                held.append(held_sensors(block.held))
+                filling.append(np.array(block.warming_up, bool))
                 places.append(_places(block))
         arrays: dict[str, NDArray[Any]] = {
             "trans": np.concatenate(places),
