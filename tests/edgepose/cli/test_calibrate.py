@@ -8,9 +8,7 @@ import os
 import pty
 import subprocess
 import sys
-import threading
 import time
-import tty
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -27,6 +25,7 @@ from edgepose.imu import ImuSample
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose_export.synthesis.heading_routine import ASIDE_DEG, exercises
 from firmware_protocols import native, native_packet
+from tests.support.ports import Port, Sender
 
 REAL = Path(__file__).parents[2] / "data" / "imu" / "six-sites-3s.npz"
 
@@ -224,49 +223,32 @@ def test_errors_are_one_line_and_torch_is_not_imported(tmp_path: Path) -> None:
 # --- live ---------------------------------------------------------------------------------------------------
 
 
-class Wearer(threading.Thread):
-    """Six sensors at 100 Hz on a pty; what they measure can be changed while they send."""
+class Wearer(Sender):
+    """Six sensors at 100 Hz on a line; what they measure can be changed while they send."""
 
     def __init__(self) -> None:
-        super().__init__(daemon=True)
-        self.master, self.slave = pty.openpty()
-        tty.setraw(self.slave)
-        os.set_blocking(self.master, False)
-        self.port = os.ttyname(self.slave)
+        (self.line,) = ports = (Port(),)
+        super().__init__(*ports)
+        self.port = self.line.name
         self.quats_at: Callable[[float], np.ndarray] = lambda t: worn(cal.POSES["straight"])
         self.silent: set[int] = set()
-        self.stop = threading.Event()
 
-    def run(self) -> None:
-        start, seq = time.monotonic(), 0
-        while not self.stop.wait(0.01):
-            now = time.monotonic() - start
-            quats = self.quats_at(now)
-            data = b""
-            for i, (q, f) in enumerate(zip(quats.tolist(), forces(quats).tolist(), strict=True)):
-                if i not in self.silent:
-                    data += native.encode(
-                        native_packet.Packet(i, seq, int(now * 1e6), tuple(q), tuple(f), (0.0, 0.0, 0.0))
-                    )
-            seq = (seq + 1) & 0xFFFF
-            try:
-                os.write(self.master, data)
-            except BlockingIOError:
-                continue  # nobody listens
-
-    def close(self) -> None:
-        self.stop.set()
-        self.join()
-        os.close(self.master)
-        os.close(self.slave)
+    def send(self, k: int) -> None:
+        now = self.elapsed_s
+        quats = self.quats_at(now)
+        data = b""
+        for i, (q, f) in enumerate(zip(quats.tolist(), forces(quats).tolist(), strict=True)):
+            if i not in self.silent:
+                data += native.encode(
+                    native_packet.Packet(i, k & 0xFFFF, int(now * 1e6), tuple(q), tuple(f), (0.0, 0.0, 0.0))
+                )
+        self.line.write(data)
 
 
 @pytest.fixture
 def wearer() -> Iterator[Wearer]:
-    thread = Wearer()
-    thread.start()
-    yield thread
-    thread.close()
+    with Wearer() as thread:
+        yield thread
 
 
 def test_live_hold(wearer: Wearer, tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ import struct
 import subprocess
 import sys
 import termios
-import tty
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,37 +21,25 @@ import pytest
 from edgepose.formats.recordings.csv_npz import read_recording, write_csv, write_npz
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import open_source
+from tests.support.ports import Port
+from tests.support.processes import simulated
+from tests.support.terminals import rest_of
 
 REAL = Path(__file__).parents[2] / "data" / "imu" / "six-sites-3s.npz"
-SIMULATOR = Path(__file__).parents[3] / "tools" / "simulate.py"
 
 
 @contextlib.contextmanager
 def rig(*flags: object) -> Iterator[str]:
     """Name of a port on which six simulated sensors send a real recording, then its last sample."""
-    process = subprocess.Popen(
-        [sys.executable, SIMULATOR, REAL, *map(str, flags)],
-        text=True,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-    )
-    try:
-        yield process.stdout.readline().removeprefix("port ").strip()
-    finally:
-        process.kill()
-        process.communicate()
+    with simulated(REAL, *flags) as (_, port):
+        yield port
 
 
 @contextlib.contextmanager
 def silent_port() -> Iterator[str]:
     """Name of a port on which nothing comes."""
-    master, slave = pty.openpty()
-    tty.setraw(slave)
-    try:
-        yield os.ttyname(slave)
-    finally:
-        os.close(master)
-        os.close(slave)
+    with Port() as port:
+        yield port.name
 
 
 def table(text: str) -> dict[str, list[str]]:
@@ -215,9 +202,7 @@ class Terminal:
 
     def rest(self) -> int:
         """Reads to the end; the exit code."""
-        with contextlib.suppress(OSError):
-            while more := os.read(self.master, 4096):
-                self._read += more
+        self._read += rest_of(self.master)
         return self.process.wait()
 
     def press(self, keys: bytes) -> None:

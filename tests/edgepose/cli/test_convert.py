@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import math
 import os
-import pty
 import re
 import resource
 import shlex
@@ -40,6 +39,7 @@ from firmware_protocols import native_can
 from firmware_protocols.native import encode
 from firmware_protocols.native_packet import Packet
 from firmware_protocols.sample import GRAVITY
+from tests.support.terminals import on_a_terminal
 
 REAL = Path(__file__).parents[2] / "data" / "imu" / "six-sites-3s.npz"
 DOCS = Path(__file__).parents[3] / "docs" / "guide" / "recordings.md"
@@ -367,21 +367,9 @@ def test_outputs_touch_no_other_file(command, tmp_path):
 
 
 def test_a_bar_on_a_terminal(tmp_path):
-    terminal, other = pty.openpty()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "edgepose", "convert", str(REAL), "--to", "npz", "--out", str(tmp_path)],
-        stdout=subprocess.DEVNULL,
-        stderr=other,
-    )
-    os.close(other)
-    said = b""
-    try:
-        while more := os.read(terminal, 4096):
-            said += more
-    except OSError:  # the other end is closed
-        pass
-    os.close(terminal)
-    assert process.wait(60) == 0
+    words = ["convert", REAL, "--to", "npz", "--out", tmp_path]
+    code, said = on_a_terminal([sys.executable, "-m", "edgepose", *words], stdout=subprocess.DEVNULL)
+    assert code == 0
     assert b"Converting" in said
     assert b"1/1" in said
 

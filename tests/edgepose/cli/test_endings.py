@@ -27,6 +27,7 @@ from edgepose.formats.recordings.csv_npz import read_recording, samples
 from edgepose.utils.safe_pickle import read_pickle
 from firmware_protocols import native_can
 from firmware_protocols.native_packet import Packet
+from tests.support.terminals import on_a_terminal
 
 RUN = [sys.executable, "-m", "edgepose", "run", "--model", "rnn"]
 LIMIT_S = 60.0
@@ -447,29 +448,6 @@ def test_a_user_without_a_home(tmp_path):
 ESCAPES = "\x1b]0;owned\x07\x1b[2J\x9b31m\u202e"
 
 
-def on_a_terminal(*words: object, cwd: Path) -> bytes:
-    """All that a command writes on a terminal, to its end."""
-    master, slave = pty.openpty()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "edgepose", *map(str, words)],
-        cwd=cwd,
-        stdin=subprocess.DEVNULL,
-        stdout=slave,
-        stderr=slave,
-    )
-    os.close(slave)
-    text = b""
-    try:
-        while piece := os.read(master, 4096):
-            text += piece
-    except OSError:  # its end
-        pass
-    finally:
-        process.wait(LIMIT_S)
-        os.close(master)
-    return text
-
-
 OWN = re.compile(rb"\x1b\[(K|\?25[hl]|\?1049[hl]|[HJ]|\d*m)")
 """What the program itself draws with: the rest of a line, the cursor, colours."""
 
@@ -512,7 +490,8 @@ def test_escape_sequences_of_others_do_not_reach_a_terminal(wearer, tmp_path, wo
     (tmp_path / "folder" / f"{ESCAPES}.csv").write_text("nothing\n")
     clip = Path(__file__).parents[3] / "tools" / "data" / "09_12.bvh"
     stands_for = {"REC": wearer.short, "CAL": wearer.calibration, "CLIP": clip}
-    text = on_a_terminal(*(stands_for.get(word, word) for word in words), cwd=tmp_path)
+    words = [stands_for.get(word, word) for word in words]
+    _, text = on_a_terminal([sys.executable, "-m", "edgepose", *words], cwd=tmp_path)
     assert text
     assert (b"Traceback" in text) == ("--debug" in words)
     rest = OWN.sub(b"", text)

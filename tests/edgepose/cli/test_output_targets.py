@@ -23,29 +23,20 @@ from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
 from edgepose.formats.bvh import read_bvh
 from edgepose.formats.poses.reading import read_poses
-from edgepose.formats.recordings.csv_npz import Recording, SensorData, read_recording, write_npz
+from edgepose.formats.recordings.csv_npz import read_recording, write_npz
 from edgepose.pose import PoseFrame
 from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.npz import NpzSink
 from edgepose.utils.durable_files import replace_file, write_whole
 from edgepose.utils.growing_files import GrowingFile
 from edgepose.utils.output_targets import descriptor, find_target, has_reader
+from tests.support.recordings import part
 
 OLD = b"what was there before\n"
 
 
 def make_pose(index: int) -> PoseFrame:
     return PoseFrame(index, index / 60, "ok", np.tile(np.eye(3, dtype=np.float32), (24, 1, 1)), np.zeros(24))
-
-
-def part(recording: Recording, start_s: float, end_s: float) -> Recording:
-    """A stretch of a recording."""
-
-    def cut(data: SensorData) -> SensorData:
-        rows = (data.time_s >= start_s) & (data.time_s < end_s)
-        return SensorData(*(None if column is None else column[rows] for column in data))
-
-    return Recording({name: cut(data) for name, data in recording.sensors.items()}, recording.metadata)
 
 
 @pytest.fixture(scope="module")

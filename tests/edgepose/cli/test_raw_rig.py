@@ -25,11 +25,13 @@ from edgepose.calibration import EXERCISE_S, ROUTINE, load_calibration
 from edgepose.cli.commands.calibrate import calibrate
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.reading import read_poses
-from edgepose.formats.recordings.csv_npz import Recording, SensorData, read_recording, write_npz
 from edgepose.placements import PLACEMENTS
 from edgepose.skeleton import local_from_global
 from edgepose_export.mocap import read_motion, resample
 from edgepose_export.synthesis.heading_routine import with_exercises
+from tests.support.datagrams import free_address
+from tests.support.recordings import write_part
+from tests.support.terminals import own_terminal
 
 SIMULATOR = Path(__file__).parents[3] / "tools" / "simulate.py"
 CLIP = SIMULATOR.parent / "data" / "09_12.bvh"
@@ -57,7 +59,7 @@ def rig(tmp_path_factory) -> Rig:
     """3 s of standing, the exercises, 2 s of standing, and 5 s of the clip."""
     folder = tmp_path_factory.mktemp("raw")
     simulate("--exercises", "--mounting", 7, "--raw", 6, "--write", folder / "whole.npz")
-    raw = part(folder / "whole.npz", STAND_S - 3.0, CLIP_S + 5.0, folder / "raw.npz")
+    raw = write_part(folder / "whole.npz", STAND_S - 3.0, CLIP_S + 5.0, folder / "raw.npz")
     result = calibrated(
         *("--file", raw, "--filter", "kalman", "--from", STAND_S - 2.5, "--hold", 2.4),
         *("--heading-reset", "motion", "--motion", "6:26", "--out", folder / "calibration.json"),
@@ -114,7 +116,7 @@ def test_a_run_with_another_filter_is_refused(command, rig, tmp_path, words, say
 
 
 def test_a_calibration_from_another_recording_is_told(command, rig, tmp_path):
-    other = part(rig.raw, STAND_S, STAND_S + 2.0, tmp_path / "other.npz")
+    other = write_part(rig.raw, STAND_S, STAND_S + 2.0, tmp_path / "other.npz")
     words = ("--calibration", rig.calibration, "--filter", "kalman", "--model", "rnn")
     result = command("run", "--file", other, *words, "--csv", tmp_path / "x.csv")
     assert result.returncode == 0, result.stderr
@@ -155,7 +157,7 @@ def test_calibrations_that_would_be_wrong_are_refused(rig, tmp_path, words, says
 def test_magnetometers_give_a_north_and_make_a_reset_needless(command, tmp_path):
     short, out = tmp_path / "short.npz", tmp_path / "calib.json"
     simulate("--raw", 9, "--write", tmp_path / "whole.npz")
-    part(tmp_path / "whole.npz", 0.0, 6.0, short)
+    write_part(tmp_path / "whole.npz", 0.0, 6.0, short)
     held = ("--file", short, "--filter", "kalman", "--from", 2, "--hold", 3)
     result = calibrated(*held, "--body-frame", "heading:0", "--out", out)
     assert result.exit_code == 0, result
@@ -199,29 +201,16 @@ class Terminal(threading.Thread):
         return termios.tcgetattr(self.inside)[:4]
 
 
-def part(path: Path, start_s: float, end_s: float, out: Path) -> Path:
-    """A stretch of a recording."""
-
-    def cut(data: SensorData) -> SensorData:
-        rows = (data.time_s >= start_s) & (data.time_s < end_s)
-        return SensorData(*(None if column is None else column[rows] for column in data))
-
-    recording = read_recording(path)
-    write_npz(out, Recording({name: cut(data) for name, data in recording.sensors.items()}, {}))
-    return out
-
-
 def said(process: subprocess.Popen, word: str) -> str:
     return next(line.split()[1] for line in process.stdout if line.startswith(f"{word} "))
 
 
 def test_a_live_run_begins_with_the_pose_and_re_zeroes_on_request(rig, tmp_path):
     """Standing, then four seconds of the clip; the filter begins anew, with any headings."""
-    clip = part(rig.raw, CLIP_S - 1.5, CLIP_S + 4.0, tmp_path / "clip.npz")
+    clip = write_part(rig.raw, CLIP_S - 1.5, CLIP_S + 4.0, tmp_path / "clip.npz")
     poses, terminal = tmp_path / "poses.csv", Terminal()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        control = free.getsockname()
+    address = free_address(socket.SOCK_DGRAM)
+    control = ("127.0.0.1", int(address.rpartition(":")[2]))
     simulator = subprocess.Popen(
         [sys.executable, str(SIMULATOR), str(clip), "--stand"],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
@@ -230,7 +219,7 @@ def test_a_live_run_begins_with_the_pose_and_re_zeroes_on_request(rig, tmp_path)
     run = subprocess.Popen(
         [sys.executable, "-m", "edgepose", "run", "--port", said(simulator, "port"), "--filter", "kalman",
          "--calibration", str(rig.calibration), "--model", "rnn", "--csv", str(poses),
-         "--control", f"127.0.0.1:{control[1]}"],
+         "--control", address],
         stdin=terminal.inside, stdout=terminal.inside, stderr=terminal.inside, preexec_fn=own_terminal,
     )  # fmt: skip
     terminal.start()
@@ -270,14 +259,6 @@ def test_a_live_run_begins_with_the_pose_and_re_zeroes_on_request(rig, tmp_path)
     true = true_poses(time_s[moving] - begin + CLIP_S - 1.5)
     assert moving.sum() > 200
     assert joint_angle_error(found[moving], true).mean() < 9.0
-
-
-def own_terminal() -> None:
-    """In a new process: the terminal on its standard input becomes its own, as a shell's is."""
-    import fcntl
-
-    os.setsid()
-    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 
 
 @pytest.mark.parametrize("ending", ["pass", "raise RuntimeError('a crash')", "os.kill(os.getpid(), 2)"])

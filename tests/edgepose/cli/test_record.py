@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-import pty
 import re
 import resource
 import signal
@@ -12,7 +9,6 @@ import subprocess
 import sys
 import threading
 import time
-import tty
 from pathlib import Path
 
 import can
@@ -29,57 +25,31 @@ from edgepose.sources import open_source
 from firmware_protocols import native_can
 from firmware_protocols.native import encode
 from firmware_protocols.native_packet import Packet
+from tests.support.ports import Port, Sender
+from tests.support.processes import end, start
+from tests.support.terminals import on_a_terminal
 
 REAL = Path(__file__).parents[2] / "data" / "imu" / "six-sites-3s.npz"
 
 
-class Rig(threading.Thread):
-    """Six devices on a pty that send their rows of a recording about 100 times a second; one packet in 21 is
-    lost."""
+class Rig(Sender):
+    """Six devices that send their rows of a recording about 100 times a second; one packet in 21 is lost."""
 
     def __init__(self) -> None:
-        super().__init__(daemon=True)
-        self.master, self.slave = pty.openpty()
-        tty.setraw(self.slave)
-        os.set_blocking(self.master, False)
-        self.port = os.ttyname(self.slave)
+        (self.line,) = ports = (Port(),)
+        super().__init__(*ports)
+        self.port = self.line.name
         self.silent: set[int] = set()
-        self._left = threading.Event()
         self._rows = list(samples(read_recording(REAL)))
 
-    def run(self) -> None:
-        start_s = time.monotonic()
-        count = 0
-        while not self._left.wait(0.01):
-            t_us = int((time.monotonic() - start_s) * 1e6)
-            at = 6 * count % len(self._rows)
-            packets = [
-                Packet(row.sensor, count + count // 20, t_us, row.quat, row.acc, row.gyr)
-                for row in self._rows[at : at + 6]
-                if row.sensor not in self.silent
-            ]
-            count += 1
-            with contextlib.suppress(BlockingIOError):  # nobody reads at the moment
-                os.write(self.master, b"".join(map(encode, packets)))
-
-    def unplug(self) -> None:
-        self._left.set()
-        self.join()
-        os.close(self.master)
-
-    def __enter__(self) -> Rig:
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for step in (self.unplug, lambda: os.close(self.slave)):
-            with contextlib.suppress(OSError):  # it may have been unplugged
-                step()
-
-
-def start(*words: object, **options: object) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "edgepose", "record", *map(str, words)]
-    return subprocess.Popen(command, text=True, **{"stderr": subprocess.PIPE} | options)
+    def send(self, k: int) -> None:
+        at = 6 * k % len(self._rows)
+        packets = [
+            Packet(row.sensor, k + k // 20, int(self.elapsed_s * 1e6), row.quat, row.acc, row.gyr)
+            for row in self._rows[at : at + 6]
+            if row.sensor not in self.silent
+        ]
+        self.line.write(b"".join(map(encode, packets)))
 
 
 def until(process: subprocess.Popen[str], file: Path, size: int) -> None:
@@ -87,15 +57,6 @@ def until(process: subprocess.Popen[str], file: Path, size: int) -> None:
     while not file.exists() or file.stat().st_size < size:
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.02)
-
-
-def end(process: subprocess.Popen[str]) -> tuple[int, str]:
-    try:
-        _, errors = process.communicate(timeout=120)
-    finally:
-        process.kill()  # one that hangs would take the ports of other tests
-    assert "Traceback" not in errors
-    return process.returncode, errors
 
 
 def good(recording) -> int:
@@ -131,16 +92,10 @@ def same(a, b, tolerance: float = 1e-6) -> None:
 
 def test_seconds_progress_and_counts(tmp_path):
     file = tmp_path / "walk.csv"
-    terminal, other = pty.openpty()
     with Rig() as rig:
-        process = start(file, "--port", rig.port, "--protocol", "native", "--seconds", 1.5, stderr=other)
-        os.close(other)
-        text = b""
-        with contextlib.suppress(OSError):  # the other end is closed
-            while more := os.read(terminal, 4096):
-                text += more
-        os.close(terminal)
-        assert process.wait(120) == 0, text
+        words = [file, "--port", rig.port, "--protocol", "native", "--seconds", 1.5]
+        code, text = on_a_terminal([sys.executable, "-m", "edgepose", "record", *words])
+    assert code == 0, text
     said = text.decode()
     recording = read_recording(file)
     count = good(recording)
@@ -164,7 +119,7 @@ def test_a_stop_leaves_a_whole_file(tmp_path, name, number):
     file = tmp_path / name
     growing = tmp_path / "walk.part.csv" if name == "walk.npz" else file
     with Rig() as rig:
-        process = start(file, "--port", rig.port, "--protocol", "native")
+        process = start("record", file, "--port", rig.port, "--protocol", "native")
         until(process, growing, 3000)
         process.send_signal(number)
         code, errors = end(process)
@@ -179,7 +134,7 @@ def test_a_stop_leaves_a_whole_file(tmp_path, name, number):
 
 def test_standard_output(tmp_path):
     with Rig() as rig:
-        process = start("-", "--port", rig.port, "--seconds", 0.5, stdout=subprocess.PIPE)
+        process = start("record", "-", "--port", rig.port, "--seconds", 0.5, stdout=subprocess.PIPE)
         text, errors = process.communicate(timeout=120)
     assert process.returncode == 0, errors
     (tmp_path / "walk.csv").write_text(text)
@@ -189,7 +144,7 @@ def test_standard_output(tmp_path):
 def test_a_sensor_that_is_silent_is_told(tmp_path):
     with Rig() as rig:
         rig.silent = {4}
-        process = start(tmp_path / "walk.npz", "--port", rig.port, "--seconds", 0.5)
+        process = start("record", tmp_path / "walk.npz", "--port", rig.port, "--seconds", 0.5)
         code, errors = end(process)
     assert code == 0
     assert "warning: nothing came from head" in errors
@@ -324,7 +279,7 @@ def test_kill_in_the_middle(command, tmp_path, name):
     file = tmp_path / name
     growing = tmp_path / "walk.part.csv" if name == "walk.npz" else file
     with Rig() as rig:
-        process = start(file, "--port", rig.port, "--protocol", "native")
+        process = start("record", file, "--port", rig.port, "--protocol", "native")
         until(process, growing, 3000)
         seen = growing.stat().st_size
         process.kill()
@@ -351,7 +306,7 @@ def test_kill_in_the_middle(command, tmp_path, name):
 def test_a_port_that_is_unplugged(tmp_path):
     file = tmp_path / "walk.csv"
     with Rig() as rig:
-        process = start(file, "--port", rig.port, "--protocol", "native")
+        process = start("record", file, "--port", rig.port, "--protocol", "native")
         until(process, file, 3000)
         rig.unplug()
         size = file.stat().st_size
@@ -368,7 +323,7 @@ def test_a_disk_that_fills_up(tmp_path, name):
     file = tmp_path / name
     limit = 50_000
     process = start(
-        *(file, "--file", REAL),
+        *("record", file, "--file", REAL),
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
     )
     code, errors = end(process)

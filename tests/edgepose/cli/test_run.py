@@ -12,10 +12,7 @@ import resource
 import signal
 import socket
 import subprocess
-import sys
-import threading
 import time
-import tty
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -35,47 +32,12 @@ from edgepose.skeleton import JOINTS, PARENTS
 from firmware_protocols import native_can
 from firmware_protocols.native import encode
 from firmware_protocols.native_packet import Packet
+from tests.support.datagrams import Listener
+from tests.support.ports import Port, Sender
+from tests.support.processes import end, simulated, start
+from tests.support.terminals import rest_of
 
-SIMULATOR = Path(__file__).parents[3] / "tools" / "simulate.py"
 BONES = [18, 19, 4, 5, 15, 0]  # those with the sensors, in the order of PLACEMENTS
-
-
-class Listener(threading.Thread):
-    """Receives datagrams on a free port of this machine until it is left."""
-
-    def __init__(self) -> None:
-        super().__init__(daemon=True)
-        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.socket.bind(("127.0.0.1", 0))
-        self.socket.settimeout(0.05)
-        self.address = f"127.0.0.1:{self.socket.getsockname()[1]}"
-        self.datagrams: list[bytes] = []
-        self.first = threading.Event()
-        self._left = False
-
-    def run(self) -> None:
-        while True:
-            try:
-                self.datagrams.append(self.socket.recv(65536))
-                self.first.set()
-            except TimeoutError:
-                if self._left:
-                    return
-
-    def wait_for(self, status: str, poses: int) -> None:
-        """Returns when so many more poses of a status have come."""
-        seen = len(self.datagrams)
-        while [json.loads(d)["status"] for d in self.datagrams[seen:]].count(status) < poses:
-            time.sleep(0.02)
-
-    def __enter__(self) -> Listener:
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._left = True
-        self.join()
-        self.socket.close()
 
 
 def whole(path: Path) -> tuple[np.ndarray, np.ndarray, list[str], np.ndarray]:
@@ -245,14 +207,19 @@ def test_datagrams_that_nobody_receives_are_told(command, wearer):
     assert 0 < int(told[1]) <= 180
 
 
-def start(*words: object, **options: object) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "edgepose", "run", *map(str, words)]
-    return subprocess.Popen(command, text=True, **{"stderr": subprocess.PIPE} | options)
-
-
 def test_the_reader_of_standard_output_ends_early(wearer):
     process = start(
-        *("--file", wearer.recording, "--calibration", wearer.calibration, "--model", "rnn", "--csv", "-"),
+        *(
+            "run",
+            "--file",
+            wearer.recording,
+            "--calibration",
+            wearer.calibration,
+            "--model",
+            "rnn",
+            "--csv",
+            "-",
+        ),
         stdout=subprocess.PIPE,
     )
     header, first, second = (process.stdout.readline() for _ in range(3))
@@ -271,7 +238,7 @@ def test_ctrl_c_at_a_terminal_in_the_middle_of_a_frame(wearer, tmp_path):
     file = tmp_path / "poses.csv"
     terminal, other = pty.openpty()
     process = start(
-        *("--file", wearer.recording, "--calibration", wearer.calibration, "--csv", file),
+        *("run", "--file", wearer.recording, "--calibration", wearer.calibration, "--csv", file),
         *("--online", "window", "--past", 60),
         stderr=other,
     )
@@ -281,9 +248,7 @@ def test_ctrl_c_at_a_terminal_in_the_middle_of_a_frame(wearer, tmp_path):
         while b" poses, " not in text:
             text += os.read(terminal, 4096)
         process.send_signal(signal.SIGINT)
-        with contextlib.suppress(OSError):  # the other end is closed
-            while more := os.read(terminal, 4096):
-                text += more
+        text += rest_of(terminal)
         assert process.wait(60) == 0
     finally:
         process.kill()
@@ -321,7 +286,17 @@ def test_a_disk_that_fills_up(wearer, tmp_path):
     file = tmp_path / "poses.csv"
     limit = 60_000
     process = start(
-        *("--file", wearer.short, "--calibration", wearer.calibration, "--model", "rnn", "--csv", file),
+        *(
+            "run",
+            "--file",
+            wearer.short,
+            "--calibration",
+            wearer.calibration,
+            "--model",
+            "rnn",
+            "--csv",
+            file,
+        ),
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
     )
     _, errors = process.communicate(timeout=60)
@@ -370,8 +345,8 @@ def broken_archive(tmp_path):
 # --- live ---------------------------------------------------------------------------------------------------
 
 
-class Rig(threading.Thread):
-    """Six devices on a pty; each sends its row of a recording about 100 times a second, with its own count.
+class Rig(Sender):
+    """Six devices on a line; each sends its row of a recording about 100 times a second, with its own count.
 
     Attributes:
         silent: sensors that are switched off.
@@ -380,58 +355,38 @@ class Rig(threading.Thread):
     """
 
     def __init__(self, recording: Path, wire: Callable[[Packet], bytes] = encode) -> None:
-        super().__init__(daemon=True)
+        (self.line,) = ports = (Port(),)
+        super().__init__(*ports)
         self._wire = wire
-        self.master, self.slave = pty.openpty()
-        tty.setraw(self.slave)
-        os.set_blocking(self.master, False)
-        self.port = os.ttyname(self.slave)
+        self.port = self.line.name
         self.silent: set[int] = set()
         self.corrupt = 0
         self.noise = b""
-        self._stop_asked = threading.Event()
         sensors = read_recording(recording).sensors.values()
         self._rows = [list(zip(s.quat.tolist(), s.acc.tolist(), strict=True)) for s in sensors]
+        self._counts = [0] * len(PLACEMENTS)
 
-    def run(self) -> None:
-        start_s = time.monotonic()
-        counts = [0] * len(PLACEMENTS)
-        packets = 0
-        while not self._stop_asked.wait(0.01):
-            t_us = int((time.monotonic() - start_s) * 1e6)
-            for i, rows in enumerate(self._rows):
-                if i in self.silent:
-                    continue
-                data = self._wire(Packet(i, counts[i], t_us, *map(tuple, rows[counts[i] % len(rows)])))
-                counts[i] += 1
-                packets += 1
-                if self.corrupt and packets % 7 == 0:
-                    self.corrupt -= 1
-                    middle = len(data) // 2
-                    data = data[:middle] + bytes([data[middle] ^ 0x55 or 0x55]) + data[middle + 1 :]
-                self._send(self.noise + data)
-                self.noise = b""
+    def send(self, k: int) -> None:
+        t_us = int(self.elapsed_s * 1e6)
+        for i, rows in enumerate(self._rows):
+            if i in self.silent:
+                continue
+            count = self._counts[i]
+            data = self._wire(Packet(i, count, t_us, *map(tuple, rows[count % len(rows)])))
+            self._counts[i] += 1
+            if self.corrupt and sum(self._counts) % 7 == 0:
+                self.corrupt -= 1
+                middle = len(data) // 2
+                data = data[:middle] + bytes([data[middle] ^ 0x55 or 0x55]) + data[middle + 1 :]
+            self._write(self.noise + data)
+            self.noise = b""
 
-    def _send(self, data: bytes) -> None:
-        while data and not self._stop_asked.is_set():
+    def _write(self, data: bytes) -> None:
+        while data and not self.left.is_set():
             try:
-                data = data[os.write(self.master, data) :]
+                data = data[os.write(self.line.master, data) :]
             except BlockingIOError:  # nobody reads at the moment
                 time.sleep(0.001)
-
-    def unplug(self) -> None:
-        self._stop_asked.set()
-        self.join()
-        os.close(self.master)
-
-    def __enter__(self) -> Rig:
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for step in (self.unplug, lambda: os.close(self.slave)):
-            with contextlib.suppress(OSError):  # it may have been unplugged
-                step()
 
 
 @contextlib.contextmanager
@@ -439,6 +394,7 @@ def live(wearer, port: str, listener: Listener, file: Path):
     """A run on a port that has given its first pose."""
     process = start(
         *(
+            "run",
             "--can" if port.startswith("slcan:") else "--port",
             port,
             "--calibration",
@@ -456,14 +412,6 @@ def live(wearer, port: str, listener: Listener, file: Path):
         process.kill()
         process.wait()
         process.stderr.close()
-
-
-def end(process: subprocess.Popen[str]) -> tuple[int, str]:
-    try:
-        _, errors = process.communicate(timeout=60)
-    finally:
-        process.kill()  # one that hangs would take the ports of other tests
-    return process.returncode, errors
 
 
 def test_live_with_damage_on_the_line_a_sensor_that_pauses_and_ctrl_c(wearer, tmp_path):
@@ -500,20 +448,16 @@ def test_live_with_damage_on_the_line_a_sensor_that_pauses_and_ctrl_c(wearer, tm
 
 def test_live_from_the_simulator_until_sigterm(wearer, tmp_path):
     file = tmp_path / "poses.csv"
-    simulator = subprocess.Popen(
-        [sys.executable, str(SIMULATOR), str(wearer.short), "--stand"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    with simulator, Listener() as listener:
-        port = simulator.stdout.readline().split()[1]
-        with live(wearer, port, listener, file) as run:
-            simulator.stdin.write("go\n")
-            simulator.stdin.flush()
-            said = [simulator.stdout.readline().split() for _ in range(2)]
-            run.send_signal(signal.SIGTERM)
-            code, errors = end(run)
+    with (
+        simulated(wearer.short, "--stand") as (simulator, port),
+        Listener() as listener,
+        live(wearer, port, listener, file) as run,
+    ):
+        simulator.stdin.write("go\n")
+        simulator.stdin.flush()
+        said = [simulator.stdout.readline().split() for _ in range(2)]
+        run.send_signal(signal.SIGTERM)
+        code, errors = end(run)
     assert code == 0, errors
     assert [words[0] for words in said] == ["started", "ended"]
     frames, time_s, status, _ = whole(file)
@@ -542,7 +486,6 @@ def test_a_line_that_is_unplugged_and_comes_back(wearer, tmp_path, monkeypatch, 
             time.sleep(0.5)
             link.unlink()
             first.unplug()
-            os.close(first.slave)
             assert run.stderr.readline().startswith("running rnn")
             assert run.stderr.readline() == f"{name}: gone; the run goes on and waits for it\n"
             listener.wait_for(f"held {' '.join(PLACEMENTS)}", 30)
@@ -572,15 +515,14 @@ def test_silence_a_wrong_speed_and_a_sensor_that_never_reports(wearer, tmp_path)
         five.silent = {PLACEMENTS.index("left_lower_leg")}
         runs = [
             start(
-                *("--port", rig.port, "--calibration", wearer.calibration, "--model", "rnn"),
+                *("run", "--port", rig.port, "--calibration", wearer.calibration, "--model", "rnn"),
                 *("--csv", tmp_path / f"{i}.csv"),
             )
             for i, rig in enumerate((quiet, noisy, five))
         ]
         try:
             while any(run.poll() is None for run in runs):
-                with contextlib.suppress(BlockingIOError):
-                    os.write(noisy.master, bytes(source.randrange(256) for _ in range(50)))
+                noisy.line.write(bytes(source.randrange(256) for _ in range(50)))
                 time.sleep(0.01)
             codes, texts = zip(*map(end, runs), strict=True)
         finally:

@@ -7,7 +7,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -20,46 +19,18 @@ from edgepose.formats.joint_tree import forward
 from edgepose.formats.poses.reading import read_poses
 from edgepose.skeleton import default_body, forward_kinematics
 from edgepose_export.mocap import read_motion
-
-
-class Mailbox(threading.Thread):
-    """Takes datagrams at a free port of this machine."""
-
-    def __init__(self) -> None:
-        super().__init__(daemon=True)
-        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.socket.bind(("127.0.0.1", 0))
-        self.address = f"127.0.0.1:{self.socket.getsockname()[1]}"
-        self.datagrams: list[bytes] = []
-        self.start()
-
-    def run(self) -> None:
-        while data := self.socket.recv(65536):
-            self.datagrams.append(data)
-
-    def close(self) -> list[bytes]:
-        """All that has come."""
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-            sender.sendto(b"", self.socket.getsockname())
-        self.join()
-        self.socket.close()
-        return self.datagrams
-
-
-def free_address() -> str:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return f"127.0.0.1:{free.getsockname()[1]}"
+from tests.support.datagrams import Listener, free_address
 
 
 def test_all_outputs_say_the_same(command, wearer, tmp_path):
-    mailbox = Mailbox()
-    result = command(
-        *("run", "--file", wearer.short, "--realtime", "--calibration", wearer.calibration, "--model", "rnn"),
-        *("--csv", tmp_path / "a.csv", "--npz", tmp_path / "a.npz", "--bvh", tmp_path / "a.bvh"),
-        *("--osc", mailbox.address, "--tcp", free_address(), "--height", "1.9"),
-    )
-    datagrams = mailbox.close()
+    with Listener() as mailbox:
+        result = command(
+            *("run", "--file", wearer.short, "--realtime"),
+            *("--calibration", wearer.calibration, "--model", "rnn"),
+            *("--csv", tmp_path / "a.csv", "--npz", tmp_path / "a.npz", "--bvh", tmp_path / "a.bvh"),
+            *("--osc", mailbox.address, "--tcp", free_address(), "--height", "1.9"),
+        )
+    datagrams = mailbox.datagrams
     assert result.returncode == 0, result.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.bvh", "a.csv", "a.npz"]
     poses = read_poses(tmp_path / "a.csv")

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import os
 import pty
 import re
 import signal
-import socket
 import subprocess
 import sys
-import termios
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +20,7 @@ from edgepose.calibration.rezero import Headings
 from edgepose.cli.options.wearer import read_rigs
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.reading import read_poses
-from edgepose.formats.recordings.csv_npz import SensorData, read_recording, write_csv, write_npz
+from edgepose.formats.recordings.csv_npz import read_recording, write_csv
 from edgepose.inference.engine import StreamEngine
 from edgepose.pipeline.frame_synchronizer import FrameClock
 from edgepose.pipeline.run import Walk, run
@@ -31,9 +28,12 @@ from edgepose.placements import PLACEMENTS
 from edgepose.sinks.csv import CsvSink
 from edgepose.sources import open_source
 from edgepose_export.networks.shape import NetworkShape
+from tests.support.datagrams import Listener
+from tests.support.processes import simulated
+from tests.support.recordings import write_part
+from tests.support.terminals import own_terminal
 
 PAGE = (Path(__file__).parents[3] / "docs" / "guide" / "sensors.md").read_text(encoding="utf-8")
-SIMULATOR = Path(__file__).parents[3] / "tools" / "simulate.py"
 ALL_HELD = f"held {' '.join(PLACEMENTS)}"
 
 
@@ -259,17 +259,6 @@ def test_the_example_of_a_rig_file_is_one(tmp_path):
 # --- recordings ---------------------------------------------------------------------------------------------
 
 
-def cut(file: Path, start_s: float, end_s: float, out: Path) -> Path:
-    """A stretch of a recording."""
-    recording = read_recording(file)
-    sensors = {}
-    for name, data in recording.sensors.items():
-        rows = (data.time_s >= start_s) & (data.time_s < end_s)
-        sensors[name] = SensorData(*(None if column is None else column[rows] for column in data))
-    write_npz(out, recording._replace(sensors=sensors))
-    return out
-
-
 @pytest.mark.parametrize("kind", ["birnn", "rnn"])
 def test_wearers_get_the_poses_that_each_gets_alone(
     command, wearer, rig, write_archive, tiny, tmp_path, kind
@@ -279,8 +268,8 @@ def test_wearers_get_the_poses_that_each_gets_alone(
     window = (0, 0) if kind == "rnn" else (4, 2)
     files = {
         "anna": wearer.short,
-        "ben": cut(wearer.recording, 4.003, 5.501, tmp_path / "ben.npz"),
-        "cleo": cut(wearer.recording, 6.2, 6.21, tmp_path / "cleo.npz"),
+        "ben": write_part(wearer.recording, 4.003, 5.501, tmp_path / "ben.npz"),
+        "cleo": write_part(wearer.recording, 6.2, 6.21, tmp_path / "cleo.npz"),
     }
     rigs = [rig(name, file=str(file), rotations="matrix") for name, file in files.items()]
     result = command("run", *words(*rigs), "--model", model, "--trust", "--precision", "f32")
@@ -329,54 +318,14 @@ def test_a_wearer_whose_input_is_broken_costs_only_his_own(command, wearer, rig,
 # --- live ---------------------------------------------------------------------------------------------------
 
 
-@contextlib.contextmanager
-def simulator(recording: Path, protocol: str = "native"):
-    """Simulated sensors that stand still, and their port or bus; killing them unplugs it."""
-    process = subprocess.Popen(
-        [sys.executable, str(SIMULATOR), str(recording), "--stand", "--protocol", protocol],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    with process:
-        try:
-            yield process, process.stdout.readline().split()[1]
-        finally:
-            process.kill()
-
-
-class Receiver:
-    """Reads the datagrams of one wearer."""
-
-    def __init__(self) -> None:
-        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.socket.bind(("127.0.0.1", 0))
-        self.socket.settimeout(60.0)
-        self.address = f"127.0.0.1:{self.socket.getsockname()[1]}"
-
-    def wait_for(self, status: str, poses: int = 20) -> None:
-        """Returns after so many poses of a status from now on."""
-        self.socket.setblocking(False)
-        with contextlib.suppress(BlockingIOError):
-            while True:
-                self.socket.recv(65536)
-        self.socket.settimeout(60.0)
-        while poses:
-            poses -= json.loads(self.socket.recv(65536))["status"] == status
-
-    def __enter__(self) -> Receiver:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.socket.close()
-
-
 def test_a_port_that_is_unplugged_and_comes_back_costs_only_its_wearer(wearer, rig, tmp_path, monkeypatch):
     """The other has a CAN bus, which is read in another way."""
     monkeypatch.setenv("CAN_CONFIG", '{"sleep_after_open": 0.01}')  # python-can's own way to set this
     link, log = tmp_path / "hub", tmp_path / "told.txt"
     with contextlib.ExitStack() as stack:
-        receivers = [stack.enter_context(Receiver()) for _ in range(2)]
-        _, bus = stack.enter_context(simulator(wearer.short, "native-can"))
-        unplugged, first = stack.enter_context(simulator(wearer.short))
+        receivers = [stack.enter_context(Listener()) for _ in range(2)]
+        _, bus = stack.enter_context(simulated(wearer.short, "--stand", "--protocol", "native-can"))
+        unplugged, first = stack.enter_context(simulated(wearer.short, "--stand"))
         link.symlink_to(first)
         anna, ben = receivers
         rigs = [
@@ -387,16 +336,16 @@ def test_a_port_that_is_unplugged_and_comes_back_costs_only_its_wearer(wearer, r
         process = subprocess.Popen(command, stderr=stack.enter_context(log.open("w")))
         stack.callback(process.wait)
         stack.callback(process.kill)
-        anna.wait_for("ok")
-        ben.wait_for("ok")
+        anna.wait_for("ok", 20)
+        ben.wait_for("ok", 20)
         link.unlink()
         unplugged.kill()
-        ben.wait_for(ALL_HELD)
-        anna.wait_for("ok")
-        _, second = stack.enter_context(simulator(wearer.short))
+        ben.wait_for(ALL_HELD, 20)
+        anna.wait_for("ok", 20)
+        _, second = stack.enter_context(simulated(wearer.short, "--stand"))
         link.symlink_to(second)
-        ben.wait_for("ok")
-        anna.wait_for("ok")
+        ben.wait_for("ok", 20)
+        anna.wait_for("ok", 20)
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 0
     told = log.read_text()
@@ -412,7 +361,7 @@ def test_a_port_that_is_unplugged_and_comes_back_costs_only_its_wearer(wearer, r
 
 
 def test_recordings_at_their_own_pace(command, rig, tmp_path, wearer):
-    files = [cut(wearer.recording, 4.0, end_s, tmp_path / f"{end_s}.npz") for end_s in (5.0, 4.5)]
+    files = [write_part(wearer.recording, 4.0, end_s, tmp_path / f"{end_s}.npz") for end_s in (5.0, 4.5)]
     rigs = [
         rig(name, file=str(file), realtime=True) for name, file in zip(("anna", "ben"), files, strict=True)
     ]
@@ -455,9 +404,3 @@ with Keys() as keys:
         process.wait()
         os.close(outside)
     assert b"anna [3.0] [] ben [3.0] []" in screen
-
-
-def own_terminal() -> None:
-    """In a new process: the terminal on its standard input becomes its own, as a shell's is."""
-    os.setsid()
-    fcntl.ioctl(0, termios.TIOCSCTTY, 0)

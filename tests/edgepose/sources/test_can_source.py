@@ -1,13 +1,9 @@
 """CAN buses and logs of them: `virtual` ones, a slcan adapter on a pty, files; SocketCAN is not needed."""
 
-import contextlib
 import os
-import pty
 import re
-import threading
 import time
-import tty
-from itertools import count, pairwise
+from itertools import pairwise
 
 import can
 import pytest
@@ -20,6 +16,7 @@ from firmware_protocols import native_can
 from firmware_protocols.native_packet import Info, Packet
 from firmware_protocols.registry import PROTOCOLS
 from firmware_protocols.sample import Sample
+from tests.support.ports import Port, Sender
 
 QUAT = (0.6, 0.0, 0.8, 0.0)
 CAN = [name for name, protocol in PROTOCOLS.items() if protocol.transport == "can"]
@@ -47,29 +44,17 @@ def messages(name, first, n, start_s=0.0, **options):
     return result
 
 
-class Devices(threading.Thread):
+class Devices(Sender):
     """Sends six devices' messages 100 times a second until it is left."""
 
     def __init__(self, send, what):
-        super().__init__(daemon=True)
-        self.send = send
+        super().__init__()
+        self.give = send
         self.messages = what if callable(what) else lambda k: messages(what, k, 1)
-        self.left = threading.Event()
 
-    def run(self):
-        for k in count():
-            if self.left.wait(0.01):
-                return
-            for message in self.messages(k):
-                self.send(message)
-
-    def __enter__(self):
-        self.start()
-        return self
-
-    def __exit__(self, *_):
-        self.left.set()
-        self.join()
+    def send(self, k):
+        for message in self.messages(k):
+            self.give(message)
 
 
 def collect(source, n):
@@ -185,23 +170,16 @@ def slcan_line(message):
     return f"{head}{message.dlc}{message.data.hex()}\r".encode()
 
 
-class Adapter:
-    """A slcan adapter on a pty behind a symbolic link."""
+class Adapter(Port):
+    """A slcan adapter behind a symbolic link."""
 
     def __init__(self, path):
-        self.master, self.slave = pty.openpty()
-        tty.setraw(self.slave)
-        os.set_blocking(self.master, False)
+        super().__init__()
         path.unlink(missing_ok=True)
-        path.symlink_to(os.ttyname(self.slave))
+        path.symlink_to(self.name)
 
     def send(self, message):
-        with contextlib.suppress(BlockingIOError):  # nobody reads yet
-            os.write(self.master, slcan_line(message))
-
-    def unplug(self):
-        os.close(self.master)
-        os.close(self.slave)
+        self.write(slcan_line(message))
 
 
 def test_a_bus_that_goes_and_comes_back(tmp_path, monkeypatch, caplog):
@@ -213,7 +191,7 @@ def test_a_bus_that_goes_and_comes_back(tmp_path, monkeypatch, caplog):
         batches = iter(source)
         with Devices(adapter.send, "hipnuc-canopen"):
             before = collect(batches, 100)
-        adapter.unplug()
+        adapter.close()
         while "gone" not in caplog.text or len(gap) < 5:
             now_s, samples = next(batches)
             before += samples
@@ -222,7 +200,7 @@ def test_a_bus_that_goes_and_comes_back(tmp_path, monkeypatch, caplog):
         adapter = Adapter(path)
         with Devices(adapter.send, "hipnuc-canopen"):
             after = collect(batches, 100)
-    adapter.unplug()
+    adapter.close()
     assert {sample.sensor for sample in after} == set(range(6))
     assert max(s.time_s for s in before) < min(s.time_s for s in after)
     told = [record.getMessage() for record in caplog.records if record.name.startswith("edgepose")]
@@ -240,7 +218,7 @@ def test_damaged_lines_of_an_adapter_cost_only_themselves(tmp_path, monkeypatch)
 
     with open_source(can=f"slcan:{tmp_path / 'adapter'}") as source, Devices(send, "hipnuc-canopen"):
         assert {sample.sensor for sample in collect(source, 100)} == set(range(6))
-    adapter.unplug()
+    adapter.close()
 
 
 # --- logs ---------------------------------------------------------------------------------------------------

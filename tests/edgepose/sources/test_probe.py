@@ -1,12 +1,6 @@
 """`edgepose devices --probe`: what is on a port or bus that nobody has described."""
 
-import contextlib
-import os
-import pty
 import re
-import threading
-import tty
-from itertools import count
 
 import pytest
 
@@ -14,48 +8,29 @@ from edgepose.errors import EdgeposeError
 from edgepose.sources.probe import BAUDS, probe_bus, probe_port
 from firmware_protocols.registry import PROTOCOLS
 from firmware_protocols.sample import Sample
+from tests.support.ports import Port, Sender
 
 
-class Devices(threading.Thread):
-    """Devices of one wire format on a pty, as bytes or as a slcan adapter's lines."""
+class Devices(Sender):
+    """Devices of one wire format on a line, as bytes or as a slcan adapter's lines."""
 
     def __init__(self, name, ids=(0,), rate=100, noise=False):
-        super().__init__(daemon=True)
-        self.protocol, self.ids, self.rate, self.noise = PROTOCOLS.get(name), ids, rate, noise
-        self.master, self.slave = pty.openpty()
-        tty.setraw(self.slave)
-        os.set_blocking(self.master, False)  # bytes that nobody reads are lost
-        self.port = os.ttyname(self.slave)
-        self.left = threading.Event()
+        (self.line,) = ports = (Port(),)
+        super().__init__(*ports, rate=rate)
+        self.protocol, self.ids, self.noise = PROTOCOLS.get(name), ids, noise
+        self.port = self.line.name
+        self.encode = self.protocol and self.protocol.encoder()
 
-    def run(self):
-        encode = self.protocol and self.protocol.encoder()
-        for k in count():
-            if self.left.wait(1 / self.rate):
-                return
-            for sensor in self.ids:
-                if self.noise:
-                    self.write(bytes([1 + (37 * k + i * k * k) % 255 for i in range(30)]))
-                    continue
-                sample = Sample(sensor, 10_000 * k, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 9.81), (0.0, 0.0, 0.0))
-                wire = encode(sample, k)
-                if self.protocol.transport == "can":
-                    wire = b"".join(b"t%03X%d%s\r" % (i, len(d), d.hex().encode()) for i, d, *_ in wire)
-                self.write(wire)
-
-    def write(self, wire):
-        with contextlib.suppress(BlockingIOError):
-            os.write(self.master, wire)
-
-    def __enter__(self):
-        self.start()
-        return self
-
-    def __exit__(self, *_):
-        self.left.set()
-        self.join()
-        os.close(self.master)
-        os.close(self.slave)
+    def send(self, k):
+        for sensor in self.ids:
+            if self.noise:
+                self.line.write(bytes([1 + (37 * k + i * k * k) % 255 for i in range(30)]))
+                continue
+            sample = Sample(sensor, 10_000 * k, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 9.81), (0.0, 0.0, 0.0))
+            wire = self.encode(sample, k)
+            if self.protocol.transport == "can":
+                wire = b"".join(b"t%03X%d%s\r" % (i, len(d), d.hex().encode()) for i, d, *_ in wire)
+            self.line.write(wire)
 
 
 def test_what_is_on_ports_and_buses(command, monkeypatch):

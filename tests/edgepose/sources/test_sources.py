@@ -1,13 +1,10 @@
 import contextlib
 import os
-import pty
 import re
 import select
-import threading
 import time
-import tty
 from collections import Counter
-from itertools import count, pairwise
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -25,18 +22,15 @@ from firmware_protocols.native import encode, encode_info
 from firmware_protocols.native_packet import Info, Packet
 from firmware_protocols.registry import PROTOCOLS
 from firmware_protocols.sample import Sample
+from tests.support.ports import Port, Sender
 
 REAL = Path(__file__).parents[2] / "data" / "imu" / "six-sites-3s.npz"
 
 
 @pytest.fixture
 def port():
-    master, slave = pty.openpty()
-    tty.setraw(slave)
-    yield master, os.ttyname(slave)
-    for fd in (master, slave):
-        with contextlib.suppress(OSError):  # a test unplugged it
-            os.close(fd)
+    with Port(blocking=True) as port:
+        yield port
 
 
 def packets(n, start_us=0, ids=range(6), period_us=10_000):
@@ -54,27 +48,18 @@ def packets(n, start_us=0, ids=range(6), period_us=10_000):
     ]
 
 
-class Device(threading.Thread):
+class Device(Sender):
     """Writes chunks at 100 Hz to the other end of a port, until told to stop."""
 
-    def __init__(self, master, chunks):
-        super().__init__(daemon=True)
-        self.master, self.chunks = master, chunks
-        self.stop = threading.Event()
+    def __init__(self, port, chunks):
+        super().__init__()
+        self.port, self.chunks = port, iter(chunks)
 
-    def run(self):
-        for chunk in self.chunks:
-            if self.stop.wait(0.01):
-                return
-            os.write(self.master, chunk)
-
-    def __enter__(self):
-        self.start()
-        return self
-
-    def __exit__(self, *_):
-        self.stop.set()
-        self.join()
+    def send(self, k):
+        if (chunk := next(self.chunks, None)) is None:
+            self.left.set()
+        else:
+            os.write(self.port.master, chunk)
 
 
 def chunks(n, **kwargs):
@@ -87,9 +72,9 @@ def chunks(n, **kwargs):
 
 
 def test_live_packets_become_samples_and_frames(port):
-    master, name = port
+    name = port.name
     got, frames = [], []
-    with open_source(port=name) as source, Device(master, chunks(200, start_us=(1 << 32) - 500_000)):
+    with open_source(port=name) as source, Device(port, chunks(200, start_us=(1 << 32) - 500_000)):
         clock = FrameClock()
         for now_s, batch in source:
             assert abs(now_s - time.time()) < 1.0
@@ -113,7 +98,7 @@ def test_live_packets_become_samples_and_frames(port):
 
 
 def test_silent_port_still_gives_batches(port):
-    with open_source(port=port[1]) as source:
+    with open_source(port=port.name) as source:
         batches = iter(source)
         times = [next(batches) for _ in range(5)]
     assert all(batch == [] for _, batch in times)
@@ -122,7 +107,7 @@ def test_silent_port_still_gives_batches(port):
 
 def test_a_source_that_does_not_wait(port, caplog):
     """Looked at whenever one likes; also while its port is gone and after it is back."""
-    master, name = port
+    name = port.name
     got = []
 
     def look_until(wanted):
@@ -135,9 +120,9 @@ def test_a_source_that_does_not_wait(port, caplog):
     with open_source(port=name, waits=False) as source:
         batches = iter(source)
         assert [next(batches)[1] for _ in range(100)] == [[]] * 100
-        with Device(master, chunks(300)):
+        with Device(port, chunks(300)):
             look_until(lambda: len(got) > 300)
-        os.close(master)
+        port.unplug()
         look_until(lambda: "gone; the run goes on" in caplog.text)
     assert {s.sensor for s in got} == set(range(6))
     for sensor in range(6):
@@ -148,7 +133,7 @@ def test_a_source_that_does_not_wait(port, caplog):
 
 def test_what_waits_behind_a_full_buffer_is_not_said_to_be_delivered(port):
     """The system shows 4 kB at a time."""
-    master, name = port
+    name = port.name
     data = b"".join(map(encode, packets(51)[6:]))
     assert 8192 < len(data) < 12_000
     got = []
@@ -156,14 +141,14 @@ def test_what_waits_behind_a_full_buffer_is_not_said_to_be_delivered(port):
         batches = iter(source)
         while not got:
             time.sleep(0.02)
-            os.write(master, encode(packets(1)[0]))
+            os.write(port.master, encode(packets(1)[0]))
             got += next(batches)[1]
         time.sleep(0.1)
         got += next(batches)[1]
         before = len(got)
         written = 0
         while written < len(data):
-            written += os.write(master, data[written:])
+            written += os.write(port.master, data[written:])
         written_s = time.time()
         time.sleep(0.1)
         while len(got) < before + 300:
@@ -176,13 +161,13 @@ def test_what_waits_behind_a_full_buffer_is_not_said_to_be_delivered(port):
 
 def test_a_line_that_is_never_empty_does_not_stop_the_time(port, monkeypatch):
     monkeypatch.setattr("edgepose.sources.live.FULL_LOOKS", 3)
-    master, name = port
-    os.set_blocking(master, False)
+    name = port.name
+    os.set_blocking(port.master, False)
 
     def fill():
         with contextlib.suppress(BlockingIOError):
             while True:
-                os.write(master, bytes(4096))
+                os.write(port.master, bytes(4096))
 
     with open_source(port=name, protocol="native", waits=False) as source:
         start_s = now_s = next(iter(batches := iter(source)))[0]
@@ -197,14 +182,14 @@ def test_a_line_that_is_never_empty_does_not_stop_the_time(port, monkeypatch):
 
 
 def test_the_time_until_a_look_counts_as_waiting(port):
-    master, name = port
+    name = port.name
     with open_source(port=name, protocol="native", waits=False) as source:
         batches, got = iter(source), []
         while not got:
             time.sleep(0.02)
-            os.write(master, encode(packets(1)[0]))
+            os.write(port.master, encode(packets(1)[0]))
             got += next(batches)[1]
-        os.write(master, encode(packets(2)[6]))
+        os.write(port.master, encode(packets(2)[6]))
         time.sleep(0.3)
         assert len(next(batches)[1]) == 1
         assert source.behind_s >= 0.3
@@ -213,17 +198,17 @@ def test_the_time_until_a_look_counts_as_waiting(port):
 
 
 def test_sources_share_a_clock_that_nobody_sets(port, monkeypatch):
-    with open_source(port=port[1], waits=False) as source:
+    with open_source(port=port.name, waits=False) as source:
         first_s, _ = next(iter(source))
     monkeypatch.setattr(time, "time", lambda: 0.0)
-    with open_source(port=port[1], waits=False) as source:
+    with open_source(port=port.name, waits=False) as source:
         second_s, _ = next(iter(source))
     assert first_s < second_s < first_s + 60.0
 
 
 def test_unknown_ids_are_counted_and_told_once(port, caplog):
-    master, name = port
-    with open_source(port=name) as source, Device(master, chunks(200, ids=(0, 9))):
+    name = port.name
+    with open_source(port=name) as source, Device(port, chunks(200, ids=(0, 9))):
         for _ in source:
             if source.counters.unknown > 20:
                 break
@@ -246,14 +231,14 @@ def drain(name, monkeypatch, seconds=0.3, **options):
 
 
 def test_silence(port, monkeypatch):
-    message, _ = drain(port[1], monkeypatch)
+    message, _ = drain(port.name, monkeypatch)
     assert "nothing came" in message
 
 
 def test_noise(port, monkeypatch):
     noise = np.random.default_rng(0).integers(0, 256, 40_000, dtype=np.uint8).tobytes()
-    with Device(port[0], [noise[i : i + 200] for i in range(0, len(noise), 200)]):
-        message, got = drain(port[1], monkeypatch)
+    with Device(port, [noise[i : i + 200] for i in range(0, len(noise), 200)]):
+        message, got = drain(port.name, monkeypatch)
     assert got == []
     assert "bytes" in message
     assert "--baud (now 9600)" in message
@@ -261,43 +246,35 @@ def test_noise(port, monkeypatch):
 
 
 def test_only_unknown_ids(port, monkeypatch):
-    with Device(port[0], chunks(200, ids=(7, 9))):
-        message, _ = drain(port[1], monkeypatch)
+    with Device(port, chunks(200, ids=(7, 9))):
+        message, _ = drain(port.name, monkeypatch)
     assert "only of sensor ids 7, 9" in message
 
 
 def test_frame_with_z_down_is_refused(port, monkeypatch):
-    with Device(port[0], [encode_info(Info(3, "x", frame="NED"))] * 100):
-        message, _ = drain(port[1], monkeypatch, protocol="native")
+    with Device(port, [encode_info(Info(3, "x", frame="NED"))] * 100):
+        message, _ = drain(port.name, monkeypatch, protocol="native")
     assert "NED" in message
 
 
 @pytest.fixture
 def link(tmp_path):
     """A name for a port that can be plugged in and out: a symbolic link to a pty."""
-    open_fds = []
+    with contextlib.ExitStack() as ports:
 
-    class Link:
-        path = tmp_path / "port"
+        class Link:
+            path = tmp_path / "port"
 
-        def plug(self):
-            master, slave = pty.openpty()
-            tty.setraw(slave)
-            self.path.unlink(missing_ok=True)
-            self.path.symlink_to(os.ttyname(slave))
-            self.master = master
-            open_fds[:] = [master, slave]
-            return master
+            def plug(self):
+                self.port = ports.enter_context(Port(blocking=True))
+                self.path.symlink_to(self.port.name)
+                return self.port
 
-        def unplug(self):
-            self.path.unlink()
-            while open_fds:
-                os.close(open_fds.pop())
+            def unplug(self):
+                self.path.unlink()
+                self.port.close()
 
-    result = Link()
-    yield result
-    for fd in open_fds:
-        os.close(fd)
+        yield Link()
 
 
 def test_a_port_that_goes_and_comes_back(link, caplog):
@@ -306,7 +283,7 @@ def test_a_port_that_goes_and_comes_back(link, caplog):
     link.plug()
     with open_source(port=str(link.path)) as source:
         batches = iter(source)
-        with Device(link.master, chunks(300)):
+        with Device(link.port, chunks(300)):
             while len(before) < 200:
                 before += next(batches)[1]
         link.unplug()
@@ -332,10 +309,10 @@ def test_unknown_port():
 
 
 def test_busy_port(port):
-    with open_source(port=port[1]), pytest.raises(EdgeposeError, match="in use"):
-        open_source(port=port[1]).__enter__()
+    with open_source(port=port.name), pytest.raises(EdgeposeError, match="in use"):
+        open_source(port=port.name).__enter__()
     # Closing gives it free.
-    with open_source(port=port[1]):
+    with open_source(port=port.name):
         pass
 
 
@@ -357,12 +334,12 @@ def test_not_a_port(tmp_path):
 
 def test_a_speed_beyond_what_systems_count(port):
     with pytest.raises(EdgeposeError, match="no port has a speed of 3000000000 bit/s; check --baud"):
-        open_source(port=port[1], baud=3_000_000_000).__enter__()
+        open_source(port=port.name, baud=3_000_000_000).__enter__()
 
 
 def test_impossible_speed(port):
     with pytest.raises(EdgeposeError, match="cannot open"):
-        open_source(port=port[1], baud=-1).__enter__()
+        open_source(port=port.name, baud=-1).__enter__()
 
 
 # --- every wire format --------------------------------------------------------------------------------------
@@ -371,21 +348,16 @@ BYTES = [name for name, protocol in PROTOCOLS.items() if protocol.transport == "
 QUAT = (0.6, 0.0, 0.8, 0.0)
 
 
-class Rig(threading.Thread):
-    """Six devices of one wire format, on six ptys or one, 100 samples a second each until it is left."""
+class Rig(Sender):
+    """Six devices of one wire format, on six ports or one, 100 samples a second each until it is left."""
 
     def __init__(self, name, lines=None, ids=None):
-        super().__init__(daemon=True)
         self.protocol = PROTOCOLS[name]
         self.alone = self.protocol.alone and lines != 1
-        self.ptys = [pty.openpty() for _ in range(6 if self.alone else 1)]
-        for master, slave in self.ptys:
-            tty.setraw(slave)
-            os.set_blocking(master, False)  # bytes that nobody reads are lost
+        super().__init__(*(Port() for _ in range(6 if self.alone else 1)))
         self.ids = [0] * 6 if self.alone else list(ids or self.protocol.ids)
-        self.names = ",".join(os.ttyname(slave) for _, slave in self.ptys)
-        self.encoders = [self.protocol.encoder() for _ in self.ptys]
-        self.left = threading.Event()
+        self.names = ",".join(port.name for port in self.ports)
+        self.encoders = [self.protocol.encoder() for _ in self.ports]
 
     def wire(self, i, k, start_us=7_000_000):
         sample = Sample(
@@ -395,35 +367,20 @@ class Rig(threading.Thread):
         # Text lines have their header again from time to time.
         return self.encoders[i % len(self.encoders)](sample, k % 20 if "openlog" in self.protocol.name else k)
 
-    def run(self):
-        for k in count():
-            if self.left.wait(0.01):
-                return
-            if self.protocol.request:
-                self.answer(k)
-            else:
-                for i in range(6):
-                    with contextlib.suppress(BlockingIOError):
-                        os.write(self.ptys[i % len(self.ptys)][0], self.wire(i, k))
+    def send(self, k):
+        if self.protocol.request:
+            self.answer(k)
+        else:
+            for i in range(6):
+                self.ports[i % len(self.ports)].write(self.wire(i, k))
 
     def answer(self, k):
-        master = self.ptys[0][0]
+        master = self.ports[0].master
         while select.select([master], [], [], 0.002)[0]:
             asked = os.read(master, 1000)
             for i, sensor in enumerate(self.ids):
                 if self.protocol.request(sensor)[0] in asked:
                     os.write(master, self.wire(i, k))
-
-    def __enter__(self):
-        self.start()
-        return self
-
-    def __exit__(self, *_):
-        self.left.set()
-        self.join()
-        for fds in self.ptys:
-            for fd in fds:
-                os.close(fd)
 
 
 def listen(n, **options):
@@ -489,9 +446,9 @@ def test_one_port_of_a_device_that_is_alone():
 
 
 def test_two_devices_with_one_id_are_told_once(port, caplog):
-    master, name = port
+    name = port.name
     both = zip(chunks(250), chunks(250, start_us=900_000_000, ids=[2]), strict=True)
-    with open_source(port=name, protocol="native") as source, Device(master, [a + b for a, b in both]):
+    with open_source(port=name, protocol="native") as source, Device(port, [a + b for a, b in both]):
         for _ in source:
             if "to and fro" in caplog.text:
                 break
@@ -503,10 +460,10 @@ def test_two_devices_with_one_id_are_told_once(port, caplog):
 
 def test_what_two_formats_understand(port):
     """A line on which two formats are spoken equally often belongs to none of them."""
-    master, name = port
+    name = port.name
     hipnuc, xsens = Rig("hipnuc"), Rig("xsens")
     mixed = [hipnuc.wire(0, k) + xsens.wire(0, k) for k in range(300)]
-    with Device(master, mixed), pytest.raises(EdgeposeError, match=r"it could be .* or .*--protocol"):
+    with Device(port, mixed), pytest.raises(EdgeposeError, match=r"it could be .* or .*--protocol"):
         listen(10_000, port=name)
 
 
@@ -572,9 +529,9 @@ def test_lines_of_text_as_a_file_describes_them(tmp_path):
 
 
 def test_raw_data_are_kept_on_demand(port):
-    master, name = port
+    name = port.name
     raw = []
-    with open_source(port=name, raw=raw) as source, Device(master, chunks(100)):
+    with open_source(port=name, raw=raw) as source, Device(port, chunks(100)):
         for _ in source:
             if source.counters.packets > 100:
                 break
