@@ -111,7 +111,7 @@ def test_pickles_that_ask_for_everything(tmp_path, name):
     done = subprocess.run(
         command, text=True, capture_output=True, timeout=LIMIT_S, check=False, env=environment
     )
-    expected = "read\n" if name == "memory" else "EdgeposeError "
+    expected = "read\n" if name == "memory" else "FileFormatError "
     assert done.stdout.startswith(expected), done.stdout + done.stderr
 
 
