@@ -34,8 +34,10 @@ LIMIT_S = 60.0
 """Nobody waits so long; a machine under load may."""
 
 
-def started(wearer, *words: object, **options) -> subprocess.Popen:
-    command = [*RUN, "--file", wearer.recording, "--calibration", wearer.calibration, *words]
+def started(wearer, *words: object, short: bool = False, **options) -> subprocess.Popen:
+    """A run on 12 s, or 3 s, of a recording."""
+    file = wearer.short if short else wearer.recording
+    command = [*RUN, "--file", file, "--calibration", wearer.calibration, *words]
     return subprocess.Popen(list(map(str, command)), **options)
 
 
@@ -337,12 +339,12 @@ def test_one_signal_ends_a_run_whose_output_nobody_reads(wearer, tmp_path, numbe
 def test_standard_error_that_nobody_reads(wearer, tmp_path, how):
     """Messages are not what a run is for."""
     options = {"stderr": subprocess.PIPE} if how == "goes away" else {"preexec_fn": lambda: os.close(2)}
-    process = started(wearer, "--realtime", "--csv", tmp_path / "p.csv", **options)
+    process = started(wearer, "--realtime", "--csv", tmp_path / "p.csv", short=True, **options)
     if how == "goes away":
         process.stderr.readline()
         process.stderr.close()
     assert process.wait(LIMIT_S) == 0
-    assert len(read_poses(tmp_path / "p.csv").frames) == 720
+    assert len(read_poses(tmp_path / "p.csv").frames) == 180
 
 
 def test_every_command_works_without_standard_error():
@@ -388,6 +390,7 @@ def take_terminal() -> None:
 def test_nohup_goes_on(wearer, tmp_path):
     process = started(
         *(wearer, "--realtime", "--csv", tmp_path / "p.csv"),
+        short=True,
         stderr=subprocess.PIPE,
         text=True,
         preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN),
@@ -397,7 +400,7 @@ def test_nohup_goes_on(wearer, tmp_path):
     process.send_signal(signal.SIGHUP)
     code, _ = ended(process)
     assert code == 0
-    assert len(read_poses(tmp_path / "p.csv").frames) == 720
+    assert len(read_poses(tmp_path / "p.csv").frames) == 180
 
 
 def test_a_recording_to_a_pipe_that_nobody_reads(wearer):
