@@ -34,6 +34,14 @@ LIMIT_S = 60.0
 """Nobody waits so long; a machine under load may."""
 
 
+@pytest.fixture(autouse=True)
+def hangup():
+    """Tests that were started with nohup have SIGHUP ignored, and what they start would inherit that."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 def started(wearer, *words: object, short: bool = False, **options) -> subprocess.Popen:
     """A run on 12 s, or 3 s, of a recording."""
     file = wearer.short if short else wearer.recording
