@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
-from edgepose.formats.poses.registry import read_poses
 from numpy.typing import NDArray
 
 from edgepose import rotations as rot
 from edgepose.analysis.figures import INK, PREDICTION, REFERENCE, FlatBody, draw_body, flatten, save_picture
 from edgepose.errors import EdgeposeError
+from edgepose.formats.poses.registry import read_poses
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import default_body, forward_kinematics
 
@@ -165,7 +165,7 @@ def poses_of_the_clip(folder: Path) -> tuple[Array, Array]:
     edgepose("calibrate", "--file", recording, *hold, "--out", calibration)
     edgepose("run", "--file", recording, "--calibration", calibration, "--model", MODEL, "--csv", csv)
 
-    _, time_s, _, predicted = read_poses(csv)[:4]
+    _, time_s, predicted = read_poses(csv)[:3]
     with np.load(recording) as data:
         true_s, true = data["t"], rot.rotvec_to_matrix(data["poses"].reshape(-1, 24, 3))
     wanted = HOLD_S + FILM_FROM_S + np.arange(round(FILM_S * FILM_FPS)) / FILM_FPS

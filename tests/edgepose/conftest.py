@@ -12,7 +12,7 @@ import pytest
 
 from edgepose.formats.recordings.npz import write_npz
 from edgepose.formats.recordings.registry import read_recording
-from edgepose.imu import Recording, SensorData
+from tests.support.recordings import part
 
 CLIP = Path(__file__).parents[2] / "tools" / "data" / "09_12.bvh"
 
@@ -23,16 +23,6 @@ class Wearer(NamedTuple):
     recording: Path
     calibration: Path
     short: Path
-
-
-def part(recording: Recording, start_s: float, end_s: float) -> Recording:
-    """A stretch of a recording."""
-
-    def cut(data: SensorData) -> SensorData:
-        rows = (data.time_s >= start_s) & (data.time_s < end_s)
-        return SensorData(*(None if column is None else column[rows] for column in data))
-
-    return Recording({name: cut(data) for name, data in recording.sensors.items()}, recording.metadata)
 
 
 def edgepose(*words: object, **options: object) -> subprocess.CompletedProcess[str]:

@@ -1,0 +1,235 @@
+"""Calibrations that cannot be the wearer's: `check` and `run` tell of them, and of no others."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import deque
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edgepose import rotations as rot
+from edgepose.calibration import POSES, load_calibration
+from edgepose.calibration.fit import fit_pose, impossible_bones
+from edgepose.calibration.misfit import Misfits
+from edgepose.formats.recordings.npz import write_npz
+from edgepose.formats.recordings.registry import read_recording
+from edgepose.imu import ImuFrame, Recording
+from edgepose.pipeline.rig_comparison import other_devices
+from edgepose.placements import PLACEMENTS
+from edgepose.sources import Device
+
+REAL = Path(__file__).parents[2] / "data" / "imu" / "six-sites-walk.npz"
+
+
+@pytest.fixture(scope="module")
+def real(tmp_path_factory):
+    """A real wearer: two seconds in the pose, and eight of walking, without the minute between."""
+    recording = read_recording(REAL)
+    sensors = {
+        name: data._replace(time_s=np.where(data.time_s > 60.0, data.time_s - 58.0, data.time_s))
+        for name, data in recording.sensors.items()
+    }
+    path = tmp_path_factory.mktemp("real") / "walk.npz"
+    write_npz(path, Recording(sensors, recording.metadata))
+    return path
+
+
+@pytest.fixture(scope="module")
+def calibrated(command, real, tmp_path_factory):
+    """The calibration of the real wearer."""
+    path = tmp_path_factory.mktemp("real") / "c.json"
+    result = command("calibrate", "--file", real, "--hold", 1.5, "--out", path)
+    assert result.returncode == 0, result.stderr
+    return path
+
+
+def exchanged(real: Path, tmp_path: Path, pairs: list[tuple[str, str]]) -> Path:
+    """The recording of a wearer who has put sensors on each other's places."""
+    recording = read_recording(real)
+    sensors = dict(recording.sensors)
+    for one, other in pairs:
+        sensors[one], sensors[other] = sensors[other], sensors[one]
+    path = tmp_path / "exchanged.npz"
+    write_npz(path, Recording(sensors, recording.metadata))
+    return path
+
+
+def told(command, recording: Path, calibration: Path) -> tuple[list[str], str, int]:
+    """Warnings of `run`, and the table and exit code of `check`."""
+    flags = ("--file", recording, "--calibration", calibration)
+    run = command("run", *flags, "--model", "rnn", "--csv", "/dev/null")
+    assert run.returncode == 0, run.stderr
+    check = command("check", *flags)
+    return re.findall(r"^warning: .*", run.stderr, re.MULTILINE), check.stdout, check.returncode
+
+
+def test_its_own_calibration_says_nothing(command, real, calibrated):
+    warnings, table, code = told(command, real, calibrated)
+    assert warnings == []
+    assert "6 of 6 sensors fine" in table
+    assert code == 0
+
+
+@pytest.mark.parametrize(
+    "pairs",
+    [
+        [("left_forearm", "right_forearm")],
+        [("left_lower_leg", "right_lower_leg")],
+        [("left_forearm", "right_forearm"), ("left_lower_leg", "right_lower_leg")],
+        [("head", "pelvis")],
+        [("left_forearm", "left_lower_leg")],
+        [("left_forearm", "head"), ("head", "pelvis")],
+    ],
+    ids=str,
+)
+def test_exchanged_sensors(command, real, calibrated, tmp_path, pairs):
+    warnings, table, code = told(command, exchanged(real, tmp_path, pairs), calibrated)
+    moved = {name for pair in pairs for name in pair}
+    message = next(line for line in warnings if "exchanged since the calibration" in line)
+    assert set(re.findall(r"(\w+) sits where", message)) == moved
+    assert set(re.findall(r"^(\w+): it sits where", table, re.MULTILINE)) == moved
+    assert code == 1
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_calibration_of_another_rig(command, real, calibrated, tmp_path, seed):
+    """Its sensors sit at other angles."""
+    document = json.loads(calibrated.read_text())
+    rng = np.random.default_rng(seed)
+    for sensor in document["sensors"].values():
+        quat = rng.normal(size=4)
+        sensor["bone_from_sensor"] = (quat / np.linalg.norm(quat)).tolist()
+    (tmp_path / "other.json").write_text(json.dumps(document))
+    warnings, table, code = told(command, real, tmp_path / "other.json")
+    assert any("nobody has stood still in the calibration's pose" in line for line in warnings)
+    assert re.search(r" [0-2] of 6 sensors fine", table)
+    assert code == 1
+
+
+def test_other_devices_are_told(calibrated):
+    calibration = load_calibration(calibrated)
+    noted = {name: Device("native", "/dev/ttyUSB0", i)._asdict() for i, name in enumerate(PLACEMENTS)}
+    made = replace(calibration, metadata={"devices": noted})
+    same = {i: Device("native", "/dev/ttyUSB0", i) for i in range(6)}
+    assert other_devices(made, same) is None
+    assert other_devices(calibration, same) is None  # nobody knows
+    assert other_devices(made, {i: device._replace(line=None) for i, device in same.items()}) is None
+    line = other_devices(made, same | {2: Device("native", "/dev/ttyUSB0", 7)})
+    assert "left_lower_leg was native id 2 on /dev/ttyUSB0 and is native id 7 on /dev/ttyUSB0" in line
+    line = other_devices(made, {i: device._replace(protocol="xsens") for i, device in same.items()})
+    assert "left_forearm was native id 0 on /dev/ttyUSB0 and is xsens id 0" in line
+    assert "(and 5 others)" in line
+    assert "ttyUSB1" in other_devices(made, {0: Device("native", "/dev/ttyUSB1", 0)})
+
+
+@pytest.mark.parametrize(
+    "noted", [1, [], {"head": 2}, {"head": {"protocol": 1}}, {"head": {"id": "a"}}, None]
+)
+def test_devices_that_somebody_has_edited(calibrated, noted):
+    made = replace(load_calibration(calibrated), metadata={"devices": noted})
+    assert other_devices(made, {4: Device("native", "a", 1)}) is None
+
+
+def test_a_capture_keeps_its_devices(command, wearer, tmp_path):
+    """From calibrate to run: the protocol and ids of a log go with the calibration."""
+    from firmware_protocols.native import encode
+    from firmware_protocols.native_packet import Packet
+
+    recording = read_recording(wearer.recording)
+    counts, data = dict.fromkeys(range(6), 0), b""
+    for row in range(len(recording.sensors["head"].time_s)):
+        for i, name in enumerate(PLACEMENTS):
+            own = recording.sensors[name]
+            time_us = int((own.time_s[row] - own.time_s[0]) * 1e6)
+            data += encode(Packet(i, counts[i], time_us, tuple(own.quat[row]), tuple(own.acc[row])))
+            counts[i] += 1
+    (tmp_path / "a.bin").write_bytes(data)
+    calibration = tmp_path / "c.json"
+    flags = ("--body-frame", "heading:0", "--from", 1, "--out", calibration)
+    result = command("calibrate", "--file", tmp_path / "a.bin", "--protocol", "native", *flags)
+    assert result.returncode == 0, result.stderr
+    devices = json.loads(calibration.read_text())["metadata"]["devices"]
+    assert devices["head"] == {"protocol": "native", "line": None, "id": 4}
+    order = [1, 0, 2, 3, 4, 5]
+    lines = "\n".join(f"{name} = {{ id = {i} }}" for name, i in zip(PLACEMENTS, order, strict=True))
+    (tmp_path / "map.toml").write_text(lines)
+    flags = ("--file", tmp_path / "a.bin", "--protocol", "native", "--sensors", tmp_path / "map.toml")
+    for command_words in (("run", "--model", "rnn", "--csv", "/dev/null"), ("check",)):
+        result = command(*command_words, *flags, "--calibration", calibration)
+        assert "left_forearm was native id 0 and is native id 1 (and 1 others)" in result.stderr
+
+
+# --- parts --------------------------------------------------------------------------------------------------
+
+
+def test_bones_in_every_pose_of_a_body_are_possible():
+    for pose in POSES.values():
+        assert impossible_bones(pose) == []
+    bones = POSES["straight"].copy()
+    about_x = rot.about_axis("x", np.radians(150.0))  # a heel at the buttock
+    bones[PLACEMENTS.index("left_lower_leg")] = about_x
+    assert impossible_bones(bones) == []
+    lying = rot.about_axis("x", np.radians(-90.0)) @ bones
+    assert impossible_bones(lying) == []
+
+
+def test_bones_that_no_body_has():
+    bones = POSES["straight"].copy()
+    bones[PLACEMENTS.index("head")] = rot.about_axis("x", np.radians(170.0))
+    bones[PLACEMENTS.index("right_lower_leg")] = rot.about_axis("y", np.radians(180.0))
+    assert sorted(impossible_bones(bones)) == ["head", "right_lower_leg"]
+
+
+def frames(calibration, poses, seconds, rate=60.0, start=0):
+    """Frames of a wearer who holds a pose (6, 3, 3) as this calibration sees it."""
+    r_it = rot.quat_to_matrix(calibration.body_from_inertial).T
+    quats = rot.matrix_to_quat(r_it @ poses @ rot.quat_to_matrix(calibration.bone_from_sensor))
+    for i in range(int(seconds * rate)):
+        held = np.zeros(6, bool)
+        yield ImuFrame(start + i, (start + i) / rate, quats, np.tile([0.0, 0.0, 9.81], (6, 1)), held, 0.0)
+
+
+def test_who_sits_at_first_and_stands_later(calibrated):
+    """Arms in the lap are no foreign calibration; nor is a wearer who finds the pose later on."""
+    calibration = load_calibration(calibrated)
+    sitting = POSES["straight"].copy()
+    for i in (0, 1):
+        sitting[i] = rot.about_axis("x", np.radians(-50.0)) @ sitting[i]
+    misfits = Misfits(calibration)
+    lines = [line for frame in frames(calibration, sitting, 25) for line in misfits.of(frame, sitting)]
+    assert lines + misfits.at_end() == []
+
+
+def test_an_impossible_bone_is_told_once(calibrated):
+    calibration = load_calibration(calibrated)
+    bones = POSES["straight"].copy()
+    bones[PLACEMENTS.index("head")] = rot.about_axis("x", np.radians(170.0))
+    misfits = Misfits(calibration)
+    lines = [
+        line for frame in frames(calibration, POSES["straight"], 60) for line in misfits.of(frame, bones)
+    ]
+    assert len(lines) == 1
+    assert lines[0].startswith("warning: head: turned against the pelvis as no body can")
+
+
+def test_headings_that_are_reset_do_not_tell_left_from_right(calibrated):
+    """Without a common north only tilts are worth something."""
+    calibration = load_calibration(calibrated)
+    away = replace(calibration, north=False)
+    quats = next(iter(frames(calibration, POSES["straight"], 1))).orientation
+    turned = rot.quat_multiply(rot.about_z(np.radians([0.0, 90.0, 0.0, 170.0, 0.0, 0.0])), quats)
+    assert fit_pose(away, turned).sits_at is None
+    assert fit_pose(away, turned).good
+
+
+def test_a_calm_run_keeps_few_frames(calibrated):
+    calibration = load_calibration(calibrated)
+    misfits = Misfits(calibration)
+    for frame in frames(calibration, POSES["t-pose"], 120):
+        misfits.of(frame, POSES["t-pose"])
+    assert isinstance(misfits._frames, deque)
+    assert len(misfits._frames) < 120

@@ -1,0 +1,118 @@
+"""All outputs of `edgepose run` at once, and however a run ends."""
+
+from __future__ import annotations
+
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pythonosc.osc_bundle import OscBundle
+
+from edgepose.formats.bvh import read_bvh
+from edgepose.formats.joint_tree import forward
+from edgepose.formats.poses.registry import read_poses
+from edgepose.skeleton import default_body, forward_kinematics
+from edgepose_export.mocap import read_motion
+from tests.support.datagrams import Listener, free_address
+
+
+def test_all_outputs_say_the_same(command, wearer, tmp_path):
+    with Listener() as mailbox:
+        result = command(
+            *("run", "--file", wearer.short, "--realtime"),
+            *("--calibration", wearer.calibration, "--model", "rnn"),
+            *("--csv", tmp_path / "a.csv", "--npz", tmp_path / "a.npz", "--bvh", tmp_path / "a.bvh"),
+            *("--osc", mailbox.address, "--tcp", free_address(), "--height", "1.9"),
+        )
+    datagrams = mailbox.datagrams
+    assert result.returncode == 0, result.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.bvh", "a.csv", "a.npz"]
+    poses = read_poses(tmp_path / "a.csv")
+    assert len(poses.frames) == 180
+    again = read_poses(tmp_path / "a.npz")
+    assert again.status == poses.status
+    np.testing.assert_array_equal(again.frames, poses.frames)
+    np.testing.assert_allclose(again.time_s, poses.time_s, atol=1e-9)
+    np.testing.assert_allclose(again.rotations, poses.rotations, atol=2e-6)
+    assert read_motion(tmp_path / "a.npz").rate == 60.0
+    read = read_bvh(tmp_path / "a.bvh")
+    assert (len(read.rotations), read.rate) == (180, 60.0)
+    offsets = default_body(1.9).offsets
+    wanted = forward_kinematics(poses.rotations, offsets)[1]
+    order = [read.names.index(name) for name in ("pelvis", "head", "left_hand", "right_foot")]
+    places = forward(read)[1][:, order] / 100.0
+    true = wanted[:, [0, 15, 22, 11]]
+    np.testing.assert_allclose(places - places[:, :1], true - true[:, :1], atol=1e-4)
+    assert len(datagrams) == 2 * 180
+    assert {message.address for message in OscBundle(datagrams[0])} >= {"/VMC/Ext/OK", "/VMC/Ext/Bone/Pos"}
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_leaves_whole_files(wearer, tmp_path, number):
+    address = free_address()
+    command = [sys.executable, "-m", "edgepose", "run", "--file", wearer.recording, "--realtime"]
+    command += ["--calibration", wearer.calibration, "--model", "rnn", "--tcp", address]
+    command += ["--csv", tmp_path / "a.csv", "--npz", tmp_path / "a.npz", "--bvh", tmp_path / "a.bvh"]
+    process = subprocess.Popen(list(map(str, command)), text=True, stderr=subprocess.PIPE)
+    host, _, port = address.partition(":")
+    while True:
+        try:
+            viewer = socket.create_connection((host, int(port)))
+            break
+        except ConnectionRefusedError:
+            assert process.poll() is None
+            time.sleep(0.05)
+    with viewer:
+        seen = b""
+        while seen.count(b"$") < 30:
+            assert select.select([viewer], [], [], 30)[0]
+            seen += viewer.recv(65536)
+        process.send_signal(number)
+        errors = process.communicate(timeout=60)[1]
+    assert process.returncode == 0, errors
+    count = len(read_poses(tmp_path / "a.csv").frames)
+    assert count >= 30
+    assert f"poses    {count} " in errors
+    assert len(read_poses(tmp_path / "a.npz").frames) == count
+    assert len(read_bvh(tmp_path / "a.bvh").rotations) == count
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.bvh", "a.csv", "a.npz"]
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "says"),
+    [
+        (["--bvh", "-"], 1, "cannot write BVH to -"),
+        (["--npz", "-"], 1, "cannot write poses to -"),
+        (["--npz", "no/a.npz"], 1, "its folder does not exist"),
+        (["--osc", "127.0.0.1"], 2, "no port in '127.0.0.1'"),
+        (["--tcp", "192.0.2.1:8888"], 1, "cannot listen for viewers at 192.0.2.1 port 8888"),
+        (["--bvh", "a.bvh", "--height", "175"], 1, "height 175 m is not between"),
+        (["--bvh", "RECORDING"], 2, "--bvh would overwrite"),
+    ],
+)
+def test_wrong_use(command, wearer, tmp_path, words, code, says):
+    words = [str(wearer.short) if word == "RECORDING" else word for word in words]
+    result = command(
+        *("run", "--file", wearer.short, "--calibration", wearer.calibration, "--model", "rnn", *words),
+        cwd=tmp_path,
+    )
+    assert result.returncode == code, result.stderr
+    assert says in result.stderr
+    assert "Traceback" not in result.stderr
+    assert Path(wearer.short).exists()
+
+
+def test_nobody_listens_for_osc(command, wearer):
+    address = free_address()
+    result = command(
+        *("run", "--file", wearer.short, "--calibration", wearer.calibration, "--model", "rnn"),
+        *("--osc", address),
+    )
+    assert result.returncode == 0, result.stderr
+    assert f"datagrams did not arrive; is anything listening at {address}?" in result.stderr

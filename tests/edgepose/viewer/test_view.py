@@ -1,0 +1,489 @@
+"""`edgepose view` and `edgepose run --view` in a real browser."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import io
+import json
+import os
+import re
+import select
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import click
+import matplotlib.image
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from websockets.sync.client import connect
+
+from edgepose.cli import cli
+from edgepose.errors import EdgeposeError
+from edgepose.formats.poses.registry import read_poses
+from edgepose.pose import PoseFrame, held_sensors, parse_status
+from edgepose.sinks.bvh import BvhSink
+from edgepose.sinks.csv import CsvSink
+from edgepose.sinks.udp import UdpSink, decode, encode_binary, encode_json
+from edgepose.skeleton import JOINTS, default_body, forward_kinematics
+from edgepose.viewer.body_mesh import TIPS, build, ground
+from edgepose.viewer.viewer import Stream, Viewer, plain, sensor_table
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "chrome"))), None)
+needs_browser = pytest.mark.skipif(
+    CHROMIUM is None, reason="no browser: install Debian's chromium-headless-shell"
+)
+
+
+def standing(index: int = 0, status: str = "ok") -> PoseFrame:
+    """Arms down, left one lifted to the front as time goes by."""
+    rotations = np.tile(np.eye(3, dtype=np.float32), (24, 1, 1))
+    rotations[16] = Rotation.from_euler("z", -75, degrees=True).as_matrix()
+    rotations[17] = Rotation.from_euler("z", 75, degrees=True).as_matrix()
+    rotations[18] = Rotation.from_euler("y", -index % 90, degrees=True).as_matrix()
+    state = parse_status(status)
+    return PoseFrame(index, 1.7e9 + index / 60, rotations, np.zeros(24, np.float32), None, *state)
+
+
+def free_port(kind: int = socket.SOCK_STREAM) -> int:
+    with socket.socket(socket.AF_INET, kind) as sock:
+        sock.bind(("127.0.0.1", 0))
+        return sock.getsockname()[1]
+
+
+def until(asked: Callable[[], object], what: str, seconds: float = 60.0) -> None:
+    """Returns once the answer is true."""
+    end = time.monotonic() + seconds
+    while not asked():
+        assert time.monotonic() < end, what
+        time.sleep(0.05)
+
+
+# --- the solids and the text --------------------------------------------------------------------------------
+
+
+def test_a_status_is_no_markup():
+    """Anybody may send one, and a browser would act on it."""
+    assert plain("held left_forearm head; filling window") == "held left_forearm head; filling window"
+    sent = plain('<img src=x onerror="alert(1)">**[a](b)' + "x" * 1000)
+    assert not re.search(r"[<>\[\]*()\"=]", sent)
+    assert len(sent) == 200
+
+
+def test_solids_join_the_joints():
+    body = default_body()
+    rotations, joints = forward_kinematics(Rotation.random(24, random_state=1).as_matrix(), body.offsets)
+    cylinders, balls = build(body.offsets)
+    quats, centres = cylinders.placed(rotations, joints)
+    along = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).apply([0, 0, 1]) * cylinders.sizes[:, 2:] / 2
+    for j, parent in enumerate(
+        [0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21]
+    ):
+        np.testing.assert_allclose(centres[j] - along[j], joints[parent], atol=1e-6)
+        np.testing.assert_allclose(centres[j] + along[j], joints[j + 1], atol=1e-6)
+    assert len(centres) == 23 + len(TIPS)
+    places = balls.placed(rotations, joints)[1]
+    for place in joints:
+        assert np.abs(places - place).sum(axis=1).min() < 1e-9
+    for joint, side in zip(cylinders.joints, cylinders.sides, strict=True):
+        assert side in ("trunk", *(s for s in ("left", "right") if s in JOINTS[joint])) or joint in (0, 9)
+
+
+def test_ground_is_below_the_feet():
+    body = default_body()
+    up = ground(np.tile(np.eye(3), (24, 1, 1)), body.offsets)
+    assert -1.1 < up < -0.85
+    assert ground(np.tile(np.eye(3), (2, 24, 1, 1)), body.offsets, [[0, 1, 0], [0, 3, 0]]) == pytest.approx(
+        up + 1
+    )
+
+
+def test_table_of_sensors():
+    held = np.zeros((60, 6), bool)
+    held[30:45, 4] = True
+    held[50:, 5] = True
+    rows = [row.split("|")[1:-1] for row in sensor_table(held, 60.0).splitlines()[2:]]
+    assert [cell.strip() for cell in rows[0]] == ["left forearm", "60", "-", "ok"]
+    assert [cell.strip() for cell in rows[4]] == ["head", "45", "0.25 s", "ok"]
+    assert [cell.strip() for cell in rows[5]] == ["pelvis", "50", "0.17 s", "held"]
+    assert "| pelvis | 0 | - | ok |" in sensor_table(np.zeros((0, 6), bool), 60.0)
+    texts = ["held head pelvis; filling window", "held tail; and what nobody knows"]
+    flags = held_sensors([parse_status(text)[0] for text in texts])
+    assert flags.tolist() == [[False] * 4 + [True] * 2, [False] * 6]
+
+
+@pytest.fixture
+def line() -> Iterator[tuple[UdpSink, socket.socket]]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.setblocking(False)
+        with UdpSink("127.0.0.1", receiver.getsockname()[1]) as sink:
+            yield sink, receiver
+
+
+def take(stream: Stream, receiver: socket.socket, now: float) -> PoseFrame | None:
+    select.select([receiver], [], [], 5)
+    return stream.take(receiver, now)
+
+
+def test_only_the_newest_pose_is_shown_and_losses_are_counted(line):
+    sink, receiver = line
+    stream = Stream()
+    assert stream.take(receiver, 0.0) is None
+    assert stream.text(0.0) == "waiting for poses"
+    for i in (0, 1, 2, 5, 4, 5):
+        sink.write(standing(i, "held head" if i == 5 else "ok"))
+    assert take(stream, receiver, 1.0).index == 5
+    assert stream.text(1.0).startswith("4 poses/s, 4 poses, 2 lost\n\n**held head**\n\n| sensor")
+    assert stream.text(9.5).startswith("4 poses/s, 4 poses, 2 lost\n\n**nothing for 8 s**") is False
+    stream.take(receiver, 9.5)
+    assert stream.text(9.5).startswith("0 poses/s, 4 poses, 2 lost\n\n**nothing for 8 s**")
+    sink.write(standing(5))  # once more, late
+    assert take(stream, receiver, 10.0) is None
+    for i in (900, 0):  # then another run
+        sink.write(standing(i))
+    assert take(stream, receiver, 10.0).index == 0
+
+
+def test_what_is_no_pose_is_counted_and_left_out(line):
+    sink, receiver = line
+    stream = Stream()
+    whole = json.loads(encode_json(standing()))
+    bad = [
+        b"",
+        b"\xff" * 100,
+        b"[" * 5000,
+        b"{}",
+        b'{"frame":1e999,"time_s":0,"status":"ok","pose":[]}',
+        *(json.dumps({**whole, key: value}).encode() for key, value in [
+            ("pose", [0] * 71), ("pose", [[0] * 72]), ("pose", ["a"] * 72), ("pose", [1e9] * 72),
+            ("pose", [float("nan")] * 72), ("time_s", float("inf")), ("frame", None), ("time_s", {}),
+        ]),
+        encode_binary(standing())[:-1],
+    ]  # fmt: skip
+    for datagram in bad:
+        with pytest.raises(EdgeposeError, match="datagram"):
+            decode(datagram)
+        sink._socket.send(datagram)
+    sink.write(standing(3))
+    until(lambda: stream.take(receiver, 0.0) or stream.poses, "the good one")
+    assert stream.bad == len(bad)
+    assert f"{len(bad)} bad" in stream.text(0.0)
+
+
+@pytest.mark.parametrize("encode", [encode_json, encode_binary])
+def test_datagrams_of_both_kinds_are_read(encode):
+    pose = standing(7, "held head")
+    back = decode(encode(pose))
+    assert (back.index, back.status) == (7, "held head")
+    assert back.time_s == pytest.approx(pose.time_s, abs=1e-6)
+    np.testing.assert_allclose(back.rotations, pose.rotations, atol=2e-6)
+
+
+# --- in the browser -----------------------------------------------------------------------------------------
+
+
+PLAY = "[...document.querySelectorAll('input[type=checkbox]')].find(box => !box.id.startsWith('mantine'))"
+"""The box beside "play" is the only one of ours; the others are viser's."""
+
+
+class Browser:
+    """A page of a headless Chromium, spoken to by its own protocol."""
+
+    def __init__(self, folder: Path) -> None:
+        command = [CHROMIUM, "--no-sandbox", "--headless", "--enable-unsafe-swiftshader", "--disable-gpu"]
+        command += ["--remote-debugging-port=0", "--window-size=800,500", f"--user-data-dir={folder}"]
+        # In a group of its own: Debian's command is a script, and the browser does not end with it.
+        self.process = subprocess.Popen(
+            [*command, "about:blank"], stderr=subprocess.DEVNULL, start_new_session=True
+        )
+        told = folder / "DevToolsActivePort"
+        until(lambda: told.exists() and "\n" in told.read_text(), "the browser")
+        port = told.read_text().splitlines()[0]
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json") as answer:
+            page = next(target for target in json.load(answer) if target["type"] == "page")
+        self.socket = connect(page["webSocketDebuggerUrl"], max_size=None)
+        self._count = 0
+
+    def call(self, method: str, **words: object) -> dict:
+        self._count += 1
+        self.socket.send(json.dumps({"id": self._count, "method": method, "params": words}))
+        while (answer := json.loads(self.socket.recv(timeout=60))).get("id") != self._count:
+            pass
+        return answer["result"]
+
+    def run(self, script: str) -> object:
+        return self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
+
+    def text(self) -> str:
+        return str(self.run("document.body.innerText"))
+
+    def image(self) -> np.ndarray:
+        data = base64.b64decode(self.call("Page.captureScreenshot")["data"])
+        return matplotlib.image.imread(io.BytesIO(data))[..., :3]
+
+    def close(self) -> None:
+        self.socket.close()
+        os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait()
+
+
+@pytest.fixture
+def browser(tmp_path) -> Iterator[Browser]:
+    with contextlib.closing(Browser(tmp_path / "chromium")) as browser:
+        yield browser
+
+
+@contextlib.contextmanager
+def started(*words: object) -> Iterator[subprocess.Popen]:
+    """The command, running; at the end of the block it is interrupted."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "edgepose", *map(str, words)],
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    try:
+        yield process
+        process.send_signal(signal.SIGINT)
+        out, errors = process.communicate(timeout=60)
+        assert out == ""
+        assert "Traceback" not in errors
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def colours(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Columns of the pixels of the light blue left and of the dark blue right limbs, the panels left out."""
+    scene = image[:, :460]
+    blue = scene[..., 2] - scene[..., 0] > 0.12
+    light = scene.mean(axis=-1)
+    return np.nonzero(blue & (light > 0.55))[1], np.nonzero(blue & (light < 0.4))[1]
+
+
+@needs_browser
+def test_poses_of_a_file_in_the_browser(browser, tmp_path):
+    for name in ("poses", "truth"):
+        with CsvSink(tmp_path / f"{name}.csv") as sink:
+            for i in range(600):
+                sink.write(standing(i, "held head" if 200 <= i < 400 else "ok"))
+    port = free_port()
+    words = ("view", tmp_path / "poses.csv", "--reference", tmp_path / "truth.csv", "--port", port)
+    with started(*words) as process:
+        assert f"open http://127.0.0.1:{port} in a browser" in process.stderr.readline()
+        browser.call("Page.navigate", url=f"http://127.0.0.1:{port}")
+        until(lambda: "of 600, 60 poses/s" in browser.text(), "the text beside the figure")
+        assert "right lower leg" in browser.text()
+
+        def number() -> int:
+            return int(re.search(r"pose (\d+) of 600", browser.text())[1])
+
+        first = number()
+        until(lambda: number() != first, "the next pose")
+        until(lambda: "held head" in browser.text(), "the status")
+        # The wearer's left is at the viewer's right.
+        until(lambda: min(map(len, colours(browser.image()))) > 100, "the figure")
+        left, right = colours(browser.image())
+        assert left.mean() > right.mean() + 20
+        # Pause, and go somewhere else on the time line.
+        browser.run(f"{PLAY}.click()")
+        until(lambda: not browser.run(f"{PLAY}.checked"), "the pause")
+        time.sleep(0.6)
+        still = number()
+        browser.run("document.querySelector('[role=slider]').focus()")
+        key = {"key": "Home", "code": "Home", "windowsVirtualKeyCode": 36}
+        browser.call("Input.dispatchKeyEvent", type="keyDown", **key)
+        browser.call("Input.dispatchKeyEvent", type="keyUp", **key)
+        if still != 1:
+            until(lambda: number() == 1, "the first pose")
+        time.sleep(0.6)
+        assert number() == 1
+
+
+def test_poses_of_a_bvh_file(tmp_path):
+    with BvhSink(tmp_path / "poses.bvh") as sink:
+        for i in range(60):
+            sink.write(standing(i))
+    port = free_port()
+    with started("view", tmp_path / "poses.bvh", "--port", port) as process:
+        assert f"open http://127.0.0.1:{port} in a browser" in process.stderr.readline()
+
+
+@needs_browser
+def test_poses_as_they_come_in_the_browser(browser):
+    page, line = free_port(), free_port(socket.SOCK_DGRAM)
+    with started("view", "--udp", f"127.0.0.1:{line}", "--port", page) as process:
+        process.stderr.readline()
+        browser.call("Page.navigate", url=f"http://127.0.0.1:{page}")
+        until(lambda: "waiting for poses" in browser.text(), "the page")
+        with UdpSink("127.0.0.1", line, "binary") as sink:
+            i = 0
+
+            def send_and_see(text: str) -> bool:
+                nonlocal i
+                for _ in range(10):
+                    i += 2 if i == 50 else 1
+                    sink.write(standing(i, "held pelvis"))
+                    time.sleep(1 / 60)
+                return text in browser.text()
+
+            until(lambda: send_and_see("1 lost"), "the lost pose")
+            until(lambda: send_and_see("held pelvis"), "the status")
+            until(lambda: send_and_see("poses/s"), "the rate")
+            until(lambda: send_and_see("") and min(map(len, colours(browser.image()))) > 100, "the figure")
+        until(lambda: "nothing for 1 s" in browser.text(), "the silence")
+
+
+# --- run --view ---------------------------------------------------------------------------------------------
+
+
+def viewers() -> list[int]:
+    """Processes `edgepose view` that this test session's commands have started and not ended."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):
+            if b"--with-parent" in entry.read_bytes().split(b"\0"):
+                found.append(int(entry.parent.name))
+    return found
+
+
+def child(process: subprocess.Popen) -> int | None:
+    """The viewer that a run has started."""
+    for pid in viewers():
+        with contextlib.suppress(OSError):
+            if int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1]) == process.pid:
+                return pid
+    return None
+
+
+def gone(pid: int) -> bool:
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    return True
+
+
+def running_run(wearer, out: Path) -> subprocess.Popen:
+    command = [
+        sys.executable,
+        "-m",
+        "edgepose",
+        "run",
+        "--file",
+        wearer.short,
+        "--realtime",
+        "--model",
+        "rnn",
+    ]
+    command += ["--calibration", wearer.calibration, "--csv", out, "--view"]
+    return subprocess.Popen(
+        [*map(str, command)], text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    )
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes as Linux shows them")
+def test_a_run_loses_nothing_while_its_viewer_sleeps_and_ends_it(wearer, tmp_path):
+    process = running_run(wearer, tmp_path / "poses.csv")
+    until(lambda: child(process), "the viewer")
+    viewer = child(process)
+    os.kill(viewer, signal.SIGSTOP)
+    until(lambda: process.poll() is not None or (tmp_path / "poses.csv").stat().st_size > 50_000, "poses")
+    os.kill(viewer, signal.SIGCONT)
+    errors = process.communicate(timeout=60)[1]
+    assert process.returncode == 0, errors
+    assert len(read_poses(tmp_path / "poses.csv").frames) == 180
+    assert gone(viewer)
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes as Linux shows them")
+def test_a_viewer_ends_with_a_run_that_is_killed(wearer, tmp_path):
+    process = running_run(wearer, tmp_path / "poses.csv")
+    until(lambda: child(process), "the viewer")
+    viewer = child(process)
+    until(lambda: "in a browser" in process.stderr.readline(), "the page")
+    process.kill()
+    process.communicate()
+    until(lambda: gone(viewer), "its end")
+
+
+# --- wrong use ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "says"),
+    [
+        ("", 2, "give POSES, a file, or --udp HOST:PORT"),
+        ("poses.csv --udp 127.0.0.1:9000", 2, "give POSES, a file, or --udp HOST:PORT"),
+        ("--udp 127.0.0.1:9000 --reference poses.csv", 2, "--reference needs POSES"),
+        ("nothing.csv", 1, "cannot read poses from nothing.csv"),
+        ("poses.csv --reference notes.md", 1, "notes.md is not a file of poses"),
+        ("poses.csv --height 175", 1, "height 175 m is not between"),
+        ("poses.csv --host no-such-host.invalid", 1, "cannot show poses at no-such-host.invalid port 8080"),
+        ("--udp 127.0.0.1", 1, "no port in '127.0.0.1'"),
+        ("--udp no-such-host.invalid:9", 1, "cannot listen for poses at no-such-host.invalid:9"),
+        ("--udp 192.0.2.1:9000", 1, "cannot listen for poses at 192.0.2.1:9000"),
+    ],
+)
+def test_wrong_use(command, tmp_path, words, code, says):
+    with CsvSink(tmp_path / "poses.csv") as sink:
+        sink.write(standing())
+    (tmp_path / "notes.md").write_text("notes\n")
+    result = command("view", *words.split(), cwd=tmp_path)
+    assert result.returncode == code
+    assert says in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+SHORT_OF_MEMORY = """
+import re, resource, sys
+from pathlib import Path
+import edgepose.cli.commands.view, edgepose.formats.poses.registry
+held = int(re.search(r"VmSize:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) << 10
+resource.setrlimit(resource.RLIMIT_AS, (held + (60 << 20),) * 2)
+edgepose.cli.main()
+"""
+
+
+def test_a_file_that_does_not_fit_into_memory(tmp_path):
+    joints = "".join(f"JOINT j{i}\n{{\nOFFSET 0 0 0\nCHANNELS 0\n}}\n" for i in range(500))
+    head = f"HIERARCHY\nROOT r\n{{\nOFFSET 0 0 0\nCHANNELS 1 Xrotation\n{joints}}}\nMOTION\n"
+    path = tmp_path / "a.bvh"
+    path.write_text(f"{head}Frames: 5000\nFrame Time: .01\n" + "0\n" * 5000)
+    command = [sys.executable, "-c", SHORT_OF_MEMORY, "view", str(path)]
+    result = subprocess.run(command, text=True, capture_output=True, check=False)
+    assert result.returncode == 1
+    assert result.stderr == "edgepose: not enough memory; give it a shorter file\n"
+
+
+def test_a_port_that_is_taken(command, tmp_path):
+    with CsvSink(tmp_path / "poses.csv") as sink:
+        sink.write(standing())
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        result = command("view", tmp_path / "poses.csv", "--port", port)
+    assert result.returncode == 1
+    assert re.fullmatch(
+        rf"edgepose: cannot show poses at 127\.0\.0\.1 port {port}: .*choose another --port\n", result.stderr
+    )
+
+
+def test_without_viser(monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(EdgeposeError, match=r"pip install 'edgepose\[view\]'"):
+        Viewer("127.0.0.1", free_port(), default_body())
+
+
+def test_documented_commands_are_understood():
+    docs = (Path(__file__).parents[3] / "docs" / "guide" / "view.md").read_text()
+    documented = re.findall(r"^edgepose view (.*?)(?: *#.*)?$", docs, re.MULTILINE)
+    assert len(documented) >= 3
+    for words in documented:
+        cli.get_command(click.Context(cli), "view").make_context("view", words.split())
