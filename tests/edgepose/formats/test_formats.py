@@ -376,4 +376,4 @@ def test_tables_name_what_is_there():
     for table in (READERS, pose_registry.READERS):
         for place in table.values():
             module = place.partition(":")[0]
-            assert (Path(__file__).parents[2] / f"{module.replace('.', '/')}.py").is_file()
+            assert (Path(__file__).parents[3] / f"{module.replace('.', '/')}.py").is_file()
