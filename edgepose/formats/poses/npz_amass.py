@@ -1,4 +1,4 @@
-"""Poses as NPZ with the keys of AMASS; the arrays are in docs/outputs.md."""
+"""Poses as NPZ with the keys of AMASS; the arrays are in docs/reference/outputs.md."""
 
 from __future__ import annotations
 

@@ -310,4 +310,4 @@ def test_debug_shows_the_traceback(command, wearer, tmp_path):
     result = command("--debug", "run", *flags)
     assert result.returncode == 1
     assert "Traceback (most recent call last)" in result.stderr
-    assert "EdgeposeError: " in result.stderr.splitlines()[-1]
+    assert "FileFormatError: " in result.stderr.splitlines()[-1]

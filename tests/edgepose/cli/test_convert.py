@@ -91,7 +91,6 @@ def test_any_recording_to_the_other_kind_and_back(tmp_path_factory, drawn, metad
         drawn_rows.append(ImuSample(sensor, times[sensor] * 1e-6, quat, acc, gyr, mag))
     recording = from_samples(drawn_rows, metadata)
     # Text of a CSV file sets no terminal.
-    seen = {key: "".join(c if c.isprintable() else "?" for c in value) for key, value in metadata.items()}
     write_csv(folder / "a.csv", recording)
     write_npz(folder / "a.npz", recording)
     for first, second in (("csv", "npz"), ("npz", "csv")):
@@ -102,7 +101,7 @@ def test_any_recording_to_the_other_kind_and_back(tmp_path_factory, drawn, metad
             assert result.problem is None
             assert result.samples == len(drawn)
         again = salvage_recording(back.target)
-        assert again.metadata == seen
+        assert again.metadata == metadata
         same(recording, again, 1e-6)
         same(salvage_recording(there.source), again, 1e-6)
 

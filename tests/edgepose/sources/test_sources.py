@@ -548,11 +548,10 @@ def test_what_came_before_an_error_is_in_a_batch(port, monkeypatch):
         raise DeviceError("nobody can tell")
 
     monkeypatch.setattr("edgepose.sources.line_decoder.Stream.feed", refuse)
-    master, name = port
     raw = []
     with (
-        open_source(port=name) as source,
-        Device(master, chunks(100)),
+        open_source(port=port.name) as source,
+        Device(port, chunks(100)),
         pytest.raises(DeviceError, match="nobody"),
     ):
         raw.extend(piece for batch in source for piece in batch.raw)
