@@ -12,7 +12,8 @@ suite=${1:-bookworm}
 [ $# -gt 0 ] && shift
 [ $# -gt 0 ] || set -- cortex-a72 cortex-a76
 folder=${FOLDER:-/var/tmp/edgepose-arm64}/$suite
-repository=/root/repository
+home=/home/rig  # in the emulated root
+repository=$home/repository
 log=$folder.log
 
 register() {  # programs for ARM are run by qemu, from inside a root without it, too
@@ -29,8 +30,8 @@ make_root() {
 }
 
 inside() {  # CPU, COMMANDS
-  env -i HOME=/root PATH=/usr/sbin:/usr/bin:/sbin:/bin LANG=C.UTF-8 DEBIAN_FRONTEND=noninteractive QEMU_CPU="$1" \
-    PIP_CERT=/etc/ssl/certs/ca-certificates.crt chroot "$folder" bash -ec "cd /root; $2"
+  env -i HOME="$home" PATH=/usr/sbin:/usr/bin:/sbin:/bin LANG=C.UTF-8 DEBIAN_FRONTEND=noninteractive QEMU_CPU="$1" \
+    PIP_CERT=/etc/ssl/certs/ca-certificates.crt chroot "$folder" bash -ec "cd $home; $2"
 }
 
 block() {  # N: the Nth block of commands of the install page
@@ -38,27 +39,28 @@ block() {  # N: the Nth block of commands of the install page
 }
 
 register
-[ -e "$folder/root" ] || make_root
+[ -e "$folder/etc" ] || make_root
+mkdir -p "$folder$home"
 for device in null zero urandom tty; do
   [ -e "$folder/dev/$device" ] || cp -a "/dev/$device" "$folder/dev/$device"
 done
 mountpoint -q "$folder/proc" || mount --bind /proc "$folder/proc"
 trap 'umount "$folder/proc"' EXIT
 
-rm -rf "$folder$repository" "$folder/root/edgepose.new"
+rm -rf "$folder$repository"
 git clone --quiet --bare . "$folder$repository"
-if [ -e "$folder/root/edgepose" ]; then  # what is installed stays, the sources are today's
+if [ -e "$folder$home/edgepose" ]; then  # what is installed stays, the sources are today's
   inside "$1" "cd edgepose && git fetch --quiet $repository HEAD && git reset --quiet --hard FETCH_HEAD &&
     .venv/bin/pip install --quiet --constraint constraints.txt ." > "$log" 2>&1
 else
-  block 1 | sed "s|REPOSITORY|$repository|; s|apt install|apt install -y|; s|pip install|pip install --progress-bar off|" > "$folder/root/install.sh"
+  block 1 | sed "s|REPOSITORY|$repository|; s|apt install|apt install -y|; s|pip install|pip install --progress-bar off|" > "$folder$home/install.sh"
   SECONDS=0
-  inside "$1" "bash -e /root/install.sh" > "$log" 2>&1
+  inside "$1" "bash -e $home/install.sh" > "$log" 2>&1
   echo "installed in $SECONDS s under emulation"
   echo "apt: $(grep -hE '^(Need to get|  Download size)' "$log")"
   awk '/^ *Downloading .*[0-9.]+ [kM]B\)/ { size = $(NF - 1); sub(/\(/, "", size); total += /MB\)/ ? size : size / 1000 }
        END { printf "pip: %.0f MB downloaded\n", total }' "$log"
-  echo "size of .venv: $(du -sm "$folder/root/edgepose/.venv" | cut -f1) MB"
+  echo "size of .venv: $(du -sm "$folder$home/edgepose/.venv" | cut -f1) MB"
 fi
 inside "$1" "edgepose/.venv/bin/pip list 2>/dev/null | grep -E '^(torch|numpy|scipy) '"
 
@@ -74,10 +76,10 @@ for model in birnn rnn; do
 done
 for cpu in "$@"; do
   for model in birnn rnn; do
-    rm -f "$folder/root/edgepose/calib.json" "$folder/root/edgepose/poses.csv"
+    rm -f "$folder$home/edgepose/calib.json" "$folder$home/edgepose/poses.csv"
     SECONDS=0
     inside "$cpu" "cd edgepose; $calibrate; $run --model $model" > "$log" 2>&1 || { tail -n 5 "$log"; exit 1; }
-    echo "$cpu $model: $(grep -o 'running.*;' "$log") $SECONDS s; $(.venv/bin/python tools/compare_poses.py "$here/$model.csv" "$folder/root/edgepose/poses.csv")"
+    echo "$cpu $model: $(grep -o 'running.*;' "$log") $SECONDS s; $(.venv/bin/python tools/compare_poses.py "$here/$model.csv" "$folder$home/edgepose/poses.csv")"
   done
   inside "$cpu" "cd edgepose; $run --precision fp16 --csv /dev/null" > "$log" 2>&1 && echo "$cpu: fp16 ran" ||
     echo "$cpu: fp16: $(tail -n 1 "$log")"

@@ -52,7 +52,7 @@ class OpenWearer:
         Args:
             stack: closes what is opened.
             config: the wearer's.
-            calibration: the wearer's, see `calibration_of`.
+            calibration: the wearer's, see `load_wearer_calibration`.
             by_key: re-zero requests from the keyboard.
             waits: see `edgepose.sources.open_source`.
             notify: takes lines for the user.
@@ -91,7 +91,6 @@ class OpenWearer:
                 full.
             on_pose: called after each pose.
         """
-
         source = self._config.source
         headings = Headings(
             self._calibration,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from edgepose.calibration import Calibration
 from edgepose.calibration.rezero import Headings
+from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.orientation.stage import OrientationStage
 from edgepose.pipeline.frame_synchronizer import FrameClock
@@ -78,14 +79,18 @@ class Pipeline:
         orient = OrientationStage(calibration.filter, magnetometer=calibration.north)
         walk = Walk(FrameClock(self._model.rate_hz), Headings(calibration), [latest], orient)
         self.summary = walk.summary
+        failure: EdgeposeError | None = None
         try:
             for batch in source:
                 for body in walk.take(Batch(*batch)):
                     walk.write(engine.push(*body), walk.arrived)
                 yield from latest.take()
-        finally:
-            for body in walk.flush():
-                walk.write(engine.push(*body), walk.arrived)
-            walk.write(engine.finish(), walk.arrived)
-            walk.end()
+        except EdgeposeError as error:
+            failure = error  # raised once the poses of what came before it are given
+        for body in walk.flush():
+            walk.write(engine.push(*body), walk.arrived)
+        walk.write(engine.finish(), walk.arrived)
+        walk.end(failure)
         yield from latest.take()
+        if failure is not None:
+            raise failure

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,9 +13,10 @@ from edgepose.errors import EdgeposeError
 from edgepose.pose import PoseFrame
 from edgepose.rotations import matrix_to_euler_zxy
 from edgepose.sinks.base import Sink, SinkContext
+from edgepose.sinks.pose_file import PoseFileSink
 from edgepose.sinks.spooled import SpooledSink
 from edgepose.skeleton import JOINTS, PARENTS, Body, default_body, standing_place
-from edgepose.utils.growing_files import FLUSH_S, GrowingFile
+from edgepose.utils.growing_files import GrowingFile
 from edgepose.utils.output_targets import is_stream
 
 Array = NDArray[np.float64]
@@ -75,7 +75,7 @@ def depth_first() -> list[int]:
     return order
 
 
-class BvhSink(Sink):
+class BvhSink(PoseFileSink):
     """Writes poses to a file, which is whole after every write to the disk, about once a second.
 
     The body frame T is the file's world: X to the wearer's left, Y up, Z forward; lengths in cm.
@@ -100,63 +100,23 @@ class BvhSink(Sink):
         self._channels = np.array(depth_first())
         self._before = np.zeros((len(JOINTS), 3))
         self._poses: list[PoseFrame] = []
-        self._count, self._closed, self._empty = 0, False, True
+        self._count = 0
         if is_stream(path):
             raise EdgeposeError(
                 f"cannot write BVH to {path}: it must be a file on a disk, as its start tells how long it is"
             )
         output = GrowingFile(path, "poses", overwrite=overwrite)
-        self._output, self._file = output, output.file
+        self._file = output.file
         head = f"{hierarchy(offsets * 100)}MOTION\n{_COUNT}"
         self._count_at = len(head)
-        head += f"{0:<{_DIGITS}}\nFrame Time: {1 / rate:.8f}\n"
-        self._flushed = time.monotonic()
-        try:
-            output.write(head.encode())
-        except EdgeposeError:
-            self.discard()
-            raise
+        super().__init__(output, f"{head}{0:<{_DIGITS}}\nFrame Time: {1 / rate:.8f}\n".encode())
 
-    def start(self) -> None:
-        """Let the file appear; where one is there already, with the first pose.
-
-        Raises:
-            EdgeposeError: another file is there now.
-        """
-        if not self._output.exists:
-            self._output.start()
-
-    def write(self, pose: PoseFrame) -> None:
-        """Add a frame."""
-        if self._empty:
-            self._empty = False
-            self._output.start()
+    def _add(self, pose: PoseFrame) -> bool:
         self._poses.append(pose)
-        if len(self._poses) >= BLOCK or time.monotonic() - self._flushed >= FLUSH_S:
-            self._flush()
+        return len(self._poses) >= BLOCK
 
-    def close(self) -> None:
-        """Write what is still held back and close the file; a second call does nothing. A file that is there
-        already stays if no pose has come."""
-        if self._closed:
-            return
-        self._closed = True
-        try:
-            self._flush()
-        finally:
-            self._output.close()
-
-    def discard(self) -> None:
-        """As `close`, but without a pose no file appears."""
-        if not self._empty:
-            self.close()
-            return
-        self._closed = True
-        self._output.discard()
-
-    def _flush(self) -> None:
+    def _write_gathered(self) -> None:
         poses, self._poses = self._poses, []
-        self._flushed = time.monotonic()
         if not poses:
             return
         rows = self._rows(poses)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,10 +9,11 @@ from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.csv_columns import FORMS, numbers, pose_columns
 from edgepose.pose import PoseFrame, format_status
 from edgepose.sinks.base import Sink, SinkContext
-from edgepose.utils.growing_files import FLUSH_S, GrowingFile
+from edgepose.sinks.pose_file import PoseFileSink
+from edgepose.utils.growing_files import GrowingFile
 
 
-class CsvSink(Sink):
+class CsvSink(PoseFileSink):
     """Writes poses to a file, or to standard output for the path "-".
 
     Rows to a file are gathered and written about once a second; a pipe or terminal gets each at once, so that
@@ -50,29 +50,11 @@ class CsvSink(Sink):
         self._rotations, self._std, self._translation = rotations, std, translation
         columns = pose_columns(rotations, std, translation)
         self._format = ",".join(["%d,%.6f,%s"] + ["%.6f"] * (len(columns) - 3)) + "\n"
-        self._closed, self._empty = False, True
-        self._file = GrowingFile(path, "poses", overwrite=overwrite, follow=follow, stopped=stopped)
-        self._rows = [",".join(columns) + "\n"]
-        try:
-            self._flush()
-        except EdgeposeError:
-            self.discard()
-            raise
+        self._rows: list[str] = []
+        output = GrowingFile(path, "poses", overwrite=overwrite, follow=follow, stopped=stopped)
+        super().__init__(output, (",".join(columns) + "\n").encode())
 
-    def start(self) -> None:
-        """Let the file appear; where one is there already, with the first pose.
-
-        Raises:
-            EdgeposeError: another file is there now.
-        """
-        if not self._file.exists:
-            self._file.start()
-
-    def write(self, pose: PoseFrame) -> None:
-        """Add a row; a file has it on disk within about a second."""
-        if self._empty:
-            self._empty = False
-            self._file.start()
+    def _add(self, pose: PoseFrame) -> bool:
         values = numbers(self._rotations, pose.rotations).ravel().tolist()
         if self._std:
             values += pose.std.tolist()
@@ -82,33 +64,12 @@ class CsvSink(Sink):
             values += pose.translation.tolist()
         status = format_status(pose.held, pose.warming_up)
         self._rows.append(self._format % (pose.index, pose.time_s, status, *values))
-        if not self._file.regular or time.monotonic() - self._flushed >= FLUSH_S:
-            self._flush()
+        return not self._output.regular
 
-    def close(self) -> None:
-        """Write what is still held back and close the file; standard output stays open. A file that is there
-        already stays if no pose has come."""
-        if self._closed:
-            return
-        self._closed = True
-        try:
-            self._flush()
-        finally:
-            self._file.close()
-
-    def discard(self) -> None:
-        """As `close`, but without a pose no file appears."""
-        if not self._empty:
-            self.close()
-            return
-        self._closed = True
-        self._file.discard()
-
-    def _flush(self) -> None:
+    def _write_gathered(self) -> None:
         rows, self._rows = "".join(self._rows).encode(), []
-        self._flushed = time.monotonic()
         if rows:
-            self._file.write(rows)
+            self._output.write(rows)
 
 
 def open_sink(target: str, context: SinkContext) -> Sink:

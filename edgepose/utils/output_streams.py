@@ -66,7 +66,9 @@ class OutputStream:
     def _open(self) -> Any:
         name = self._target.name
         if name == "-":
-            if sys.stdout is None or getattr(sys.stdout, "name", None) == os.devnull:  # see `cli.terminal`
+            if (
+                sys.stdout is None or getattr(sys.stdout, "name", None) == os.devnull
+            ):  # see `cli.terminal.messages`
                 raise EdgeposeError(f"cannot write {self._what}: standard output is closed")
             # Below Python's buffers: what they still held would fail at exit without a reader.
             sys.stdout.flush()

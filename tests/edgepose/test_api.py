@@ -70,6 +70,29 @@ def test_a_pipeline_takes_pairs_of_time_and_samples(wearer):
     assert [pose.status for pose in poses].count("ok") == sum(not pose.warming_up for pose in poses)
 
 
+@pytest.mark.parametrize("model", ["birnn", "rnn"])
+def test_the_poses_before_the_error_of_a_source_are_given(wearer, model):
+    def ends_in_an_error(source):
+        for k, batch in enumerate(source):
+            if k == 50:
+                raise edgepose.DeviceError("the cable is out")
+            yield batch
+
+    pipeline = edgepose.Pipeline(edgepose.load_calibration(wearer.calibration), model)
+    given = []
+
+    def take(poses):
+        for pose in poses:
+            given.append(pose.index)
+
+    with edgepose.open_source(file=wearer.short) as source:
+        poses = pipeline.poses(ends_in_an_error(source))
+        with pytest.raises(edgepose.DeviceError, match="cable"):
+            take(poses)
+    assert given == list(range(pipeline.summary.poses))
+    assert given
+
+
 def test_the_example_of_arrays():
     assert re.fullmatch(
         r"\(120, 24, 3, 3\), left knee bent by \d+\.\d deg\n", run_example("poses_of_arrays.py")

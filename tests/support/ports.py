@@ -8,6 +8,7 @@ import pty
 import threading
 import time
 import tty
+from abc import ABC, abstractmethod
 from itertools import count
 
 
@@ -50,7 +51,7 @@ class Port:
         self.close()
 
 
-class Sender(threading.Thread):
+class Sender(threading.Thread, ABC):
     """Calls `send` with the count, about 100 times a second, until it is left; then its ports are closed."""
 
     def __init__(self, *ports: Port, rate: float = 100.0) -> None:
@@ -64,8 +65,9 @@ class Sender(threading.Thread):
     def elapsed_s(self) -> float:
         return time.monotonic() - self._start_s
 
+    @abstractmethod
     def send(self, k: int) -> None:
-        raise NotImplementedError
+        """Write what the devices send at the count k."""
 
     def run(self) -> None:
         self._start_s = time.monotonic()

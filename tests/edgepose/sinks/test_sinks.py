@@ -18,7 +18,7 @@ from edgepose.formats.poses.registry import read_poses
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseFrame, parse_status
 from edgepose.rotations import matrix_to_euler_zxy
-from edgepose.sinks import csv as csv_file
+from edgepose.sinks import pose_file
 from edgepose.sinks.csv import CsvSink, pose_columns
 from edgepose.sinks.udp import UdpSink, decode_binary, encode_binary, encode_json
 from edgepose.skeleton import JOINTS
@@ -144,7 +144,7 @@ def test_csv_ends_at_a_whole_row_when_the_disk_fills(tmp_path):
 def test_csv_killed_run_keeps_its_rows(tmp_path):
     path = tmp_path / "a.csv"
     code = (
-        "import edgepose.sinks.csv as c\n"
+        "import edgepose.sinks.pose_file as c\n"
         "c.FLUSH_S = 0.05\n"
         "sink = CsvSink(sys.argv[1])\n"
         "for i in range(100):\n"
@@ -157,7 +157,7 @@ def test_csv_killed_run_keeps_its_rows(tmp_path):
     process.communicate()
     frames = read_poses(path).frames
     assert 0 < len(frames) <= 100
-    assert csv_file.FLUSH_S == 1.0
+    assert pose_file.FLUSH_S == 1.0
 
 
 def test_csv_reader_of_the_pipe_ends():

@@ -324,8 +324,8 @@ def test_an_interrupted_run_leaves_a_whole_file(tmp_path, name):
 @pytest.mark.parametrize("name", ["a.npz", "a.bvh"])
 def test_a_killed_run_leaves_what_was_on_the_disk(tmp_path, name):
     code = (
-        "import edgepose.sinks.bvh as b, edgepose.sinks.csv as c\n"
-        "b.FLUSH_S = c.FLUSH_S = 0.05\n"
+        "import edgepose.sinks.pose_file as p\n"
+        "p.FLUSH_S = 0.05\n"
         "sink = kind(sys.argv[1])\n"
         "for i in range(100):\n"
         "    sink.write(pose(i)); time.sleep(0.002)\n"
