@@ -14,7 +14,7 @@ from importlib.metadata import entry_points
 
 from firmware_protocols.base import Decoder, Encode, Frame, Protocol
 
-__all__ = ["PROTOCOLS", "Decoder", "Encode", "Frame", "Protocol"]
+__all__ = ["PROTOCOLS", "Decoder", "Encode", "Frame", "Protocol", "protocol_names"]
 
 _log = logging.getLogger(__name__)
 
@@ -46,6 +46,12 @@ _BUILT_IN = {
     "mavlink": "mavlink:PROTOCOL",
 }
 """Module of this package and constant in it, by name of the format."""
+
+
+def protocol_names() -> tuple[str, ...]:
+    """Names of all formats, those of other packages last; nothing is imported."""
+    others = {point.name for point in entry_points(group=GROUP)}
+    return (*_BUILT_IN, *sorted(others - set(_BUILT_IN)))
 
 
 class _Registry(Mapping[str, Protocol]):
@@ -80,7 +86,7 @@ def _installed() -> dict[str, Protocol]:
             continue
         try:
             protocol = point.load()
-        except Exception as error:  # whatever the import of another package's module raises
+        except (Exception, SystemExit) as error:  # whatever the import of another package's module raises
             _log.warning("%s cannot be loaded: %s: %s", package, type(error).__name__, error)
             continue
         if not isinstance(protocol, Protocol) or protocol.name != point.name:

@@ -31,7 +31,7 @@ def plugin_formats() -> tuple[FileFormat, ...]:
     for point in entry_points(group=GROUP):
         try:
             loaded = point.load()
-        except Exception as error:  # foreign code raises anything
+        except (Exception, SystemExit) as error:  # foreign code raises anything
             _log.warning("cannot load the file format %s (%s): %r", point.name, point.value, error)
             continue
         if isinstance(loaded, FileFormat):

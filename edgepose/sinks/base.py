@@ -122,7 +122,7 @@ def sink_factory(name: str) -> SinkFactory:
     for point in entry_points(group=ENTRY_POINTS, name=name):
         try:
             loaded: SinkFactory = point.load()
-        except Exception as error:  # code of others
+        except (Exception, SystemExit) as error:  # code of others
             raise ConfigError(f"output {name!r}: {point.value} cannot be imported: {error}") from error
         return loaded
     known = ", ".join(sorted({point.name for point in entry_points(group=ENTRY_POINTS)})) or "none"

@@ -252,8 +252,9 @@ def read_pickle(
     except EdgeposeError:
         raise
     except Exception as error:  # a broken pickle can fail in any way
-        reason = str(error).partition("\n")[0]
-        raise FileFormatError(f"{path}: not a readable {what}: {reason}") from error
+        cut_off = isinstance(error, (EOFError, IndexError, struct.error))
+        reason = "it is cut off or damaged; copy it again" if cut_off else str(error).partition("\n")[0]
+        raise FileFormatError(f"{path}: not a readable {what}: {reason or type(error).__name__}") from error
     if not isinstance(content, dict):
         raise FileFormatError(f"{path}: {what} holds a dictionary, this one a {type(content).__name__}")
     return content

@@ -68,7 +68,7 @@ overwrite_option = click.option("--overwrite", is_flag=True, help="Replace files
 
 
 def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds the flags that say where poses go; the command gets them as `outputs: OutputFlags`."""
+    """Adds the flags that say where poses go; the command gets them as `outputs: OutputConfig`."""
     flags = [
         click.option("--csv", metavar="FILE", help="Write poses as CSV; - is standard output."),
         click.option(

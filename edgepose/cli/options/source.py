@@ -14,7 +14,7 @@ from edgepose.config import SourceConfig, checked_protocol
 from edgepose.errors import ConfigError
 from edgepose.imu import FILTERS
 from edgepose.placements import PLACEMENTS
-from firmware_protocols.registry import PROTOCOLS
+from firmware_protocols.registry import protocol_names
 
 BITS_PER_SECOND = click.IntRange(1)
 
@@ -32,7 +32,7 @@ protocol_option = click.option(
     callback=_protocol,
     default="auto",
     show_default=True,
-    help=f"Wire format: {', '.join(PROTOCOLS)}, or a .toml file that describes text lines. auto "
+    help=f"Wire format: {', '.join(protocol_names())}, or a .toml file that describes text lines. auto "
     "listens and decides.",
 )
 """The flag --protocol."""

@@ -65,7 +65,7 @@ def read_blocks(path: str | Path) -> Iterator[Poses]:
         raise FileFormatError(f"cannot read poses from {path}: {error.strerror or error}") from error
 
 
-class _BadRowError(EdgeposeError):
+class _BadRowError(FileFormatError):
     """A row that is no pose; `row` is its number, counted from 1 for the header."""
 
     def __init__(self, name: str, row: int, problem: str) -> None:

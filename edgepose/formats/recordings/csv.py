@@ -24,18 +24,19 @@ _MAX_LINE = 4096
 
 
 def comments(metadata: Mapping[str, str]) -> str:
-    """Metadata as lines `# key: value`."""
-    # A line break would start a row of its own.
-    return "".join("# " + " ".join(f"{key}: {value}".splitlines()) + "\n" for key, value in metadata.items())
+    """Metadata as lines `# key: value`; control characters become blanks or "?"."""
+    return "".join(f"# {_one_line(f'{key}: {value}')}\n" for key, value in metadata.items())
+
+
+def _one_line(text: str) -> str:
+    """A line break would start a row of its own, an escape sequence would reach a terminal."""
+    line = " ".join(text.splitlines()).replace("\t", " ")
+    return "".join("?" if unicodedata.category(character) == "Cc" else character for character in line)
 
 
 def csv_header(metadata: Mapping[str, str]) -> str:
-    """First lines of a CSV recording, up to its column names; no control character is in them."""
-    clean = {
-        key: "".join("?" if unicodedata.category(c) == "Cc" else c for c in " ".join(value.splitlines()))
-        for key, value in metadata.items()
-    }
-    return comments(clean) + COLUMNS + "\n"
+    """First lines of a CSV recording, up to its column names."""
+    return comments(metadata) + COLUMNS + "\n"
 
 
 def csv_row(sample: ImuSample) -> str:
