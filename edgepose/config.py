@@ -23,6 +23,28 @@ ANY_OUTPUT = "give at least one output, such as --csv FILE, --udp HOST:PORT or -
 ONE_SOURCE = "give one source: --port PORT, --can INTERFACE:CHANNEL or --file PATH"
 
 
+def parse_host_and_port(text: str) -> tuple[str, int]:
+    """Host and port of a text that is nothing else.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    if "," in text:
+        raise ConfigError(f"{text!r} is more than HOST:PORT")
+    return parse_address(text)
+
+
+FILE_OUTPUTS = ("csv", "npz", "bvh")
+"""Outputs to a file with that ending: it is never the input, nor replaced unasked."""
+
+NETWORK_OUTPUTS: dict[str, Callable[[str], Any]] = {
+    "udp": parse_destination,
+    "osc": parse_host_and_port,
+    "tcp": parse_host_and_port,
+}
+"""Outputs to an address, and what reads its text."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class SourceConfig:
     """Where samples come from; the fields are the arguments of `edgepose.sources.open_source`.
@@ -119,15 +141,16 @@ class OutputConfig:
     @property
     def any(self) -> bool:
         """Whether there is an output at all."""
-        named = (self.csv, self.npz, self.bvh, self.udp, self.osc, self.tcp)
-        return self.view or bool(self.sinks) or any(output is not None for output in named)
+        targets = (getattr(self, name) for name in (*FILE_OUTPUTS, *NETWORK_OUTPUTS))
+        return self.view or bool(self.sinks) or any(target is not None for target in targets)
 
     @property
     def files(self) -> dict[str, str | None]:
         """The files that are written, by flag."""
         # While a run goes on, poses for an NPZ file are in a CSV file beside it.
         growing = None if self.npz is None or is_stream(self.npz) else str(part_path(self.npz))
-        return {"--csv": self.csv, "--npz": self.npz, "--bvh": self.bvh, "--npz (while it grows)": growing}
+        named = {f"--{name}": getattr(self, name) for name in FILE_OUTPUTS}
+        return named | {"--npz (while it grows)": growing}
 
     def check(self) -> None:
         """Make sure that no file is lost by what is asked for.
@@ -135,9 +158,10 @@ class OutputConfig:
         Raises:
             EdgeposeError: a file exists already, or cannot be written.
         """
-        for name, ending in ((self.csv, ".csv"), (self.npz, ".npz"), (self.bvh, ".bvh")):
-            if name is not None:
-                check_output(name, "poses", (ending,), self.overwrite)
+        for name in FILE_OUTPUTS:
+            path = getattr(self, name)
+            if path is not None:
+                check_output(path, "poses", (f".{name}",), self.overwrite)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,7 +246,7 @@ _TEXT, _SWITCH, _WHOLE, _NUMBER = "text in quotes", "true or false", "a whole nu
 
 _TYPES: dict[str, tuple[type, ...]] = {_TEXT: (str,), _SWITCH: (bool,), _WHOLE: (int,), _NUMBER: (int, float)}
 
-_FILES = ("file", "sensors", "calibration", "csv", "npz", "bvh")
+_FILES = ("file", "sensors", "calibration", *FILE_OUTPUTS)
 """Keys whose values are files, relative to the TOML file; `protocol` may be one."""
 
 _KEYS = {
@@ -238,14 +262,9 @@ _KEYS = {
     "filter": _TEXT,
     "no-mag": _SWITCH,
     "calibration": _TEXT,
-    "csv": _TEXT,
+    **dict.fromkeys((*FILE_OUTPUTS, *NETWORK_OUTPUTS), _TEXT),
     "rotations": _TEXT,
     "std": _SWITCH,
-    "npz": _TEXT,
-    "bvh": _TEXT,
-    "udp": _TEXT,
-    "osc": _TEXT,
-    "tcp": _TEXT,
     "view": _SWITCH,
     "height": _NUMBER,
     "overwrite": _SWITCH,
@@ -280,10 +299,8 @@ def _text(key: str, value: str, folder: Path) -> Any:
         return Path(value)
     parse: dict[str, Callable[[str], Any]] = {
         "protocol": lambda name: str(folder / name) if name.endswith(".toml") else checked_protocol(name),
-        "udp": parse_destination,
-        "osc": parse_host_and_port,
-        "tcp": parse_host_and_port,
         "control": parse_host_and_port,
+        **NETWORK_OUTPUTS,
     }
     if key not in parse:
         return value
@@ -291,17 +308,6 @@ def _text(key: str, value: str, folder: Path) -> Any:
         return parse[key](value)
     except EdgeposeError as error:
         raise ConfigError(f"{key}: {error}") from None
-
-
-def parse_host_and_port(text: str) -> tuple[str, int]:
-    """Host and port of a text that is nothing else.
-
-    Raises:
-        ConfigError: it is not.
-    """
-    if "," in text:
-        raise ConfigError(f"{text!r} is more than HOST:PORT")
-    return parse_address(text)
 
 
 def checked_protocol(name: str) -> str:

@@ -7,6 +7,7 @@ import edgepose
 T = 120
 orientation = np.tile(np.eye(3), (T, 6, 1, 1))  # bones in the body frame: a T-pose
 acceleration = np.zeros((T, 6, 3))  # m/s^2, without gravity
+# Lower legs are vertical in a squat, too: without a motion before it the network cannot tell which it is.
 rotations = edgepose.load_model("rnn").poses(orientation, acceleration)
 knee = edgepose.JOINTS.index("left_knee")
 angle = np.degrees(np.arccos(np.clip((np.trace(rotations[-1, knee]) - 1) / 2, -1, 1)))

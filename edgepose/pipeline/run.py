@@ -51,7 +51,7 @@ class RunSummary:
     behind_s: float = 0.0
     seconds: float = 0.0
     late_s: float = 0.0
-    latencies_s: array[float] = field(default_factory=lambda: array("f"))
+    latencies_s: array[float] = field(default_factory=lambda: array("f"), repr=False)
     error: EdgeposeError | None = None
 
     def sent(self, late_s: float) -> None:
