@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.formats.joint_tree import LARGEST
-from edgepose.formats.plugins import FileFormat
+from edgepose.formats.registered import FileFormat
 from edgepose.pose import Poses
 
 LARGEST_TIME = 1e12

@@ -5,14 +5,12 @@ Files are hostile until checked: what comes out is finite, in order and made of 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
-from pkgutil import resolve_name
 
 from edgepose.errors import FileFormatError
 from edgepose.formats.bvh import FRAME_TIMES
-from edgepose.formats.plugins import plugin_formats
 from edgepose.formats.poses.base import PoseFormat
+from edgepose.formats.registered import all_formats, built_in_format
 from edgepose.pose import Poses
 
 READERS = {
@@ -59,13 +57,15 @@ def find_format(path: Path) -> PoseFormat:
     """The format of a file by its ending; CSV is also that of unknown endings and of "-"."""
     suffix = path.suffix.lower()
     if not suffix:
-        return _built_in("csv")
-    return next((known for known in _formats() if suffix in known.suffixes), None) or _built_in("csv")
+        return built_in_format(PoseFormat, READERS["csv"])
+    return next(
+        (known for known in all_formats(PoseFormat, READERS.values()) if suffix in known.suffixes), None
+    ) or built_in_format(PoseFormat, READERS["csv"])
 
 
 def pose_suffixes() -> tuple[str, ...]:
     """Endings of files that may hold poses."""
-    return tuple(suffix for known in _formats() for suffix in known.suffixes)
+    return tuple(suffix for known in all_formats(PoseFormat, READERS.values()) for suffix in known.suffixes)
 
 
 def _read(path: Path) -> tuple[Poses, str | None]:
@@ -74,15 +74,3 @@ def _read(path: Path) -> tuple[Poses, str | None]:
     if not FRAME_TIMES[0] < poses.frame_time < FRAME_TIMES[1]:
         raise FileFormatError(f"{path}: {poses.frame_time:g} s from pose to pose is not possible")
     return poses, problem
-
-
-def _formats() -> Iterator[PoseFormat]:
-    """All formats, imported one after the other."""
-    yield from map(_built_in, READERS)
-    yield from (known for known in plugin_formats() if isinstance(known, PoseFormat))
-
-
-def _built_in(name: str) -> PoseFormat:
-    known = resolve_name(READERS[name])
-    assert isinstance(known, PoseFormat)
-    return known

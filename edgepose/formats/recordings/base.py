@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import FileFormatError
-from edgepose.formats.plugins import FileFormat
+from edgepose.formats.registered import FileFormat
 from edgepose.imu import ImuSample, Recording, SensorData
 from edgepose.placements import PLACEMENTS
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from pkgutil import resolve_name
 
 from edgepose.errors import FileFormatError
-from edgepose.formats.plugins import plugin_formats
 from edgepose.formats.recordings.base import ReadOptions, RecordingFormat
+from edgepose.formats.registered import all_formats, built_in_format
 from edgepose.imu import Recording
 from edgepose.placements import PLACEMENTS
 
@@ -81,14 +80,18 @@ def find_format(path: Path) -> RecordingFormat | None:
     "-" is CSV on standard input.
     """
     if str(path) == "-":
-        return _built_in("csv")
+        return built_in_format(RecordingFormat, READERS["csv"])
     folder = path.is_dir()
-    return next((known for known in _formats() if known.fits(path, folder)), None)
+    return next(
+        (known for known in all_formats(RecordingFormat, READERS.values()) if known.fits(path, folder)), None
+    )
 
 
 def recording_suffixes() -> tuple[str, ...]:
     """Endings of recordings that are files."""
-    return tuple(suffix for known in _formats() for suffix in known.suffixes)
+    return tuple(
+        suffix for known in all_formats(RecordingFormat, READERS.values()) for suffix in known.suffixes
+    )
 
 
 def _read(path: Path, options: ReadOptions) -> Recording:
@@ -100,21 +103,9 @@ def _read(path: Path, options: ReadOptions) -> Recording:
                     f"{path}: unknown kind of file (Is a directory with no recording in it); give the folder "
                     "that holds the files or folders of all sensors"
                 )
-            known = _built_in("csv")
+            known = built_in_format(RecordingFormat, READERS["csv"])
         return known.read(path, options)
     except (OSError, UnicodeDecodeError) as error:
         raise FileFormatError(
             f"{path}: cannot read it: {getattr(error, 'strerror', None) or error}"
         ) from None
-
-
-def _formats() -> Iterator[RecordingFormat]:
-    """All formats, imported one after the other."""
-    yield from map(_built_in, READERS)
-    yield from (known for known in plugin_formats() if isinstance(known, RecordingFormat))
-
-
-def _built_in(name: str) -> RecordingFormat:
-    known = resolve_name(READERS[name])
-    assert isinstance(known, RecordingFormat)
-    return known

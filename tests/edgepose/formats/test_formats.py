@@ -20,7 +20,6 @@ from edgepose.calibration import GRAVITY, load_calibration
 from edgepose.cli import cli
 from edgepose.convert import plan
 from edgepose.errors import EdgeposeError
-from edgepose.formats.plugins import plugin_formats
 from edgepose.formats.poses import registry as pose_registry
 from edgepose.formats.poses.registry import is_poses, read_poses
 from edgepose.formats.recordings.csv import write_csv
@@ -33,6 +32,7 @@ from edgepose.formats.recordings.registry import (
     salvage_recording,
 )
 from edgepose.formats.recordings.totalcapture import NAMES
+from edgepose.formats.registered import plugin_formats
 from edgepose.imu import Recording, SensorData
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Z_UP_TO_T, angle_between, quat_rotate, quat_to_matrix

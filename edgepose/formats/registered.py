@@ -1,11 +1,17 @@
-"""File formats of other packages, which announce them by entry points of the group `edgepose.formats`."""
+"""File formats one after the other: those of edgepose, then those of other packages.
+
+Other packages announce theirs by entry points of the group `edgepose.formats`.
+"""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
+from pkgutil import resolve_name
+from typing import TypeVar
 
 GROUP = "edgepose.formats"
 """Each entry point of the group names a `RecordingFormat` or a `PoseFormat`."""
@@ -22,6 +28,23 @@ class FileFormat:
     """
 
     suffixes: tuple[str, ...]
+
+
+Format = TypeVar("Format", bound=FileFormat)
+
+
+def built_in_format(kind: type[Format], place: str) -> Format:
+    """The format at a place, "module:constant", whose module is imported now."""
+    known = resolve_name(place)
+    assert isinstance(known, kind)
+    return known
+
+
+def all_formats(kind: type[Format], places: Iterable[str]) -> Iterator[Format]:
+    """The formats of a kind: those at the places, imported one after the other, then those of plug-ins."""
+    for place in places:
+        yield built_in_format(kind, place)
+    yield from (known for known in plugin_formats() if isinstance(known, kind))
 
 
 @cache
