@@ -195,3 +195,20 @@ def test_protocols_of_other_packages_are_loaded_only_when_asked_for(install):
         env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
     )
     assert result.stdout == "False sensors in boots\n"
+
+
+def test_the_help_names_formats_of_other_packages_without_importing_them(install):
+    install(["boots = boots_protocol:PROTOCOL"])
+    script = (
+        "import sys; from click.testing import CliRunner; from edgepose.cli import cli\n"
+        "text = CliRunner().invoke(cli, ['check', '--help']).output\n"
+        "print('boots' in text, 'boots_protocol' in sys.modules)"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+    )
+    assert result.stdout == "True False\n"

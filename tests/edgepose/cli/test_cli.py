@@ -190,6 +190,10 @@ def test_a_missing_recording(fail, tmp_path):
     assert f"{tmp_path / 'nowhere.npz'}: cannot read it: No such file" in fail(file=tmp_path / "nowhere.npz")
 
 
+def test_a_missing_session(fail, tmp_path):
+    assert f"{tmp_path / 'session'}: no such file or folder" in fail(file=tmp_path / "session")
+
+
 def test_a_folder_as_a_recording(fail, tmp_path):
     assert "unknown kind of file" in fail(file=tmp_path)
     (tmp_path / "folder.csv").mkdir()

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from edgepose.formats.recordings.csv import csv_header
+from edgepose.formats.recordings.raw_capture import times_header
 from tests.support.terminals import on_a_terminal
 
 ESCAPES = "\x1b]0;owned\x07\x1b[2J\x9b31m\u202e"
@@ -85,3 +87,8 @@ def test_names_that_are_no_text(command, wearer, tmp_path):
     result = command("report", poses)
     assert result.returncode == 0, result.stderr
     assert (tmp_path / f"{odd}.html").read_bytes().endswith(b"</html>\n")
+
+
+def test_control_characters_in_the_first_lines_of_a_recording():
+    assert csv_header({"no\x1b[2Jte": "a\tb\x9bc\nd"}).splitlines()[0] == "# no?[2Jte: a b?c d"
+    assert times_header({"\x07": "\x1b"}).splitlines()[0] == "# ?: ?"

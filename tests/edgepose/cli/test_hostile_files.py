@@ -16,7 +16,7 @@ import can
 import numpy as np
 import pytest
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import EdgeposeError, FileFormatError
 from edgepose.formats.recordings.base import samples
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.utils.safe_pickle import read_pickle
@@ -83,6 +83,13 @@ def test_pickles_that_ask_for_everything(tmp_path, name):
     )
     expected = "read\n" if name == "memory" else "FileFormatError "
     assert done.stdout.startswith(expected), done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("content", [b"", b"\x80\x04\x95", b".", b"}K", b"no pickle"])
+def test_a_broken_pickle_is_told_with_a_reason(tmp_path, content):
+    (tmp_path / "a.pkl").write_bytes(content)
+    with pytest.raises(FileFormatError, match=r"a\.pkl: not a readable pickle: \S"):
+        read_pickle(tmp_path / "a.pkl", "pickle", "advice")
 
 
 def test_a_list_in_a_pickle_that_holds_itself_many_times(tmp_path):

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import EdgeposeError, FileFormatError
 from edgepose.formats.bvh import read_bvh
 from edgepose.formats.joint_tree import forward
 from edgepose.formats.poses.csv import BLOCK, read_blocks
@@ -289,7 +289,7 @@ def test_bvh_without_translation_stands_on_the_ground(tmp_path):
 PRELUDE = """
 import sys, signal, time, numpy as np
 from edgepose.pose import PoseFrame, parse_status
-from edgepose.errors import EdgeposeError
+from edgepose.errors import EdgeposeError, FileFormatError
 from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.npz import NpzSink
 def pose(i): return PoseFrame(i, i / 60, np.tile(np.eye(3), (24, 1, 1)), np.zeros(24))
@@ -436,3 +436,12 @@ def test_poses_of_a_run_that_was_cut_off_are_not_written_over(tmp_path):
     with pytest.raises(EdgeposeError, match=r"walk\.part\.csv is there already.*edgepose convert"):
         NpzSink(tmp_path / "walk.npz")
     assert part.read_bytes() == before
+
+
+def test_a_bad_first_row_is_the_error_of_a_file(tmp_path):
+    with CsvSink(tmp_path / "a.csv") as sink:
+        sink.write(motion(1)[0])
+    header, row = (tmp_path / "a.csv").read_text().splitlines()
+    (tmp_path / "a.csv").write_text(f"{header}\n{row[:-3]}x\n")
+    with pytest.raises(FileFormatError, match="row 2"):
+        read_poses(tmp_path / "a.csv")
