@@ -52,7 +52,7 @@ def as_told(error: Exception) -> EdgeposeError:
 
 @contextmanager
 def named(whose: str) -> Iterator[None]:
-    """Errors say whose they are, where he has a name."""
+    """Errors say whose they are, if there is a name."""
     try:
         yield
     except EdgeposeError as error:

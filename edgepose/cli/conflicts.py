@@ -75,7 +75,7 @@ def _inputs(rig: WearerConfig) -> dict[str, Path | None]:
 
 
 def _lines(rig: WearerConfig) -> dict[str, list[int | None]]:
-    """The lines that a wearer listens to, and the ids of his sensors on them as far as a map tells."""
+    """The lines that a wearer listens to, and the ids of their sensors on them as far as a map tells."""
     from edgepose.sources.line_config import links
 
     source = rig.source

@@ -33,7 +33,7 @@ class Wearer:
     """One of several wearers; an error of any kind ends only their part.
 
     Attributes:
-        walk: his.
+        walk: from the wearer's samples to the outputs.
         waiting: frames that have not been through the network.
         ended: no more samples are taken.
     """
@@ -43,7 +43,7 @@ class Wearer:
 
         Args:
             source: entered, and not one that waits.
-            walk: his.
+            walk: from the wearer's samples to the outputs.
             tell: hears of an error.
         """
         self.walk = walk
@@ -149,7 +149,7 @@ def run_together(
 
 
 def _step(engine: BatchEngine, frames: dict[int, _Waiting], wearers: dict[int, Wearer]) -> None:
-    """One frame of each wearer who has one, to his sinks."""
+    """One frame of each wearer who has one, to its sinks."""
     for i, outputs in engine.push({i: waiting.body for i, waiting in frames.items()}).items():
         wearers[i].write(outputs, frames[i].arrived)
 

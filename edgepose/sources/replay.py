@@ -243,7 +243,7 @@ def open_file(
         protocols = candidates(protocol, "bytes", live=False)
         streams = _streams(path, protocols, sensor_map, _capture_clock)
         return LogSource(path, realtime, _read_capture, streams, waits)
-    if not path.exists():
+    if not path.suffix and not path.exists():
         raise EdgeposeError(f"{path}: no such file or folder")
     raise EdgeposeError(
         f"{path}: unknown kind of file; recordings end in {', '.join(recording_suffixes())}, logs of CAN "

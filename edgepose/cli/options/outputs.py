@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import click
 
+from edgepose.cli.options.gathered import gathered
 from edgepose.config import OutputConfig, parse_host_and_port
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.csv_columns import FORMS
@@ -123,12 +122,4 @@ def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
             help="Write to an output that an installed package adds; may be repeated.",
         ),
     ]
-
-    @functools.wraps(command)
-    def with_outputs(**words: Any) -> Any:
-        own = {each.name: words.pop(each.name) for each in dataclasses.fields(OutputConfig)}
-        return command(outputs=OutputConfig(**own), **words)
-
-    for flag in reversed(flags):
-        with_outputs = flag(with_outputs)
-    return with_outputs
+    return gathered(command, flags, "outputs", OutputConfig)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import click
 
+from edgepose.cli.options.gathered import gathered
 from edgepose.config import SourceConfig, checked_protocol
 from edgepose.errors import ConfigError
 from edgepose.imu import FILTERS
@@ -47,7 +46,7 @@ sensors_option = click.option(
 
 
 def source_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds the flags that say where samples come from; the command gets them as `source: SourceFlags`."""
+    """Adds the flags that say where samples come from; the command gets them as `source: SourceConfig`."""
     flags = [
         click.option(
             "--port",
@@ -86,19 +85,7 @@ def source_options(command: Callable[..., Any]) -> Callable[..., Any]:
         protocol_option,
         sensors_option,
     ]
-
-    @functools.wraps(command)
-    def with_source(**words: Any) -> Any:
-        own = {each.name: words.pop(each.name) for each in dataclasses.fields(SourceConfig)}
-        try:
-            source = SourceConfig(**own)
-        except ConfigError as error:
-            raise click.UsageError(str(error)) from None
-        return command(source=source, **words)
-
-    for flag in reversed(flags):
-        with_source = flag(with_source)
-    return with_source
+    return gathered(command, flags, "source", SourceConfig)
 
 
 def filter_options(command: Callable[..., Any]) -> Callable[..., Any]:
