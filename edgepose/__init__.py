@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from edgepose.formats.recordings.registry import read_recording
     from edgepose.imu import ImuFrame, ImuSample, Recording
     from edgepose.inference.model import Model, load_model
-    from edgepose.pipeline.wearer_pipeline import Pipeline
+    from edgepose.pipeline.python_api import Pipeline
     from edgepose.placements import PLACEMENTS
     from edgepose.pose import PoseFrame
     from edgepose.sinks.base import Sink
@@ -54,7 +54,7 @@ _MODULES = {
     "NpzSink": "edgepose.sinks.npz",
     "OutputConfig": "edgepose.config",
     "PLACEMENTS": "edgepose.placements",
-    "Pipeline": "edgepose.pipeline.wearer_pipeline",
+    "Pipeline": "edgepose.pipeline.python_api",
     "PoseFrame": "edgepose.pose",
     "Recording": "edgepose.imu",
     "Sink": "edgepose.sinks.base",

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from edgepose.errors import ConfigError, EdgeposeError
-from edgepose.formats.poses.csv_columns import FORMS
+from edgepose.formats.poses.csv_columns import ROTATION_FORMATS
 from edgepose.imu import FILTERS
 from edgepose.utils.output_targets import check_output, is_stream, part_path
 from edgepose.utils.sockets import Destination, parse_address, parse_destination
@@ -135,8 +135,10 @@ class OutputConfig:
 
     def __post_init__(self) -> None:
         """Raises ConfigError for an unknown representation of rotations."""
-        if self.rotations not in FORMS:
-            raise ConfigError(f"rotations: {self.rotations!r} is not one of {', '.join(map(repr, FORMS))}")
+        if self.rotations not in ROTATION_FORMATS:
+            raise ConfigError(
+                f"rotations: {self.rotations!r} is not one of {', '.join(map(repr, ROTATION_FORMATS))}"
+            )
 
     @property
     def any(self) -> bool:

@@ -18,13 +18,13 @@ from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.npz_amass import write_npz as write_poses_npz
 from edgepose.formats.poses.registry import is_poses, pose_suffixes, salvage_poses
 from edgepose.formats.recordings import xio_session
-from edgepose.formats.recordings.base import from_samples
+from edgepose.formats.recordings.base import recording_from_samples
 from edgepose.formats.recordings.csv import write_csv
 from edgepose.formats.recordings.npz import write_npz
 from edgepose.formats.recordings.registry import find_format, recording_suffixes, salvage_recording
 from edgepose.imu import ImuSample, Recording
 from edgepose.placements import PLACEMENTS
-from edgepose.pose import Poses
+from edgepose.pose import PoseSequence
 from edgepose.sinks.base import Sink
 from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.csv import CsvSink
@@ -235,7 +235,7 @@ def _read(path: Path, protocol: str, sensors: Path | None) -> Recording:
     rows = list(_samples(path, protocol, sensors, problems))
     # Names need not be text.
     name = os.fsencode(path.name).decode(errors="replace")
-    recording = from_samples(rows, {"source": name}, name=str(path), salvage=True)
+    recording = recording_from_samples(rows, {"source": name}, name=str(path), salvage=True)
     problems += [recording.damage] if recording.damage else []
     return recording._replace(damage="; ".join(problems) or None)
 
@@ -296,7 +296,7 @@ def _ignore_interrupts() -> None:
 # --- poses --------------------------------------------------------------------------------------------------
 
 
-def _write_poses(path: Path, poses: Poses, height_m: float) -> None:
+def _write_poses(path: Path, poses: PoseSequence, height_m: float) -> None:
     if path.suffix == ".npz":
         write_poses_npz(path, [poses], len(poses.frames), poses.rate)
         return

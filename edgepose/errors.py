@@ -34,7 +34,7 @@ class ModelError(EdgeposeError):
     """A model archive is missing, damaged, not trusted, or cannot run here."""
 
 
-def as_told(error: Exception) -> EdgeposeError:
+def as_edgepose_error(error: Exception) -> EdgeposeError:
     """An error as the user is told of it; what nobody has foreseen is the cause of what it becomes."""
     if isinstance(error, EdgeposeError):
         return error
@@ -51,7 +51,7 @@ def as_told(error: Exception) -> EdgeposeError:
 
 
 @contextmanager
-def named(whose: str) -> Iterator[None]:
+def prefix_errors(whose: str) -> Iterator[None]:
     """Errors say whose they are, if there is a name."""
     try:
         yield

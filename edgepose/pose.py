@@ -80,7 +80,7 @@ def longest_holds(held: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.array([np.max(np.flatnonzero(e < 0) - np.flatnonzero(e > 0), initial=0) for e in edges])
 
 
-class Poses(NamedTuple):
+class PoseSequence(NamedTuple):
     """Poses of one file.
 
     Attributes:

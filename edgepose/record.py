@@ -23,7 +23,7 @@ from edgepose.placements import PLACEMENTS
 from edgepose.sources import Batch, Source
 from edgepose.sources.replay import CAPTURES
 from edgepose.utils.durable_files import replace_file
-from edgepose.utils.growing_files import Appender
+from edgepose.utils.growing_files import DurableAppender
 from edgepose.utils.output_targets import check_output
 
 CAN_LOGS = (".asc", ".blf", ".log")
@@ -42,7 +42,7 @@ class Output(NamedTuple):
         finish: called when the files are closed and something is in them.
     """
 
-    files: list[Appender]
+    files: list[DurableAppender]
     samples: Callable[[list[ImuSample]], None]
     raw: Callable[[float, Any], None]
     finish: Callable[[], None]
@@ -196,7 +196,7 @@ def _write(output: Output, batch: Batch) -> bool:
 def _samples(path: str, metadata: Mapping[str, str], overwrite: bool) -> Output:
     journal = path if path == "-" else str(_journal(Path(path)))
     header = csv_header(metadata).encode()
-    file = Appender(journal, "samples", header, overwrite=overwrite, follow=journal == path)
+    file = DurableAppender(journal, "samples", header, overwrite=overwrite, follow=journal == path)
 
     def take(samples: list[ImuSample]) -> None:
         file.add("".join(map(csv_row, samples)).encode())
@@ -212,10 +212,10 @@ def _samples(path: str, metadata: Mapping[str, str], overwrite: bool) -> Output:
 
 def _capture(path: Path, metadata: Mapping[str, str], overwrite: bool) -> Output:
     times = times_path(path)
-    bytes_file = Appender(str(path), "bytes", b"", end=b"", overwrite=overwrite)
+    bytes_file = DurableAppender(str(path), "bytes", b"", end=b"", overwrite=overwrite)
     try:
         header = times_header(metadata).encode()
-        times_file = Appender(str(times), "arrival times", header, overwrite=overwrite)
+        times_file = DurableAppender(str(times), "arrival times", header, overwrite=overwrite)
     except EdgeposeError:
         bytes_file.close()
         raise
@@ -234,7 +234,7 @@ def _can_log(path: Path, overwrite: bool) -> Output:
     import can
 
     journal = _journal(path)
-    file = Appender(str(journal), "CAN frames", b"", overwrite=overwrite, follow=journal == path)
+    file = DurableAppender(str(journal), "CAN frames", b"", overwrite=overwrite, follow=journal == path)
     writer = can.CanutilsLogWriter(cast(TextIO, _TextFile(file)))
 
     def take(arrival_s: float, message: can.Message) -> None:
@@ -263,7 +263,7 @@ def _can_log(path: Path, overwrite: bool) -> Output:
 class _TextFile:
     """As much of a text file as python-can's writer of logs needs."""
 
-    def __init__(self, file: Appender) -> None:
+    def __init__(self, file: DurableAppender) -> None:
         self._file = file
 
     def write(self, text: str) -> None:

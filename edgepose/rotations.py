@@ -50,7 +50,7 @@ def quat_rotate(q: ArrayLike, v: ArrayLike) -> Array:
     return v + q[..., :1] * t + np.cross(u, t)
 
 
-def turn(q: tuple[float, ...], x: float, y: float, z: float) -> tuple[float, float, float, float]:
+def integrate_rotvec(q: tuple[float, ...], x: float, y: float, z: float) -> tuple[float, float, float, float]:
     """Unit quaternion q (4,) after a turn by an axis-angle vector in its own frame, radians.
 
     Plain floats, for loops over single samples, in which arrays take twenty times longer.
@@ -94,20 +94,20 @@ def mean_rotation(quats: ArrayLike) -> Array:
     return mean if mean[0] >= 0 else -mean
 
 
-def heading(q: ArrayLike) -> Array:
+def yaw_of_quat(q: ArrayLike) -> Array:
     """Angle (...) of the part of unit quaternions (..., 4) that turns about Z, up (swing-twist split)."""
     q = np.asarray(q, float)
     return 2.0 * np.arctan2(q[..., 3], q[..., 0])
 
 
-def turn_about_y(r: ArrayLike) -> Array:
+def yaw_of_matrix(r: ArrayLike) -> Array:
     """Angle (...), radians, of the part of rotation matrices (..., 3, 3) that turns about Y, up in T."""
     r = np.asarray(r, float)
     angle: Array = np.arctan2(r[..., 0, 2] - r[..., 2, 0], r[..., 0, 0] + r[..., 2, 2])
     return angle
 
 
-def about_z(angle: ArrayLike) -> Array:
+def quat_about_z(angle: ArrayLike) -> Array:
     """Unit quaternions (..., 4) of turns about Z."""
     half = np.asarray(angle, float) / 2.0
     zero = np.zeros_like(half)
@@ -185,14 +185,14 @@ def matrix_to_rotvec(r: ArrayLike) -> Array:
     return quat_to_rotvec(matrix_to_quat(r))
 
 
-def about_axis(axis: str, angle: ArrayLike) -> Array:
+def rotation_about_axis(axis: str, angle: ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3) of turns about one coordinate axis, `axis` one of "x", "y", "z"."""
     direction = np.zeros(3)
     direction["xyz".index(axis)] = 1.0
     return rotvec_to_matrix(np.asarray(angle, float)[..., None] * direction)
 
 
-Z_UP_TO_T = about_axis("x", -np.pi / 2)
+Z_UP_TO_T = rotation_about_axis("x", -np.pi / 2)
 """Turns a world with Z up, such as that of AMASS, into the body frame T, Y up."""
 
 
@@ -201,9 +201,9 @@ def euler_to_matrix(angles: ArrayLike, order: str) -> Array:
     Ry Rx.
     """
     angles = np.asarray(angles, float)
-    result = about_axis(order[0], angles[..., 0])
+    result = rotation_about_axis(order[0], angles[..., 0])
     for i, axis in enumerate(order[1:], start=1):
-        result = result @ about_axis(axis, angles[..., i])
+        result = result @ rotation_about_axis(axis, angles[..., i])
     return result
 
 
@@ -227,7 +227,7 @@ def transpose(r: Array) -> Array:
     return np.swapaxes(r, -1, -2)
 
 
-def angle_between(a: ArrayLike, b: ArrayLike) -> Array:
+def geodesic_angle(a: ArrayLike, b: ArrayLike) -> Array:
     """Geodesic distance (...) between rotation matrices (..., 3, 3), from 0 to pi."""
     # The chord ||A - B||_F = 2 sqrt(2) sin(angle / 2) keeps its precision at small angles, where arccos of
     # the trace does not.

@@ -65,7 +65,7 @@ def local_from_global(rotations: ArrayLike) -> Array:
     return local
 
 
-def standing_place(offsets: ArrayLike) -> Array:
+def standing_pelvis_position(offsets: ArrayLike) -> Array:
     """Place of the pelvis (3,) above the ground of someone who stands straight, metres; offsets (24, 3)."""
     _, joints = forward_kinematics(np.tile(np.eye(3), (len(JOINTS), 1, 1)), offsets)
     return np.array([0.0, joints[0, 1] - joints[:, 1].min(), 0.0])

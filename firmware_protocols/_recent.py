@@ -11,7 +11,7 @@ K = TypeVar("K")
 V = TypeVar("V")
 
 
-class Recent(dict[K, V]):
+class BoundedDict(dict[K, V]):
     """A dict of the MAX_SENSORS keys set last; more push out those not set for longest."""
 
     def __setitem__(self, key: K, value: V) -> None:

@@ -25,19 +25,19 @@ class Receiver(Decoder):
         self.counters = Counters()
         self._in_sync = True
 
-    def _bad(self) -> list[Sample]:
+    def _count_bad(self) -> list[Sample]:
         """Something came that is no valid packet."""
         self.counters.bad += 1
         self._in_sync = False
         return []
 
-    def _good(self) -> None:
+    def _count_good(self) -> None:
         """A valid packet came."""
         if not self._in_sync:
             self._in_sync = True
             self.counters.resyncs += 1
 
-    def _give(self, sample: Sample, samples: list[Sample]) -> None:
+    def _emit(self, sample: Sample, samples: list[Sample]) -> None:
         """Append a sample, if there is anything in it."""
         if sample[2:] == NOTHING:
             self.counters.skipped += 1
@@ -88,7 +88,7 @@ class StreamDecoder(Receiver):
                 length = -1
             intact = self._intact(buffer, at, length) if length > 0 else None
             if intact:
-                self._good()
+                self._count_good()
                 self._message(buffer[at : at + length], samples)
                 at += length
                 continue

@@ -9,7 +9,7 @@ from math import pi, radians
 from typing import Any
 
 from firmware_protocols._numbers import int16
-from firmware_protocols.pairing import Usual
+from firmware_protocols.pairing import CycleDetector
 from firmware_protocols.rotation import from_angles, to_yaw_pitch_roll
 from firmware_protocols.sample import STANDARD_G, Counters, Sample, Vector3
 
@@ -58,7 +58,7 @@ class Cycle:
         self._top = -1  # type of the packet before
         self._end: int | None = None  # the last type of a cycle
         self._other_end = -1  # where the cycle before ended, if not there
-        self._usual = Usual()
+        self._usual = CycleDetector()
         self._counted = True  # a stream that begins in the middle of a cycle has lost nothing
 
     def add(self, order: int, values: dict[str, Any]) -> list[Sample]:

@@ -77,12 +77,12 @@ class Protocol:
 
     name: str
     transport: Literal["bytes", "can"]
-    speed: int
-    text: str
+    default_bitrate: int
+    description: str
     decoder: Callable[[], Decoder]
     encoder: Callable[[], Encode] | None
     ids: Sequence[int] = ()
-    alone: bool = False
+    single_device: bool = False
     request: Callable[[int], tuple[bytes, int]] | None = None
 
     @property

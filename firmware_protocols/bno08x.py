@@ -79,7 +79,7 @@ class Bno08xDecoder(StreamDecoder):
         self._index = index
         self._text = b""
         quat = _quaternion(a * self._yaw_step, b * _STEP, c * _STEP, self._order)
-        self._give(Sample(0, None, quat, (x * _MG, y * _MG, z * _MG)), samples)
+        self._emit(Sample(0, None, quat, (x * _MG, y * _MG, z * _MG)), samples)
 
     def _bad_frame(self, start: int, end: int) -> None:
         self._text = _HEADER  # no text
@@ -133,9 +133,9 @@ def encode(sample: Sample, index: int, *, order: str = "zxy", clockwise: bool = 
 PROTOCOL = Protocol(
     name="bno08x-rvc",
     transport="bytes",
-    speed=115200,
-    text="BNO08x in UART-RVC mode: angles without a common heading, acceleration",
+    default_bitrate=115200,
+    description="BNO08x in UART-RVC mode: angles without a common heading, acceleration",
     decoder=Bno08xDecoder,
     encoder=lambda: encode,
-    alone=True,
+    single_device=True,
 )

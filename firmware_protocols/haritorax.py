@@ -72,9 +72,9 @@ class HaritoraxDecoder(Receiver):
         samples = _samples(match) if match is not None else []
         # A good line may follow on a broken one that has lost its end.
         if match is None or match.start() or not samples:
-            self._bad()
+            self._count_bad()
         if samples:
-            self._good()
+            self._count_good()
             self.counters.packets += len(samples)
         return samples
 
@@ -129,8 +129,8 @@ def _block(sample: Sample, step: float) -> bytes:
 PROTOCOL = Protocol(
     name="haritorax",
     transport="bytes",
-    speed=500_000,
-    text="HaritoraX trackers, by a GX dongle or wired; ids are slots of the dongle",
+    default_bitrate=500_000,
+    description="HaritoraX trackers, by a GX dongle or wired; ids are slots of the dongle",
     decoder=HaritoraxDecoder,
     encoder=uncounted(encode),
     ids=range(6),

@@ -137,7 +137,7 @@ class HipnucDecoder(StreamDecoder):
 
     def _message(self, frame: bytes, samples: list[Sample]) -> None:
         for sample in self._payload(frame[_HEADER:]):
-            self._give(sample, samples)
+            self._emit(sample, samples)
 
     def _payload(self, payload: bytes) -> list[Sample]:
         samples: list[Sample] = []
@@ -365,10 +365,10 @@ def _write_block(sample: Sample, node_ids: bool) -> bytes:
 PROTOCOL = Protocol(
     name="hipnuc",
     transport="bytes",
-    speed=115200,
-    text="HiPNUC HI2xx, CH0x0, CH10x, HI221 and its wireless receiver",
+    default_bitrate=115200,
+    description="HiPNUC HI2xx, CH0x0, CH10x, HI221 and its wireless receiver",
     decoder=HipnucDecoder,
     encoder=uncounted(encode),
     ids=range(6),
-    alone=True,
+    single_device=True,
 )

@@ -21,7 +21,7 @@ from firmware_protocols._hipnuc_fields import (
 from firmware_protocols._sequence import count_byte
 from firmware_protocols._stream import Receiver
 from firmware_protocols.base import Protocol, uncounted_can
-from firmware_protocols.pairing import Usual
+from firmware_protocols.pairing import CycleDetector
 from firmware_protocols.sample import STANDARD_G, CanFrame, Sample, Vector3, unit_quaternion
 
 _MASK_FD = 0x17F
@@ -39,10 +39,10 @@ class _CanDecoder(Receiver):
     def __init__(self) -> None:
         super().__init__()
         self._parts: dict[int, dict[str, Vector3 | float]] = {}
-        self._usual: dict[int, Usual] = {}
+        self._usual: dict[int, CycleDetector] = {}
 
     def _add(self, node: int, kind: str, value: Vector3 | float) -> list[Sample]:
-        self._good()
+        self._count_good()
         parts = self._parts.setdefault(node, {})
         if kind in parts:
             self.counters.lost += 1
@@ -53,11 +53,11 @@ class _CanDecoder(Receiver):
     def _close(self, node: int, values: tuple[int, ...]) -> list[Sample]:
         parts = self._parts.pop(node, {})
         known = node in self._usual
-        whole = self._usual.setdefault(node, Usual()).whole(parts)
+        whole = self._usual.setdefault(node, CycleDetector()).whole(parts)
         quat = unit_quaternion(*(value / 10000 for value in values))
         if quat is None:
-            return self._bad()
-        self._good()
+            return self._count_bad()
+        self._count_good()
         if "acc" not in parts or not whole:
             self.counters.lost += known
             return []
@@ -87,9 +87,9 @@ class HipnucCanopenDecoder(_CanDecoder):
             self.counters.skipped += 1
             return []
         if kind == 0x480:
-            return self._close(node, QUAT_I.unpack(data)) if len(data) == 8 else self._bad()
+            return self._close(node, QUAT_I.unpack(data)) if len(data) == 8 else self._count_bad()
         if not 6 <= len(data) <= 8:
-            return self._bad()
+            return self._count_bad()
         values = VECTOR_I.unpack_from(data)
         if kind == 0x180:
             return self._add(node, "acc", scaled(values, STANDARD_G / 1000))
@@ -134,14 +134,14 @@ class HipnucJ1939Decoder(_CanDecoder):
             return []
         if group in _J1939_VECTORS:
             if not 6 <= len(data) <= 8:
-                return self._bad()
+                return self._count_bad()
             kind, scale = _J1939_VECTORS[group]
             return self._add(node, kind, scaled(VECTOR_I.unpack_from(data), scale))
         if group in _J1939_QUATS:
-            return self._close(node, QUAT_I.unpack(data)) if len(data) == 8 else self._bad()
+            return self._close(node, QUAT_I.unpack(data)) if len(data) == 8 else self._count_bad()
         if group == _J1939_TEMPERATURE:
             if not 2 <= len(data) <= 8:
-                return self._bad()
+                return self._count_bad()
             return self._add(node, "temperature", int.from_bytes(data[:2], "little", signed=True) / 100)
         if group == _J1939_FD:
             return self._whole(node, data)
@@ -150,7 +150,7 @@ class HipnucJ1939Decoder(_CanDecoder):
 
     def _whole(self, node: int, data: bytes) -> list[Sample]:
         if not 8 <= len(data) <= 64:
-            return self._bad()
+            return self._count_bad()
         mask = int.from_bytes(data[:4], "little")
         if mask & ~_MASK_FD:
             self.counters.skipped += 1
@@ -158,8 +158,8 @@ class HipnucJ1939Decoder(_CanDecoder):
         try:
             sample, _ = fields_at(data, 8, mask, node)
         except ValueError:
-            return self._bad()
-        self._good()
+            return self._count_bad()
+        self._count_good()
         count_byte(self.counters, self._counts.get(node), data[7])
         self._counts[node] = data[7]
         if sample.quat is None and sample.acc is None:
@@ -219,8 +219,8 @@ def _j1939_id(group: int, node: int) -> int:
 PROTOCOL_CANOPEN = Protocol(
     name="hipnuc-canopen",
     transport="can",
-    speed=500_000,
-    text="HiPNUC CANopen process data; ids are node ids",
+    default_bitrate=500_000,
+    description="HiPNUC CANopen process data; ids are node ids",
     decoder=HipnucCanopenDecoder,
     encoder=uncounted_can(encode_canopen),
     ids=range(1, 7),
@@ -229,8 +229,8 @@ PROTOCOL_CANOPEN = Protocol(
 PROTOCOL_J1939 = Protocol(
     name="hipnuc-j1939",
     transport="can",
-    speed=500_000,
-    text="HiPNUC J1939 groups, CAN 2.0 and CAN FD; ids are source addresses",
+    default_bitrate=500_000,
+    description="HiPNUC J1939 groups, CAN 2.0 and CAN FD; ids are source addresses",
     decoder=HipnucJ1939Decoder,
     encoder=uncounted_can(encode_j1939),
     ids=range(1, 7),

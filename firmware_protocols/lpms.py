@@ -122,7 +122,7 @@ class LpmsDecoder(StreamDecoder):
         at = self._at_of.get("temperature")
         if at is not None and isfinite(v[at]):
             temperature = v[at] * self._scale["temperature"]
-        self._give(Sample(sensor, v[0] * TICK_US, quat, acc, gyr, mag, temperature), samples)
+        self._emit(Sample(sensor, v[0] * TICK_US, quat, acc, gyr, mag, temperature), samples)
 
     def _vector(self, v: tuple[float, ...], name: str, unit: float) -> Vector3 | None:
         at = self._at_of.get(name)
@@ -165,10 +165,10 @@ def encode(sample: Sample, fields: Iterable[str] = USUAL_FIELDS, floats: bool = 
 PROTOCOL = Protocol(
     name="lpms",
     transport="bytes",
-    speed=115200,
-    text="LP-Research LPMS, set to send rate, acceleration, field and quaternion as f32",
+    default_bitrate=115200,
+    description="LP-Research LPMS, set to send rate, acceleration, field and quaternion as f32",
     decoder=LpmsDecoder,
     encoder=uncounted(encode),
     ids=range(1, 7),
-    alone=True,
+    single_device=True,
 )

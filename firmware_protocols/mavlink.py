@@ -12,11 +12,11 @@ from importlib import import_module
 from typing import Any
 
 from firmware_protocols._numbers import number, vector
-from firmware_protocols._recent import Recent
+from firmware_protocols._recent import BoundedDict
 from firmware_protocols._sequence import count_byte
 from firmware_protocols._stream import StreamDecoder
 from firmware_protocols.base import Encode, Protocol
-from firmware_protocols.pairing import Pairing
+from firmware_protocols.pairing import MessagePairer
 from firmware_protocols.sample import STANDARD_G, Sample, Vector3, unit_quaternion, z_up
 
 _V1 = 0xFE
@@ -65,8 +65,8 @@ class MavlinkDecoder(StreamDecoder):
         self._decode = dialect.MAVLink(None).decode
         self._decoded: Any = None
         self._imu = imu
-        self._pairing = Pairing(self.counters, tolerance_us, _WRAP_US)
-        self._sequence: Recent[int, int] = Recent()
+        self._pairing = MessagePairer(self.counters, tolerance_us, _WRAP_US)
+        self._sequence: BoundedDict[int, int] = BoundedDict()
 
     def flush(self) -> list[Sample]:
         """What still waits for its partner, at the end of a recording."""
@@ -242,10 +242,10 @@ def _encoder() -> Encode:
 PROTOCOL = Protocol(
     name="mavlink",
     transport="bytes",
-    speed=57600,
-    text="MAVLink 1 and 2 (needs pymavlink); ids are system id << 8 | component id",
+    default_bitrate=57600,
+    description="MAVLink 1 and 2 (needs pymavlink); ids are system id << 8 | component id",
     decoder=MavlinkDecoder,
     encoder=_encoder,
     ids=[system << 8 | 1 for system in range(1, 7)],
-    alone=True,
+    single_device=True,
 )

@@ -178,7 +178,7 @@ class MipDecoder(StreamDecoder):
         if time_ns is not None:
             self._count(descriptor, time_ns, period_ns)
         quat = quat or matrix or euler
-        self._give(
+        self._emit(
             Sample(
                 0,
                 gps_us if time_ns is None else time_ns // 1000,
@@ -268,9 +268,9 @@ def encode(
 PROTOCOL = Protocol(
     name="mip",
     transport="bytes",
-    speed=115200,
-    text="MicroStrain MIP: 3DM-GX, 3DM-CV",
+    default_bitrate=115200,
+    description="MicroStrain MIP: 3DM-GX, 3DM-CV",
     decoder=MipDecoder,
     encoder=uncounted(encode),
-    alone=True,
+    single_device=True,
 )

@@ -108,14 +108,14 @@ class NativeReceiver(Receiver):
     def _take(self, message: Packet | Info) -> list[Sample]:
         """The sample in an intact message, if it holds a new one."""
         samples: list[Sample] = []
-        self._good()
+        self._count_good()
         if isinstance(message, Info):
             self.infos[message.sensor_id] = message
             self.counters.skipped += 1
         elif self._sequence.is_new(message.sensor_id, message.seq, message.t_us):
             if message.battery is not None:
                 self.batteries[message.sensor_id] = message.battery
-            self._give(Sample(message.sensor_id, message.t_us, *message[3:8]), samples)
+            self._emit(Sample(message.sensor_id, message.t_us, *message[3:8]), samples)
         return samples
 
 
@@ -151,7 +151,7 @@ class NativeDecoder(NativeReceiver):
                 return _open_frame(frame)
             except ValueError:
                 pass
-        self._bad()
+        self._count_bad()
         # Noise, or a packet without its 00, may have run into a good packet at the end. Its first body byte
         # is known, which leaves few places to try.
         frame = frame[-MAX_FRAME:]
@@ -179,8 +179,8 @@ def _encoder() -> Encode:
 PROTOCOL = Protocol(
     name="native",
     transport="bytes",
-    speed=115200,
-    text="edgepose's own packet: COBS and CRC-16, many sensors on one line",
+    default_bitrate=115200,
+    description="edgepose's own packet: COBS and CRC-16, many sensors on one line",
     decoder=NativeDecoder,
     encoder=_encoder,
     ids=range(6),

@@ -202,7 +202,7 @@ class NativeCanDecoder(NativeReceiver):
 
     def _vector(self, message: int, sensor: int, data: bytes, time_s: float | None) -> None:
         if len(data) != _VECTOR.size:
-            self._bad()
+            self._count_bad()
             return
         x, y, z, ticks = _VECTOR.unpack(data)
         open_ = self._open.get(sensor)
@@ -218,7 +218,7 @@ class NativeCanDecoder(NativeReceiver):
                 period = min(step, period + period // 8 + 1) if period else step
             self._acc[sensor] = ticks, period
         elif open_ is None:
-            self._bad()
+            self._count_bad()
         elif open_.ticks != ticks:
             # QUAT of the open sample and ACC of this one are lost; the QUAT to come shows the second loss.
             del self._open[sensor]
@@ -240,13 +240,13 @@ class NativeCanDecoder(NativeReceiver):
                 w, x, y, z = _QUATERNION.unpack(data)
                 quat = unit_quaternion(w / QUAT_SCALE, x / QUAT_SCALE, y / QUAT_SCALE, z / QUAT_SCALE)
             if quat is None:
-                return self._bad()
+                return self._count_bad()
         if time_s is not None and open_.arrival_s is not None:
             half_us = self._acc[sensor][1] * TICK_US / 2
             if (time_s - open_.arrival_s) * 1e6 > half_us > 0:
                 self.counters.lost += 2  # a QUAT and an ACC
                 return []
-        self._good()
+        self._count_good()
         self.counters.packets += 1
         return [Sample(sensor, open_.ticks * TICK_US, quat, open_.acc, open_.gyr, open_.mag)]
 
@@ -255,9 +255,9 @@ class NativeCanDecoder(NativeReceiver):
             size = body_size(data)
             body = decode_body(data[:size])
         except ValueError:
-            return self._bad()
+            return self._count_bad()
         if message or body.sensor_id != sensor or any(data[size:]):
-            return self._bad()
+            return self._count_bad()
         samples = self._take(body)
         if not samples or isinstance(body, Info):
             return []
@@ -279,8 +279,8 @@ def _encoder() -> Encode:
 PROTOCOL = Protocol(
     name="native-can",
     transport="can",
-    speed=500_000,
-    text="edgepose's own packet on CAN 2.0 and CAN FD",
+    default_bitrate=500_000,
+    description="edgepose's own packet on CAN 2.0 and CAN FD",
     decoder=NativeCanDecoder,
     encoder=_encoder,
     ids=range(6),

@@ -1,19 +1,19 @@
 """One Sample of messages that a device sends apart.
 
-By their times: `Pairing`. By the order in which they come, where they have none: HiPNUC on CAN and
-WitMotion, with `Usual`. The MTi-600 (time or group counter) and the native packet on CAN have rules of their
-own.
+By their times: `MessagePairer`. By the order in which they come, where they have none: HiPNUC on CAN and
+WitMotion, with `CycleDetector`. The MTi-600 (time or group counter) and the native packet on CAN have rules
+of their own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-from firmware_protocols._recent import Recent
+from firmware_protocols._recent import BoundedDict
 from firmware_protocols.sample import Counters, Sample
 
 
-class Usual:
+class CycleDetector:
     """What a device sends in every cycle, as far as two cycles show it."""
 
     def __init__(self) -> None:
@@ -29,7 +29,7 @@ class Usual:
         return usual <= now
 
 
-class Pairing:
+class MessagePairer:
     """Pairs orientation and inertial messages of a sensor that belong to the same instant.
 
     The message that comes first is held until its partner of the same time comes. If one of another time
@@ -48,8 +48,8 @@ class Pairing:
         self.counters = counters
         self.tolerance_us = tolerance_us
         self._wrap_us = wrap_us
-        self._held: Recent[int, tuple[bool, Sample]] = Recent()
-        self._done: Recent[int, int] = Recent()
+        self._held: BoundedDict[int, tuple[bool, Sample]] = BoundedDict()
+        self._done: BoundedDict[int, int] = BoundedDict()
 
     def add(self, sample: Sample, oriented: bool) -> list[Sample]:
         """The samples that this message completes; oriented says if it is the orientation of its instant."""

@@ -95,7 +95,7 @@ class TextDecoder(Receiver):
     def _line(self, line: str) -> Sample | None:
         # A line that is too long comes as an empty one.
         if not line or not line.isascii():
-            self._bad()
+            self._count_bad()
             return None
         values: Mapping[str, str | None]
         if self._regex is not None:
@@ -118,7 +118,7 @@ class TextDecoder(Receiver):
                 return None
             count, places = self._layout
             if len(columns) != count:
-                self._bad()
+                self._count_bad()
                 return None
             values = {name: columns[place] for name, place in places.items()}
         try:
@@ -126,9 +126,9 @@ class TextDecoder(Receiver):
         except (ValueError, OverflowError):
             sample = None
         if sample is None:
-            self._bad()
+            self._count_bad()
             return None
-        self._good()
+        self._count_good()
         self.counters.packets += 1
         return sample
 
@@ -276,39 +276,39 @@ def _encoder(pattern: str) -> Callable[[], Encode]:
 PROTOCOL_ADAFRUIT = Protocol(
     name="adafruit",
     transport="bytes",
-    speed=115200,
-    text='text lines "Quaternion: w, x, y, z" of sketches for Adafruit\'s libraries',
+    default_bitrate=115200,
+    description='text lines "Quaternion: w, x, y, z" of sketches for Adafruit\'s libraries',
     decoder=partial(TextDecoder, "adafruit"),
     encoder=_encoder("adafruit"),
-    alone=True,
+    single_device=True,
 )
 
 PROTOCOL_RAZOR = Protocol(
     name="razor",
     transport="bytes",
-    speed=57600,
-    text='text lines "#YPR=" of the Razor AHRS firmware',
+    default_bitrate=57600,
+    description='text lines "#YPR=" of the Razor AHRS firmware',
     decoder=partial(TextDecoder, "razor"),
     encoder=_encoder("razor"),
-    alone=True,
+    single_device=True,
 )
 
 PROTOCOL_OPENLOG = Protocol(
     name="openlog",
     transport="bytes",
-    speed=115200,
-    text="text lines of OpenLog Artemis as delivered, without orientation",
+    default_bitrate=115200,
+    description="text lines of OpenLog Artemis as delivered, without orientation",
     decoder=partial(TextDecoder, "artemis"),
     encoder=_encoder("artemis"),
-    alone=True,
+    single_device=True,
 )
 
 PROTOCOL_OPENLOG_DMP = Protocol(
     name="openlog-dmp",
     transport="bytes",
-    speed=115200,
-    text="text lines of OpenLog Artemis with the sensor's own orientation",
+    default_bitrate=115200,
+    description="text lines of OpenLog Artemis with the sensor's own orientation",
     decoder=partial(TextDecoder, "artemis-dmp"),
     encoder=_encoder("artemis-dmp"),
-    alone=True,
+    single_device=True,
 )

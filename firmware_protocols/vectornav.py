@@ -153,7 +153,7 @@ class VectorNavDecoder(StreamDecoder):
         mag = vector(values["mag"], _GAUSS_UT) if "mag" in values else None
         temperature = number(*values["temperature"]) if "temperature" in values else None
         time_us = values["time"][0] // 1000 if "time" in values else None
-        self._give(
+        self._emit(
             Sample(0, time_us, None if quat is None else z_up(quat), acc, gyr, mag, temperature), samples
         )
 
@@ -340,19 +340,19 @@ def _ypr(quat: Quaternion) -> Vector3:
 PROTOCOL = Protocol(
     name="vectornav",
     transport="bytes",
-    speed=115200,
-    text="VectorNav binary outputs (reads the ASCII lines too)",
+    default_bitrate=115200,
+    description="VectorNav binary outputs (reads the ASCII lines too)",
     decoder=VectorNavDecoder,
     encoder=uncounted(encode_binary),
-    alone=True,
+    single_device=True,
 )
 
 PROTOCOL_ASCII = Protocol(
     name="vectornav-ascii",
     transport="bytes",
-    speed=115200,
-    text="VectorNav ASCII lines (reads the binary outputs too)",
+    default_bitrate=115200,
+    description="VectorNav ASCII lines (reads the binary outputs too)",
     decoder=VectorNavDecoder,
     encoder=uncounted(encode_ascii),
-    alone=True,
+    single_device=True,
 )

@@ -153,9 +153,9 @@ def _packet(kind: int, data: bytes) -> bytes:
 PROTOCOL = Protocol(
     name="witmotion",
     transport="bytes",
-    speed=9600,
-    text="WitMotion standard protocol: WT61, WT901, HWT901B, HWT905",
+    default_bitrate=9600,
+    description="WitMotion standard protocol: WT61, WT901, HWT901B, HWT905",
     decoder=WitDecoder,
     encoder=uncounted(encode),
-    alone=True,
+    single_device=True,
 )

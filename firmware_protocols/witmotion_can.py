@@ -9,7 +9,7 @@ import struct
 from math import pi, radians
 from typing import Any
 
-from firmware_protocols._recent import Recent
+from firmware_protocols._recent import BoundedDict
 from firmware_protocols._stream import Receiver
 from firmware_protocols._witmotion_cycle import (
     ACC,
@@ -58,7 +58,7 @@ class WitCanDecoder(Receiver):
         super().__init__()
         self._fine = fine_angles
         self._mag_ut = mag_ut
-        self._cycles: Recent[tuple[int, bool], Cycle] = Recent()
+        self._cycles: BoundedDict[tuple[int, bool], Cycle] = BoundedDict()
 
     def feed(self, can_id: int, data: bytes, extended: bool = False) -> list[Sample]:
         """The samples that this frame completes."""
@@ -84,10 +84,10 @@ class WitCanDecoder(Receiver):
         else:
             _, _, axis, angle = _CAN_ANGLE.unpack(data)
             if not 1 <= axis <= 3:
-                return self._bad()
+                return self._count_bad()
             order += axis
             values = {ANGLE_NAMES[axis - 1]: radians(angle / 1000)}
-        self._good()
+        self._count_good()
         return cycle.add(order, values)
 
 
@@ -106,8 +106,8 @@ def encode_can(sample: Sample, *, fine_angles: bool = False, mag_ut: float = 1.0
 PROTOCOL = Protocol(
     name="witmotion-can",
     transport="can",
-    speed=250_000,
-    text="WitMotion on CAN; ids are CAN ids",
+    default_bitrate=250_000,
+    description="WitMotion on CAN; ids are CAN ids",
     decoder=WitCanDecoder,
     encoder=uncounted_can(encode_can),
     ids=range(0x50, 0x56),

@@ -138,7 +138,7 @@ class WitModbusDecoder(StreamDecoder):
             scaled(words[6:9], self._mag_ut),
             temperature,
         )
-        self._give(sample, samples)
+        self._emit(sample, samples)
 
 
 def encode_modbus(sample: Sample, *, count: int = ANGLE_REGISTERS, mag_ut: float = 1.0) -> bytes:
@@ -164,8 +164,8 @@ def _request(sensor: int) -> tuple[bytes, int]:
 PROTOCOL = Protocol(
     name="witmotion-modbus",
     transport="bytes",
-    speed=9600,
-    text="WitMotion on RS-485; ids are Modbus addresses, which are asked in turn",
+    default_bitrate=9600,
+    description="WitMotion on RS-485; ids are Modbus addresses, which are asked in turn",
     decoder=WitModbusDecoder,
     encoder=uncounted(encode_modbus),
     ids=range(0x50, 0x56),

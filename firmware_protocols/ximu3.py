@@ -12,10 +12,10 @@ from math import degrees, isfinite, radians
 
 from firmware_protocols import rotation
 from firmware_protocols._numbers import plausible
-from firmware_protocols._recent import Recent
+from firmware_protocols._recent import BoundedDict
 from firmware_protocols._stream import Receiver
 from firmware_protocols.base import Protocol, uncounted
-from firmware_protocols.pairing import Pairing
+from firmware_protocols.pairing import MessagePairer
 from firmware_protocols.sample import STANDARD_G, Quaternion, Sample, Vector3, unit_quaternion, z_up
 
 FRAMES = ("NWU", "ENU", "NED")
@@ -72,13 +72,13 @@ class Ximu3Decoder(Receiver):
             raise ValueError(f"frame must be one of {', '.join(FRAMES)}, not {frame!r}")
         super().__init__()
         self._ned = frame == "NED"
-        self._pairing = Pairing(self.counters)
+        self._pairing = MessagePairer(self.counters)
         self._rest = b""
         self._has_channels = False
-        self._time: Recent[int, int] = Recent()
-        self._suspect: Recent[int, int] = Recent()
-        self._mag: Recent[int, tuple[int, Vector3]] = Recent()
-        self._temperature: Recent[int, tuple[int, float]] = Recent()
+        self._time: BoundedDict[int, int] = BoundedDict()
+        self._suspect: BoundedDict[int, int] = BoundedDict()
+        self._mag: BoundedDict[int, tuple[int, Vector3]] = BoundedDict()
+        self._temperature: BoundedDict[int, tuple[int, float]] = BoundedDict()
 
     def feed(self, data: bytes) -> list[Sample]:
         """Samples completed by the next bytes of the stream."""
@@ -99,9 +99,9 @@ class Ximu3Decoder(Receiver):
         message = _parse(line) if len(line) <= MAX_MESSAGE else None
         samples = self._take(message) if message is not None else None
         if samples is None:
-            self._bad()
+            self._count_bad()
             return self._at_end(line[-_MAX_TAIL:])
-        self._good()
+        self._count_good()
         if message is not None and not message[1] and message[0] not in self._time:
             # Any length fits these letters: where the time says nothing either, it may be noise.
             return self._at_end(line[-_MAX_TAIL:])
@@ -124,7 +124,7 @@ class Ximu3Decoder(Receiver):
                 continue
             samples = self._take(message)
             if samples is not None:
-                self._good()
+                self._count_good()
                 return samples
         return []
 
@@ -358,9 +358,9 @@ def encode(sample: Sample, *, ascii: bool = False, frame: str = "NWU") -> bytes:
 PROTOCOL = Protocol(
     name="ximu3",
     transport="bytes",
-    speed=115200,
-    text="x-io x-IMU3, ASCII and binary; ids are channels of multiplexed messages",
+    default_bitrate=115200,
+    description="x-io x-IMU3, ASCII and binary; ids are channels of multiplexed messages",
     decoder=Ximu3Decoder,
     encoder=uncounted(encode),
-    alone=True,
+    single_device=True,
 )

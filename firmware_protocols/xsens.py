@@ -225,7 +225,7 @@ class XbusDecoder(StreamDecoder):
         sensor = 0 if frame[1] == _BROADCAST else frame[1]
         if count is not None and not self._sequence.is_new(sensor, count, time_us):
             return
-        self._give(Sample(sensor, time_us, quat or matrix or euler, acc, gyr, mag, temperature), samples)
+        self._emit(Sample(sensor, time_us, quat or matrix or euler, acc, gyr, mag, temperature), samples)
 
 
 def _z_up(quat: Quaternion | None, item: int) -> Quaternion | None:
@@ -318,10 +318,10 @@ def _item(item: int, values: tuple[float, ...]) -> bytes:
 PROTOCOL = Protocol(
     name="xsens",
     transport="bytes",
-    speed=115200,
-    text="Xsens / Movella MTi: Xbus with MTData2; ids are bus ids behind a master",
+    default_bitrate=115200,
+    description="Xsens / Movella MTi: Xbus with MTData2; ids are bus ids behind a master",
     decoder=XbusDecoder,
     encoder=lambda: encode_mtdata2,
     ids=range(1, 7),
-    alone=True,
+    single_device=True,
 )

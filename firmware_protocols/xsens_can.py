@@ -157,8 +157,8 @@ class Mti600CanDecoder(Receiver):
             else:
                 value = (raw[0] * scale, raw[1] * scale, raw[2] * scale)
         if value is None:
-            return self._bad()
-        self._good()
+            return self._count_bad()
+        self._count_good()
         group = self._groups[sensor]
         samples: list[Sample] = []
         if group.opens(kind):
@@ -191,7 +191,7 @@ class Mti600CanDecoder(Receiver):
         sample = Sample(
             sensor, time_us, quat, *(items.get(kind) for kind in ("acc", "gyr", "mag", "temperature"))
         )
-        self._give(sample, samples)
+        self._emit(sample, samples)
 
 
 def encode_mti600(
@@ -273,8 +273,8 @@ def _encoder() -> Encode:
 PROTOCOL = Protocol(
     name="xsens-can",
     transport="can",
-    speed=250_000,
-    text="Xsens / Movella MTi-600 on CAN; sensor n has the ids as delivered plus n times 0x100",
+    default_bitrate=250_000,
+    description="Xsens / Movella MTi-600 on CAN; sensor n has the ids as delivered plus n times 0x100",
     decoder=_decoder,
     encoder=_encoder,
     ids=range(6),

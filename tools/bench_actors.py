@@ -65,7 +65,7 @@ def main(data: Path, models: tuple[str, ...], parts: tuple[str, ...]) -> None:
     click.echo("| | 15 joints, deg / SIP error, deg / position, cm | without an actor's constants | frames |")
     click.echo("|---|---|---|---|")
     for model in models:
-        info = archive.inspect(archive.find(model))
+        info = archive.read_info(archive.find_archive(model))
         module = archive.load(info, trust=True)
         mode: Mode = next(mode for mode in modes_of(info.metadata) if mode.name == "stream")
         for part in parts:

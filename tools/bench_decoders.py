@@ -28,7 +28,7 @@ CAN_BITS = {False: 47, True: 67}
 
 def wires(spoken: Protocol) -> list[Any]:
     """The packets of all samples, in the order they come."""
-    ids = [0] if spoken.alone else list(spoken.ids)
+    ids = [0] if spoken.single_device else list(spoken.ids)
     encode = spoken.encoder()
     result = []
     for number in range(SAMPLES):
@@ -98,7 +98,7 @@ def main() -> None:
         cost = microseconds(spoken, packets)
         per_s = SENSORS * RATE
         kbit = line_bits(spoken, packets) * per_s / 1000
-        line = "CAN" if spoken.transport == "can" else "six ports" if spoken.alone else "one port"
+        line = "CAN" if spoken.transport == "can" else "six ports" if spoken.single_device else "one port"
         print(f"| {name} | {line} | {kbit:.0f} | {cost:.1f} | {cost * per_s / 1e4:.2f} % |", flush=True)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from edgepose import calibration
 from edgepose import rotations as rot
 from edgepose.analysis.metrics import format_table, summary
-from edgepose.formats.recordings.base import samples
+from edgepose.formats.recordings.base import iter_samples
 from edgepose.imu import Recording, SensorData
 from edgepose.inference import archive
 from edgepose.placements import BONES, PLACEMENTS
@@ -24,19 +24,19 @@ from edgepose.rotations import Array
 from edgepose.skeleton import default_body, forward_kinematics, local_from_global
 from edgepose_export.mocap import Motion, read_motion, resample
 from edgepose_export.synthesis.heading_routine import with_exercises
-from edgepose_export.synthesis.imu_errors import BMI270, Chip, raw
+from edgepose_export.synthesis.imu_errors import BMI270, ImuErrorModel, raw
 from edgepose_export.synthesis.virtual_imus import random_mounting, virtual_imus
 
 CLIP = Path(__file__).parent / "data" / "09_12.bvh"
 RATE, STAND_S, HOLD = 100.0, 6.0, (1.0, 5.0)
 EXERCISES_S = len(calibration.ROUTINE) * calibration.EXERCISE_S
-QUIET = Chip(0.0, 0.0, 0.0, 0.0, 0.0)
+QUIET = ImuErrorModel(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class Way(NamedTuple):
     """How orientations are made and headings come together: a chip, a filter, a magnetometer, a reset."""
 
-    chip: Chip | None = None
+    chip: ImuErrorModel | None = None
     filter: str = "none"
     magnetometer: bool = False
     reset: str | None = None
@@ -66,8 +66,8 @@ def ideal(motion: Motion, mounting: Array) -> Recording:
 
 def oriented(recording: Recording, way: Way, seed: int) -> Recording:
     """What is left of it after the chip and the filter."""
-    from edgepose.formats.recordings.base import from_samples
-    from edgepose.orientation import Orienter
+    from edgepose.formats.recordings.base import recording_from_samples
+    from edgepose.orientation import OrientationEstimator
 
     if way.chip is None:
         return recording
@@ -75,21 +75,21 @@ def oriented(recording: Recording, way: Way, seed: int) -> Recording:
         name: raw(data, way.chip, seed + i, way.magnetometer)
         for i, (name, data) in enumerate(recording.sensors.items())
     }
-    orienter = Orienter(way.filter, way.magnetometer)
-    return from_samples(orienter.orient(list(samples(Recording(chips, {})))))
+    orienter = OrientationEstimator(way.filter, way.magnetometer)
+    return recording_from_samples(orienter.orient(list(iter_samples(Recording(chips, {})))))
 
 
 def calibrated(recording: Recording, way: Way, truth: Recording) -> calibration.Calibration:
     """The calibration from the standing and the exercises."""
     everything = calibration.hold_from_recording(recording)
-    held = calibration.check_hold(calibration.cut(everything, *HOLD))
+    held = calibration.check_hold(calibration.trim(everything, *HOLD))
     offset = None
     if way.reset == "motion":
-        moving = calibration.cut(everything, STAND_S, STAND_S + EXERCISES_S)
+        moving = calibration.trim(everything, STAND_S, STAND_S + EXERCISES_S)
         offset = calibration.headings_from_motion(moving, held.orientation).offset
     elif way.reset == "true":
-        true = calibration.check_hold(calibration.cut(calibration.hold_from_recording(truth), *HOLD))
-        offset = rot.heading(rot.quat_multiply(true.orientation, rot.quat_conjugate(held.orientation)))
+        true = calibration.check_hold(calibration.trim(calibration.hold_from_recording(truth), *HOLD))
+        offset = rot.yaw_of_quat(rot.quat_multiply(true.orientation, rot.quat_conjugate(held.orientation)))
     elif way.magnetometer:  # the field points along Y of the inertial frame, as headings count here
         offset = np.zeros(len(PLACEMENTS))
     return calibration.calibrate(
@@ -100,15 +100,15 @@ def calibrated(recording: Recording, way: Way, truth: Recording) -> calibration.
 def run(recording: Recording, found: calibration.Calibration, model: str) -> tuple[Array, Array, Array]:
     """Times (T,), poses (T, 24, 3, 3) and measured bones (T, 6, 3, 3)."""
     from edgepose.inference.engine import StreamEngine
-    from edgepose.pipeline.frame_synchronizer import FrameClock
+    from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 
-    info = archive.inspect(archive.find(model))
+    info = archive.read_info(archive.find_archive(model))
     engine = StreamEngine(archive.load(info), info.metadata["past"], info.metadata["future"])
-    clock = FrameClock()
-    clock.push(samples(recording), 0.0)
+    clock = FrameSynchronizer()
+    clock.push(iter_samples(recording), 0.0)
     bones, outputs, frames = [], [], clock.flush()
     for frame in frames:
-        r_tb, force = calibration.apply(found, frame.orientation, frame.force)
+        r_tb, force = calibration.apply_calibration(found, frame.orientation, frame.force)
         bones.append(r_tb)
         outputs += engine.push(frame, r_tb.astype(np.float32), force.astype(np.float32))
     outputs += engine.finish()

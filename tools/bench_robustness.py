@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from edgepose import rotations as rot
 from edgepose.analysis.metrics import joint_angle_error, sip_error
 from edgepose.inference import archive
-from edgepose.pipeline.dropout import carried
+from edgepose.pipeline.dropout import extrapolate_dropouts
 from edgepose.placements import PLACEMENTS, ROOT
 from edgepose_export.evaluation.evaluate import Mode, groups, modes_of, run_archive, takes_of
 from edgepose_export.training.dataset import RATE, Take
@@ -68,7 +68,7 @@ def without(sensor: int) -> Fault:
         )
         here, before = np.arange(len(PLACEMENTS)) == sensor, None
         for t, held in enumerate(gone[:, None] & here):
-            before, acceleration[t] = carried(orientation[t], acceleration[t], held, before)
+            before, acceleration[t] = extrapolate_dropouts(orientation[t], acceleration[t], held, before)
             orientation[t] = before
         return take._replace(orientation=orientation, acceleration=acceleration)
 
@@ -128,7 +128,7 @@ def errors(poses: Sequence[Array], takes: Sequence[Take], fault: Fault) -> list[
 def main(data: Path, models: tuple[str, ...], parts: tuple[str, ...], every: int) -> None:
     """What a lost sensor, a slipped sensor or a wrong heading costs in accuracy."""
     for model in models:
-        info = archive.inspect(archive.find(model))
+        info = archive.read_info(archive.find_archive(model))
         module = archive.load(info, trust=True)
         mode: Mode = next(mode for mode in modes_of(info.metadata) if mode.name == "stream")
         for part in parts:

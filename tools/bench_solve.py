@@ -29,7 +29,7 @@ from edgepose.placements import BONES, PLACEMENTS
 from edgepose.sip.bodies import scaled, sensor_points, shaped_body
 from edgepose.sip.energy import Weights, second_difference
 from edgepose.sip.measurements import Measurements
-from edgepose.sip.parameterisation import Rig, hinge_rig, smpl_rig
+from edgepose.sip.parameterisation import PoseParameterisation, hinge_rig, smpl_rig
 from edgepose.sip.prior import Prior, load_prior
 from edgepose.sip.solve import Settings, solve
 from edgepose.skeleton import Body, default_body, forward_kinematics
@@ -175,7 +175,7 @@ def published(folder: Path) -> Iterator[Sample]:
         )
 
 
-def solver(method: str, rig: Rig, body: Body, weights: Weights) -> Method:
+def solver(method: str, rig: PoseParameterisation, body: Body, weights: Weights) -> Method:
     """Poses (T, 24, 3, 3) that SIP or SOP finds."""
     settings = Settings(method, rig, sensor_points(body, PLACEMENTS), weights)
     return lambda measurements: np.concatenate([p.rotations for p in solve(measurements, settings)])
@@ -187,7 +187,7 @@ def network(name: str, mode: str) -> Method:
     from edgepose_export.evaluation.evaluate import modes_of, run_archive
     from edgepose_export.training.dataset import Take
 
-    info = archive.inspect(archive.find(name))
+    info = archive.read_info(archive.find_archive(name))
     module = archive.load(info)
     chosen = next(m for m in modes_of(info.metadata) if m.name == mode)
 

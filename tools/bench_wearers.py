@@ -36,8 +36,8 @@ import torch
 
 from edgepose.calibration import Calibration, save
 from edgepose.inference import archive
-from edgepose.inference.engine import BatchEngine, Body
-from edgepose.inference.quantisation import pack
+from edgepose.inference.engine import EngineInput, MultiWearerEngine
+from edgepose.inference.quantisation import quantise_weights
 from edgepose.placements import PLACEMENTS
 from edgepose.sinks.udp import decode_binary
 from firmware_protocols.registry import PROTOCOLS
@@ -80,11 +80,11 @@ class Whole(NamedTuple):
 
 def network_us(model: str, wearers: int) -> float:
     """Processor time of a step of the network a frame a wearer, microseconds; median over rounds."""
-    info = archive.inspect(archive.find(model))
+    info = archive.read_info(archive.find_archive(model))
     module = archive.load(info)
-    pack(module, info)
-    engine = BatchEngine(module, info.metadata["past"], info.metadata["future"], wearers)
-    body = Body(None, np.tile(np.eye(3, dtype=np.float32), (6, 1, 1)), np.zeros((6, 3), np.float32))
+    quantise_weights(module, info)
+    engine = MultiWearerEngine(module, info.metadata["past"], info.metadata["future"], wearers)
+    body = EngineInput(None, np.tile(np.eye(3, dtype=np.float32), (6, 1, 1)), np.zeros((6, 3), np.float32))
     bodies = dict.fromkeys(range(wearers), body)
     costs = []
     for _ in range(15):
@@ -229,7 +229,7 @@ def whole(model: str, wearers: int, seconds: float, core: int) -> Whole:
             sender.terminate()
             sender.join()
     poses = [decode_binary(datagram.data) for datagram in came]
-    ahead_s = archive.inspect(archive.find(model)).metadata["future"] / RATE
+    ahead_s = archive.read_info(archive.find_archive(model)).metadata["future"] / RATE
     ages = np.array(
         [datagram.at_s - pose.time_s - ahead_s for datagram, pose in zip(came, poses, strict=True)]
     )

@@ -31,7 +31,7 @@ def main(models: tuple[str, ...], data: Path, parts: tuple[str, ...], out: Path)
     torch.set_num_threads(1)
     points: dict[str, dict[str, tuple[float, float]]] = {}
     for name in models:
-        info = archive.inspect(archive.find(name))
+        info = archive.read_info(archive.find_archive(name))
         mode = next(mode for mode in modes_of(info.metadata) if mode.name == "stream")
         measured = compare(lambda info=info: archive.load(info, trust=True), data, parts, mode)
         costs = {

@@ -59,8 +59,8 @@ FILM_PIXELS, FILM_METRES = (640, 440), 3.1
 def arms_down(degrees: float) -> Array:
     """The T-pose (24, 3, 3) with both arms lowered at the shoulders."""
     pose = np.tile(np.eye(3), (24, 1, 1))
-    pose[16] = rot.about_axis("z", -np.deg2rad(degrees))
-    pose[17] = rot.about_axis("z", np.deg2rad(degrees))
+    pose[16] = rot.rotation_about_axis("z", -np.deg2rad(degrees))
+    pose[17] = rot.rotation_about_axis("z", np.deg2rad(degrees))
     return pose
 
 

@@ -83,7 +83,7 @@ class Sender:
     def __init__(self, protocol: Protocol) -> None:
         """Nothing sent yet."""
         self._encode = protocol.encoder()
-        self._ids = [0] if protocol.alone else list(protocol.ids)
+        self._ids = [0] if protocol.single_device else list(protocol.ids)
         self._bytes = protocol.transport == "bytes"
         self._count = 0
 

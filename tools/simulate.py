@@ -270,10 +270,10 @@ def slcan_line(frame: Frame) -> bytes:
 def open_lines(spoken: Format, bus: str | None) -> list[Line]:
     """One line for all six sensors, or six."""
     if bus is not None:
-        return [Bus(bus, spoken.speed)]
+        return [Bus(bus, spoken.default_bitrate)]
     if spoken.transport == "can":
         return [Pty(slcan=True)]
-    return [Pty() for _ in range(len(PLACEMENTS) if spoken.alone else 1)]
+    return [Pty() for _ in range(len(PLACEMENTS) if spoken.single_device else 1)]
 
 
 # --- playing ------------------------------------------------------------------------------------------------
@@ -467,10 +467,10 @@ def parse_kill(ctx: click.Context, param: click.Parameter, values: Sequence[str]
 def simulate(recording: Recording, spoken: Format, bus: str | None, stand: bool, faults: Faults) -> None:
     """Opens the lines and plays the recording on them."""
     start_s = min(float(data.time_s[0]) for data in recording.sensors.values())
-    ids = [0] * len(PLACEMENTS) if spoken.alone else list(spoken.ids)
+    ids = [0] * len(PLACEMENTS) if spoken.single_device else list(spoken.ids)
     if faults.duplicate_id:
         ids[1] = ids[0]
-    encoders = [spoken.encoder() for _ in range(len(PLACEMENTS) if spoken.alone else 1)]
+    encoders = [spoken.encoder() for _ in range(len(PLACEMENTS) if spoken.single_device else 1)]
     sensors = []
     for index, data in enumerate(recording.sensors.values()):
         sensor = Sensor(index, data, start_s, encoders[index % len(encoders)])
@@ -556,7 +556,7 @@ def main(
         raise click.UsageError(f"{protocol} does not go over CAN")
     if corrupt and spoken.transport == "can":
         raise click.UsageError("a CAN controller passes no wrong bits on; use --loss")
-    if duplicate_id and spoken.alone:
+    if duplicate_id and spoken.single_device:
         raise click.UsageError(f"{protocol} has one sensor on a line, whatever its id")
     # A shell starts what runs in the background deaf to Ctrl-C.
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -75,7 +75,7 @@ LEAST_STEPS = 6
 """Fewer in a row are no walk."""
 
 
-class Walk(NamedTuple):
+class WalkingBout(NamedTuple):
     """Steps one after the other without a pause.
 
     Attributes:
@@ -88,7 +88,7 @@ class Walk(NamedTuple):
     left: NDArray[np.bool_]
 
 
-def walks(local: Array, offsets: Array, rate: float) -> list[Walk]:
+def walks(local: Array, offsets: Array, rate: float) -> list[WalkingBout]:
     """Stretches of walking or running.
 
     Args:
@@ -111,4 +111,4 @@ def walks(local: Array, offsets: Array, rate: float) -> list[Walk]:
     # A walk ends where the feet do not alternate, or after a pause.
     pause = (np.diff(frames) > SLOWEST_STEP_S * rate) | (is_left[1:] == is_left[:-1])
     starts = np.concatenate([[0], np.flatnonzero(pause) + 1, [len(frames)]])
-    return [Walk(frames[a:b], is_left[a:b]) for a, b in pairwise(starts) if b - a >= LEAST_STEPS]
+    return [WalkingBout(frames[a:b], is_left[a:b]) for a, b in pairwise(starts) if b - a >= LEAST_STEPS]

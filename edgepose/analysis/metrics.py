@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edgepose.rotations import angle_between
+from edgepose.rotations import geodesic_angle
 from edgepose.skeleton import PREDICTED, UNOBSERVED, forward_kinematics
 
 Array = NDArray[np.float64]
@@ -45,7 +45,7 @@ HEADINGS = {
 """The same, short enough for the head of a column."""
 
 
-class Measure(NamedTuple):
+class Metric(NamedTuple):
     """Mean and standard deviation of a measure over a number of frames; NaN where there are none."""
 
     mean: float
@@ -77,7 +77,7 @@ def joint_angle_error(predicted: ArrayLike, true: ArrayLike, joints: Sequence[in
     rotations, _ = _root_aligned(predicted, no_offsets)
     reference, _ = _root_aligned(true, no_offsets)
     chosen = list(joints)
-    return np.rad2deg(angle_between(rotations[:, chosen], reference[:, chosen])).mean(axis=-1)
+    return np.rad2deg(geodesic_angle(rotations[:, chosen], reference[:, chosen])).mean(axis=-1)
 
 
 def position_error(predicted: ArrayLike, true: ArrayLike, offsets: ArrayLike) -> Array:
@@ -102,12 +102,12 @@ def jitter(local: ArrayLike, offsets: ArrayLike, rate: float) -> Array:
     return np.linalg.norm(np.diff(positions, n=3, axis=0), axis=-1).mean(axis=-1) * rate**3 / 1000.0
 
 
-def measure(values: ArrayLike) -> Measure:
+def measure(values: ArrayLike) -> Metric:
     """Mean, deviation and number of per-frame values, of one sequence or of several joined together."""
     values = np.asarray(values, float)
     if not len(values):
-        return Measure(float("nan"), float("nan"), 0)
-    return Measure(float(values.mean()), float(values.std()), len(values))
+        return Metric(float("nan"), float("nan"), 0)
+    return Metric(float(values.mean()), float(values.std()), len(values))
 
 
 def per_frame(predicted: ArrayLike, true: ArrayLike, offsets: ArrayLike, rate: float) -> dict[str, Array]:
@@ -122,7 +122,7 @@ def per_frame(predicted: ArrayLike, true: ArrayLike, offsets: ArrayLike, rate: f
     }
 
 
-def summary(predicted: ArrayLike, true: ArrayLike, offsets: ArrayLike, rate: float) -> dict[str, Measure]:
+def summary(predicted: ArrayLike, true: ArrayLike, offsets: ArrayLike, rate: float) -> dict[str, Metric]:
     """All measures of one sequence.
 
     Args:
@@ -132,12 +132,12 @@ def summary(predicted: ArrayLike, true: ArrayLike, offsets: ArrayLike, rate: flo
         rate: frames a second, Hz.
 
     Returns:
-        A `Measure` for each key of `LABELS`.
+        A `Metric` for each key of `LABELS`.
     """
     return {key: measure(values) for key, values in per_frame(predicted, true, offsets, rate).items()}
 
 
-def format_table(summaries: Mapping[str, Mapping[str, Measure]]) -> str:
+def format_table(summaries: Mapping[str, Mapping[str, Metric]]) -> str:
     """A table to print: a line a method, a column a measure, in each cell "mean ± deviation".
 
     Numbers of frames, those of the errors, stand in a column of their own where methods differ in them,

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.analysis.figures import INK, PREDICTION, require_matplotlib, skeleton_strip
-from edgepose.analysis.joint_angles import ANGLES, LIMBS, Walk, joint_angles, walks
+from edgepose.analysis.joint_angles import ANGLES, LIMBS, WalkingBout, joint_angles, walks
 from edgepose.placements import PLACEMENTS
-from edgepose.pose import Poses, held_sensors, longest_holds
+from edgepose.pose import PoseSequence, held_sensors, longest_holds
 from edgepose.skeleton import Body
 from edgepose.utils.durable_files import write_whole
 
@@ -41,7 +41,7 @@ img { max-width: 100%; } .note { color: #666; }
 """
 
 
-def write_report(path: Path, poses: Poses, body: Body, name: str, overwrite: bool = True) -> None:
+def write_report(path: Path, poses: PoseSequence, body: Body, name: str, overwrite: bool = True) -> None:
     """Write the page.
 
     Args:
@@ -89,7 +89,7 @@ def _image(png: bytes, about: str) -> str:
     return f"<img alt='{about}' src='data:image/png;base64,{base64.b64encode(png).decode()}'>"
 
 
-def _strip(poses: Poses, times: Array, body: Body) -> bytes:
+def _strip(poses: PoseSequence, times: Array, body: Body) -> bytes:
     chosen = np.unique(np.linspace(0, len(times) - 1, FIGURES).round().astype(int))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "strip.png"
@@ -109,7 +109,7 @@ def extremes(values: Array) -> NDArray[np.int64]:
     return np.unique(np.minimum(rows, len(values) - 1))
 
 
-def _plots(times: Array, angles: dict[str, Array], found: Sequence[Walk]) -> bytes:
+def _plots(times: Array, angles: dict[str, Array], found: Sequence[WalkingBout]) -> bytes:
     """A panel an angle, left and right in one."""
     from matplotlib.figure import Figure
 
@@ -147,7 +147,7 @@ def _ranges(angles: dict[str, Array]) -> str:
     return f"{table}<p class='note'>{note}</p>"
 
 
-def _steps(found: Sequence[Walk], times: Array, rate: float) -> list[str]:
+def _steps(found: Sequence[WalkingBout], times: Array, rate: float) -> list[str]:
     """Counts, cadence and evenness of all walks."""
     if not found:
         return ["<p>No walking was found.</p>"]
@@ -165,7 +165,7 @@ def _steps(found: Sequence[Walk], times: Array, rate: float) -> list[str]:
     return [_table(("walking", ""), rows)]
 
 
-def _sensors(poses: Poses) -> list[str]:
+def _sensors(poses: PoseSequence) -> list[str]:
     """How often each sensor's last values were repeated."""
     held, rate = held_sensors(poses.held), poses.rate
     rows = [

@@ -162,5 +162,5 @@ def same_heading(quat: Array, trial: Trial) -> Array:
     """
     moving = np.flatnonzero(trial.movement & ~np.isnan(trial.quat[:, 0]))
     start = moving[moving < moving[0] + _START_S * trial.rate]
-    error = rot.heading(rot.quat_multiply(quat[start], rot.quat_conjugate(trial.quat[start])))
-    return rot.quat_multiply(rot.about_z(-np.angle(np.exp(1j * error).mean())), quat)
+    error = rot.yaw_of_quat(rot.quat_multiply(quat[start], rot.quat_conjugate(trial.quat[start])))
+    return rot.quat_multiply(rot.quat_about_z(-np.angle(np.exp(1j * error).mean())), quat)

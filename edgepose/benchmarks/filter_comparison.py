@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edgepose.benchmarks.broad import Trial, errors, read_trial, same_heading
-from edgepose.benchmarks.reference_filters import Contender, contenders
+from edgepose.benchmarks.reference_filters import ReferenceFilter, contenders
 from edgepose.orientation.filter import OrientationFilter
 
 WARM_UP = 300
@@ -77,7 +77,7 @@ def _beginning(trial: Trial) -> Trial:
     return trial._replace(gyr=gyr, acc=acc, mag=mag)
 
 
-def _score(contender: Contender, trial: Trial, magnetometer: bool) -> Score:
+def _score(contender: ReferenceFilter, trial: Trial, magnetometer: bool) -> Score:
     started = time.process_time()
     quat = contender.run(trial, magnetometer)
     us = (time.process_time() - started) / len(quat) * 1e6

@@ -18,7 +18,7 @@ from firmware_protocols.sample import STANDARD_G
 Array = NDArray[np.float64]
 
 
-class Contender(NamedTuple):
+class ReferenceFilter(NamedTuple):
     """A filter.
 
     Attributes:
@@ -32,15 +32,21 @@ class Contender(NamedTuple):
     run: Callable[[Trial, bool], Array]
 
 
-def contenders() -> list[Contender]:
+def contenders() -> list[ReferenceFilter]:
     """Those that can run here."""
-    result = [Contender("edgepose", False, _kalman), Contender("edgepose smoother", True, _smoother)]
+    result = [
+        ReferenceFilter("edgepose", False, _kalman),
+        ReferenceFilter("edgepose smoother", True, _smoother),
+    ]
     if find_spec("vqf"):
-        result += [Contender("vqf", False, _vqf), Contender("offlineVQF", True, _offline_vqf)]
+        result += [ReferenceFilter("vqf", False, _vqf), ReferenceFilter("offlineVQF", True, _offline_vqf)]
     if find_spec("imufusion"):
-        result.append(Contender("imufusion", False, _imufusion))
+        result.append(ReferenceFilter("imufusion", False, _imufusion))
     if find_spec("ahrs"):
-        result += [Contender("ahrs Madgwick", False, _madgwick), Contender("ahrs Mahony", False, _mahony)]
+        result += [
+            ReferenceFilter("ahrs Madgwick", False, _madgwick),
+            ReferenceFilter("ahrs Mahony", False, _mahony),
+        ]
     return result
 
 
@@ -112,7 +118,7 @@ def _madgwick(trial: Trial, magnetometer: bool) -> Array:
     mag = {"mag": trial.mag} if magnetometer else {}
     quat = Madgwick(gyr=trial.gyr, acc=trial.acc, **mag, frequency=trial.rate, gain=0.12).Q
     # It has X to the north.
-    return rot.quat_multiply(rot.about_z(np.pi / 2.0), quat)
+    return rot.quat_multiply(rot.quat_about_z(np.pi / 2.0), quat)
 
 
 def _mahony(trial: Trial, magnetometer: bool) -> Array:

@@ -25,17 +25,18 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from edgepose.calibration import GRAVITY, Calibration, apply
-from edgepose.calibration.rezero import Headings
+from edgepose.calibration import GRAVITY, Calibration, apply_calibration
+from edgepose.calibration.rezero import HeadingRezero
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuFrame, ImuSample
 from edgepose.inference import archive
 from edgepose.inference.engine import Engine, StreamEngine, WindowEngine
 from edgepose.inference.features import INPUTS
-from edgepose.inference.quantisation import PRECISIONS, pack
-from edgepose.orientation import Orienter
-from edgepose.pipeline.frame_synchronizer import FrameClock
-from edgepose.pipeline.run import Walk, pose_frame, run
+from edgepose.inference.quantisation import PRECISIONS, quantise_weights
+from edgepose.orientation import OrientationEstimator
+from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
+from edgepose.pipeline.run import run
+from edgepose.pipeline.wearer_pipeline import WearerPipeline, pose_frame
 from edgepose.placements import PLACEMENTS
 from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.udp import UdpSink, encode_binary, encode_json
@@ -116,17 +117,17 @@ def step_costs(engine: Engine, folder: Path) -> dict[str, float]:
         engine: makes the poses.
         folder: to write into.
     """
-    decoder, clock = PROTOCOLS["native"].decoder(), FrameClock(RATE)
-    headings, orienter = Headings(_calibration()), Orienter("kalman")
+    decoder, clock = PROTOCOLS["native"].decoder(), FrameSynchronizer(RATE)
+    headings, orienter = HeadingRezero(_calibration()), OrientationEstimator("kalman")
 
     def to_frames(samples: list[ImuSample]) -> list[ImuFrame]:
         clock.push(samples, samples[-1].time_s)
         return clock.frames(samples[-1].time_s)
 
     def calibrated(frame: ImuFrame) -> tuple[ImuFrame, Any, Any]:
-        calibration = headings.at(frame)
+        calibration = headings.calibration_for(frame)
         assert calibration is not None, "the headings are known"
-        return frame, *apply(calibration, frame.orientation, frame.force)
+        return frame, *apply_calibration(calibration, frame.orientation, frame.force)
 
     costs = {}
     samples, costs["decode"] = _each(lambda chunk: _decode(decoder, chunk), _chunks())
@@ -180,7 +181,7 @@ def whole_walk(engine: Engine, paced: bool) -> Latency:
         listener.bind(("127.0.0.1", 0))
         with UdpSink("127.0.0.1", listener.getsockname()[1], "binary") as sink:
             summary = run(
-                Walk(FrameClock(RATE), Headings(_calibration()), [sink]),
+                WearerPipeline(FrameSynchronizer(RATE), HeadingRezero(_calibration()), [sink]),
                 source(),
                 engine,
             )
@@ -255,7 +256,7 @@ def _reference(about: dict[str, Any]) -> Callable[[], object]:
 def load_engine(info: archive.ArchiveInfo, trust: bool, precision: str, mode: str = "stream") -> Engine:
     """A model ready to run in its default past and future, with what is alive put aside as `run` does."""
     module = archive.load(info, trust)
-    pack(module, info, precision)
+    quantise_weights(module, info, precision)
     kind = StreamEngine if mode == "stream" else WindowEngine
     engine = kind(module, info.metadata["past"], info.metadata["future"])
     gc.collect()

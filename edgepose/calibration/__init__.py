@@ -9,21 +9,21 @@ from edgepose.calibration.checks import GRAVITY, HoldSummary, MovedError, check_
 from edgepose.calibration.functional import EXERCISE_S, ROUTINE, WeakMotionError, headings_from_motion
 from edgepose.calibration.headings import (
     HeadingReset,
-    heading_offsets,
     headings_from_axis,
     headings_from_mounting,
     headings_from_pose,
+    headings_side_by_side,
 )
 from edgepose.calibration.json_format import from_json, load_calibration, save, to_json
 from edgepose.calibration.mounting import mounting, mounting_warnings
-from edgepose.calibration.sensor_to_segment import POSES, Calibration, apply, calibrate
+from edgepose.calibration.sensor_to_segment import POSES, Calibration, apply_calibration, calibrate
 from edgepose.calibration.static_pose import (
     Hold,
     SensorHold,
-    cut,
     hold_from_recording,
     hold_from_samples,
     stillest_start,
+    trim,
 )
 
 __all__ = [
@@ -38,18 +38,17 @@ __all__ = [
     "MovedError",
     "SensorHold",
     "WeakMotionError",
-    "apply",
+    "apply_calibration",
     "body_from_inertial",
     "calibrate",
     "check_body_frame",
     "check_hold",
-    "cut",
     "from_json",
-    "heading_offsets",
     "headings_from_axis",
     "headings_from_motion",
     "headings_from_mounting",
     "headings_from_pose",
+    "headings_side_by_side",
     "hold_from_recording",
     "hold_from_samples",
     "load_calibration",
@@ -58,4 +57,5 @@ __all__ = [
     "save",
     "stillest_start",
     "to_json",
+    "trim",
 ]

@@ -13,7 +13,7 @@ from edgepose.calibration.static_pose import (
     Hold,
     SensorHold,
     check_reported,
-    named,
+    sensor_names,
     unit_or_zero,
 )
 from edgepose.errors import CalibrationError
@@ -64,14 +64,16 @@ def check_hold(hold: Hold, advice: str = "stand still and repeat") -> HoldSummar
         CalibrationError: any other fault of the hold; names the sensors and what to do.
     """
     check_reported(hold)
-    few = [f"{name} {len(s.quat)}" for name, s in named(hold) if len(s.quat) < MIN_SAMPLES]
+    few = [f"{name} {len(s.quat)}" for name, s in sensor_names(hold) if len(s.quat) < MIN_SAMPLES]
     if few:
         raise CalibrationError(
             f"too few samples in the hold ({', '.join(few)}; at least {MIN_SAMPLES}): "
             "check the rate and the link, or hold longer"
         )
     broken = [
-        f"{name} ({bad} of {len(s.quat)})" for name, s in named(hold) if (bad := _not_rotations(s.quat))
+        f"{name} ({bad} of {len(s.quat)})"
+        for name, s in sensor_names(hold)
+        if (bad := _not_rotations(s.quat))
     ]
     if broken:
         raise CalibrationError(
@@ -82,7 +84,7 @@ def check_hold(hold: Hold, advice: str = "stand still and repeat") -> HoldSummar
     shared = [
         (name, apart)
         for name, quat in zip(PLACEMENTS, quats, strict=True)
-        if (apart := two_sensors(quat)) is not None
+        if (apart := detect_alternating_devices(quat)) is not None
     ]
     if shared:
         raise CalibrationError(
@@ -117,7 +119,7 @@ def _rms(x: Array) -> float:
     return float(np.sqrt(np.mean(np.square(x))))
 
 
-def two_sensors(quat: Array) -> float | None:
+def detect_alternating_devices(quat: Array) -> float | None:
     """Angle in degrees between two devices whose samples (n, 4) alternate under one name; None if one."""
     from_first = _angles(quat, quat[0])
     far = from_first > from_first.max() / 2
@@ -159,7 +161,7 @@ def _gravity(hold: Hold, quats: list[Array]) -> tuple[Array, list[str]]:
                 f"{name} measures {at_rest:.2f} m/s^2 (gravity is removed already; send specific force)"
             )
         elif tilt_deg(force[i]) > GRAVITY_TILT_LIMIT_DEG:
-            wrong.append(f"{name} {tilt_deg(force[i]):.0f} deg off ({why_not_up(quat, acc)})")
+            wrong.append(f"{name} {tilt_deg(force[i]):.0f} deg off ({diagnose_gravity_direction(quat, acc)})")
         elif abs(size / GRAVITY - 1.0) > GRAVITY_SCALE_LIMIT:
             warnings.append(
                 f"{name} measures {size:.2f} m/s^2 at rest, not {GRAVITY:.2f}: check its units and scale"
@@ -172,7 +174,7 @@ def _gravity(hold: Hold, quats: list[Array]) -> tuple[Array, list[str]]:
     return force, warnings
 
 
-def why_not_up(quat: Array, acc: Array) -> str:
+def diagnose_gravity_direction(quat: Array, acc: Array) -> str:
     """A guess at the convention that a device uses instead of ours, from one hold."""
     guesses: list[tuple[str, Array]] = [
         ("looks negated: acceleration instead of specific force, or Z down", -rot.quat_rotate(quat, acc)),

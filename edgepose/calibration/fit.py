@@ -95,7 +95,7 @@ def fit_pose(calibration: Calibration, orientation: Array) -> PoseFit:
         2.0
         * np.arctan2(np.hypot(between[..., 1], between[..., 2]), np.hypot(between[..., 0], between[..., 3]))
     )
-    turn = rot.heading(between) - calibration.heading_offset[:, None]
+    turn = rot.yaw_of_quat(between) - calibration.heading_offset[:, None]
     places = np.arange(len(PLACEMENTS))
     own_tilt, own_heading = tilt[places, places], from_median(-turn[places, places])
     order = _other_order(calibration, tilt, turn, own_tilt, own_heading)

@@ -44,12 +44,12 @@ class HeadingReset(NamedTuple):
 def turn_about_z(measured: Array, wanted: Array) -> HeadingReset:
     """The turns about Z that bring orientations (6, 4) nearest to wanted ones (6, 4) or (4,)."""
     between = rot.quat_multiply(wanted, rot.quat_conjugate(measured))
-    yaw = rot.heading(between)
+    yaw = rot.yaw_of_quat(between)
     tilt = 2.0 * np.arctan2(np.hypot(between[:, 1], between[:, 2]), np.hypot(between[:, 0], between[:, 3]))
     return HeadingReset(np.arctan2(np.sin(yaw), np.cos(yaw)), np.degrees(tilt))
 
 
-def heading_offsets(still: Hold) -> HeadingReset:
+def headings_side_by_side(still: Hold) -> HeadingReset:
     """Heading reset (DIP 4.5) from all six sensors lying side by side in one orientation.
 
     Raises:

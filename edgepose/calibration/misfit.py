@@ -32,7 +32,7 @@ COMPARE_S = 2.0
 _EVERY_S = 0.5
 
 
-class Misfits:
+class MisfitDetector:
     """Watches frames; each thing is told once."""
 
     def __init__(self, calibration: Calibration, compare: Callable[[], str | None] = lambda: None) -> None:
@@ -52,7 +52,7 @@ class Misfits:
         self._told_no_pose = False
         self._impossible_s = dict.fromkeys(PLACEMENTS, 0.0)
 
-    def of(self, frame: ImuFrame, bones: Array) -> list[str]:
+    def update(self, frame: ImuFrame, bones: Array) -> list[str]:
         """What there is to tell of a frame, one line each.
 
         Args:

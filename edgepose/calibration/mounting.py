@@ -46,7 +46,7 @@ def mounting_warnings(calibration: Calibration, said: Mapping[str, str | None], 
 
     def fits(sensor: int, place: int) -> bool:
         r = wanted[place]
-        return r is None or bool(np.degrees(rot.angle_between(sits[sensor], r)) < WRONG_DEG)
+        return r is None or bool(np.degrees(rot.geodesic_angle(sits[sensor], r)) < WRONG_DEG)
 
     wrong = [i for i in range(len(PLACEMENTS)) if not fits(i, i)]
     lines = []

@@ -40,7 +40,7 @@ REPEAT_S = 5.0
 _POSE = {"straight": "stand straight, arms hanging, palms to the thighs", "t-pose": "stand in the T-pose"}
 
 
-class Headings:
+class HeadingRezero:
     """The calibration of each frame of a run."""
 
     def __init__(
@@ -49,7 +49,7 @@ class Headings:
         *,
         hold_first: bool = False,
         requests: Callable[[], list[float]] = list,
-        tell: Callable[[str], None] = lambda text: None,
+        notify: Callable[[str], None] = lambda text: None,
     ) -> None:
         """As calibrated.
 
@@ -57,10 +57,10 @@ class Headings:
             calibration: of the wearer.
             hold_first: its headings are worth nothing; there are no poses before the first good hold.
             requests: asked at each frame for new wishes to begin a hold, in how many seconds each.
-            tell: hears what the wearer has to know.
+            notify: hears what the wearer has to know.
         """
         self._calibration = calibration
-        self._requests, self._tell = requests, tell
+        self._requests, self._notify = requests, notify
         self._old: Array | None = None if hold_first else calibration.heading_offset
         self._new = calibration.heading_offset
         self._blend_from_s = -np.inf
@@ -68,9 +68,9 @@ class Headings:
         self._hold_from_s: float | None = None
         self._told_s = -np.inf
         if hold_first:
-            tell(f"{_POSE[calibration.pose]}, facing forward, and hold still: poses begin after that")
+            notify(f"{_POSE[calibration.pose]}, facing forward, and hold still: poses begin after that")
 
-    def at(self, frame: ImuFrame) -> Calibration | None:
+    def calibration_for(self, frame: ImuFrame) -> Calibration | None:
         """The calibration for a frame; None until the first hold, if there must be one."""
         wishes = self._requests()
         if self._old is None:
@@ -79,7 +79,7 @@ class Headings:
             for delay_s in wishes[-1:]:
                 self._hold, self._hold_from_s = [], frame.time_s + delay_s
                 wait = f"in {delay_s:g} s" if delay_s else "now"
-                self._tell(f"re-zero {wait}: {_POSE[self._calibration.pose]}, facing forward")
+                self._notify(f"re-zero {wait}: {_POSE[self._calibration.pose]}, facing forward")
             if self._hold_from_s is not None and frame.time_s >= self._hold_from_s:
                 self._again(frame)
         return self._blended(frame.time_s)
@@ -94,12 +94,12 @@ class Headings:
             del self._hold[: len(self._hold) // 4 + 1]
             if frame.time_s - self._told_s > REPEAT_S:
                 self._told_s = frame.time_s
-                self._tell(f"waiting for the pose: {error}")
+                self._notify(f"waiting for the pose: {error}")
             return
         self._hold = []
         self._old = self._new = found.offset
         self._calibration = replace(self._calibration, heading_offset=found.offset)
-        self._tell(f"headings found; tilt off by {_by_sensor(found.error_deg)} deg. You can move now")
+        self._notify(f"headings found; tilt off by {_by_sensor(found.error_deg)} deg. You can move now")
 
     def _again(self, frame: ImuFrame) -> None:
         self._hold.append(frame)
@@ -108,12 +108,12 @@ class Headings:
         try:
             found = _from_hold(self._calibration, self._hold)
         except EdgeposeError as error:
-            self._tell(f"headings stay as they are: {error}")
+            self._notify(f"headings stay as they are: {error}")
         else:
             self._old, self._new = self._calibration.heading_offset, found.offset
             self._blend_from_s = frame.time_s
             turned = np.degrees(_wrapped(self._new - self._old))
-            self._tell(
+            self._notify(
                 f"re-zeroed: headings turned by {_by_sensor(turned)} deg; "
                 f"tilt off by {_by_sensor(found.error_deg)} deg"
             )

@@ -23,7 +23,7 @@ def _arms(turn: float) -> Array:
     """R_TB0 (6, 3, 3) with the left forearm turned by `turn` about Z and the right one by the opposite."""
     bones = np.tile(np.eye(3), (len(PLACEMENTS), 1, 1))
     for name, angle in (("left_forearm", turn), ("right_forearm", -turn)):
-        bones[PLACEMENTS.index(name)] = rot.about_axis("z", angle)
+        bones[PLACEMENTS.index(name)] = rot.rotation_about_axis("z", angle)
     return bones
 
 
@@ -63,7 +63,7 @@ class Calibration:
     def _maps(self) -> tuple[Array, Array, Array]:
         """Products q q^T to R_TB (6, 16, 9), force as a row from I to T (6, 3, 3), gravity in T (3,)."""
         r_ti = rot.quat_to_matrix(self.body_from_inertial)
-        left = r_ti @ rot.quat_to_matrix(rot.about_z(self.heading_offset))
+        left = r_ti @ rot.quat_to_matrix(rot.quat_about_z(self.heading_offset))
         right = rot.transpose(rot.quat_to_matrix(self.bone_from_sensor))
         bones = np.einsum("sab,ijbc,scd->sijad", left, _quadratic_form(), right)
         return bones.reshape(-1, 16, 9), rot.transpose(left), r_ti @ np.array([0.0, 0.0, -GRAVITY])
@@ -104,7 +104,7 @@ def calibrate(
     if pose not in POSES:
         raise CalibrationError(f"pose {pose!r} is none of: {', '.join(POSES)}")
     offset = np.zeros(len(PLACEMENTS)) if heading_offset is None else np.asarray(heading_offset, float)
-    orientation = rot.quat_multiply(rot.about_z(offset), summary.orientation)
+    orientation = rot.quat_multiply(rot.quat_about_z(offset), summary.orientation)
     r_ti = body_from_inertial(orientation, body_frame)
     r_bs = rot.transpose(POSES[pose]) @ (r_ti @ rot.quat_to_matrix(orientation))
     return Calibration(
@@ -121,7 +121,9 @@ def calibrate(
     )
 
 
-def apply(calibration: Calibration, orientation: ArrayLike, force: ArrayLike) -> tuple[Array, Array]:
+def apply_calibration(
+    calibration: Calibration, orientation: ArrayLike, force: ArrayLike
+) -> tuple[Array, Array]:
     """Bones and accelerations in the body frame (DIP 4.2, SIP eq. 13); leading dimensions are free.
 
     R_TB = R_TI R_IS inv(R_BS). DIP prints eq. 8 as R_BS R_TS, which would not give R_TB0 back at the

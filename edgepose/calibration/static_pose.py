@@ -73,7 +73,7 @@ def _oriented(time_s: Array, quat: Array, acc: Array, gyr: Array) -> SensorHold:
     return SensorHold(time_s[rows], quat[rows], acc[rows], gyr[rows])
 
 
-def cut(hold: Hold, start_s: float, end_s: float) -> Hold:
+def trim(hold: Hold, start_s: float, end_s: float) -> Hold:
     """The part of a hold from `start_s` up to but without `end_s`, on the source's clock."""
     return [SensorHold(*(column[(s.time_s >= start_s) & (s.time_s < end_s)] for column in s)) for s in hold]
 
@@ -112,17 +112,17 @@ def stillest_start(hold: Hold, seconds: float) -> float:
     return float(starts[np.argmax(spread <= spread.min() + math.radians(0.5))])
 
 
-def named(hold: Hold) -> Iterable[tuple[str, SensorHold]]:
+def sensor_names(hold: Hold) -> Iterable[tuple[str, SensorHold]]:
     """The sensors with their placements."""
     return zip(PLACEMENTS, hold, strict=True)
 
 
 def check_reported(hold: Hold) -> None:
     """Raises EdgeposeError unless every sensor sent orientations."""
-    silent = [name for name, s in named(hold) if not len(s.quat)]
+    silent = [name for name, s in sensor_names(hold) if not len(s.quat)]
     if silent:
         raise CalibrationError(f"nothing from {', '.join(silent)}: check power, link and placement of each")
-    raw = [name for name, s in named(hold) if np.isnan(s.quat).all()]
+    raw = [name for name, s in sensor_names(hold) if np.isnan(s.quat).all()]
     if raw:
         raise CalibrationError(
             f"no orientation from {', '.join(raw)}: set each to send quaternions, "

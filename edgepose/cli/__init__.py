@@ -17,7 +17,7 @@ import click
 from edgepose import __version__
 from edgepose.cli.terminal.messages import prepare, say
 from edgepose.cli.terminal.stop_signal import endings
-from edgepose.errors import as_told
+from edgepose.errors import as_edgepose_error
 
 COMMANDS = (
     "bench",
@@ -101,5 +101,5 @@ def main() -> NoReturn:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         sys.exit(1)
     except Exception as error:
-        say(traceback.format_exc().rstrip() if debug else f"edgepose: {as_told(error)}")
+        say(traceback.format_exc().rstrip() if debug else f"edgepose: {as_edgepose_error(error)}")
         sys.exit(1)

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 from edgepose import calibration
 from edgepose.calibration import HeadingReset, Hold, HoldSummary
-from edgepose.cli.prompts import Guide, all_reporting, held, moved, wait_for_enter
+from edgepose.cli.prompts import Prompter, record_hold, record_motion, wait_for_all_sensors, wait_for_enter
 from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.base import samples
+from edgepose.formats.recordings.base import iter_samples
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.orientation.stage import OrientationStage
 from edgepose.sources import Device, open_source
@@ -28,7 +28,7 @@ def finds_forward(heading_reset: str | None) -> bool:
     return heading_reset is not None and heading_reset.partition(":")[0] in ("motion", "mounting")
 
 
-class Plan(NamedTuple):
+class CalibrationPlan(NamedTuple):
     """What the wearer will do: the command's flags, and how the sensors sit if the heading reset needs it."""
 
     pose: str
@@ -62,24 +62,30 @@ class Measured(NamedTuple):
     devices: Mapping[int, Device]
 
 
-def live(source: SourceConfig, plan: Plan, orient: OrientationStage, say: Guide) -> Measured:
+def live(source: SourceConfig, plan: CalibrationPlan, orient: OrientationStage, say: Prompter) -> Measured:
     """The hold and the heading reset of a wearer in front of a live source."""
     reset = _side_by_side(source, plan, orient, say)
     with open_source(**source.arguments()) as opened:
-        batches = all_reporting((b._replace(samples=orient(b.samples)) for b in opened), say)
+        batches = wait_for_all_sensors((b._replace(samples=orient(b.samples)) for b in opened), say)
         if plan.heading_reset == "live":
-            reset = held(batches, "lying", plan.countdown_s, plan.hold_s, say, calibration.heading_offsets)
+            reset = record_hold(
+                batches, "lying", plan.countdown_s, plan.hold_s, say, calibration.headings_side_by_side
+            )
             wait_for_enter(batches, say)
-        summary = held(batches, plan.pose, plan.countdown_s, plan.hold_s, say, calibration.check_hold)
+        summary = record_hold(batches, plan.pose, plan.countdown_s, plan.hold_s, say, calibration.check_hold)
         # Not before: magnetometers may be slower than the rest.
         _check_north(orient, plan)
         if plan.heading_reset == "motion":
             upright = summary.orientation
-            reset = moved(batches, say, lambda moving: calibration.headings_from_motion(moving, upright))
+            reset = record_motion(
+                batches, say, lambda moving: calibration.headings_from_motion(moving, upright)
+            )
     return Measured(summary, reset or _mounted(plan, summary), None, opened.devices)
 
 
-def recorded(source: SourceConfig, plan: Plan, orient: OrientationStage, say: Guide) -> Measured:
+def recorded(
+    source: SourceConfig, plan: CalibrationPlan, orient: OrientationStage, say: Prompter
+) -> Measured:
     """The hold and the heading reset in a recording."""
     reset = _side_by_side(source, plan, orient, say)
     everything, damage, devices = _read(source, orient)
@@ -90,7 +96,7 @@ def recorded(source: SourceConfig, plan: Plan, orient: OrientationStage, say: Gu
     summary = calibration.check_hold(still, "choose a still part with --from, or record again")
     if plan.heading_reset == "motion":
         end_s = start_s + plan.hold_s
-        moving = calibration.cut(everything, *(plan.motion or (end_s, end_s + ROUTINE_S)))
+        moving = calibration.trim(everything, *(plan.motion or (end_s, end_s + ROUTINE_S)))
         if not all(len(sensor.time_s) for sensor in moving):
             raise EdgeposeError(
                 f"{source.name}: not all six sensors report where the movements should be; say where "
@@ -101,7 +107,7 @@ def recorded(source: SourceConfig, plan: Plan, orient: OrientationStage, say: Gu
 
 
 def _side_by_side(
-    source: SourceConfig, plan: Plan, orient: OrientationStage, say: Guide
+    source: SourceConfig, plan: CalibrationPlan, orient: OrientationStage, say: Prompter
 ) -> HeadingReset | None:
     """Heading reset from a recording of the sensors lying side by side, if there is one.
 
@@ -111,19 +117,19 @@ def _side_by_side(
     if plan.lying is None:
         return None
     say(f"Heading reset from {plan.lying}.")
-    own = orient.anew()
+    own = orient.fresh()
     everything, damage, _ = _read(dataclasses.replace(source, file=plan.lying, port=None, can=None), own)
     if not own.north:
         raise EdgeposeError(
             "the filter's headings begin anew in each recording, so another one cannot reset them: "
             "use --heading-reset motion, live or mounting"
         )
-    return calibration.heading_offsets(
+    return calibration.headings_side_by_side(
         _window(str(plan.lying), (everything, damage), None, plan.hold_s, say)[0]
     )
 
 
-def _mounted(plan: Plan, summary: HoldSummary) -> HeadingReset | None:
+def _mounted(plan: CalibrationPlan, summary: HoldSummary) -> HeadingReset | None:
     """Heading reset from how the sensors sit, if that is wanted."""
     way, _, axis = (plan.heading_reset or "").partition(":")
     if way != "mounting":
@@ -133,7 +139,7 @@ def _mounted(plan: Plan, summary: HoldSummary) -> HeadingReset | None:
     return calibration.headings_from_axis(summary.orientation, axis)
 
 
-def _check_north(orient: OrientationStage, plan: Plan) -> None:
+def _check_north(orient: OrientationStage, plan: CalibrationPlan) -> None:
     """Raises EdgeposeError if a filter has begun with any headings and nothing will bring them together."""
     if orient.mixed:
         raise EdgeposeError(
@@ -159,7 +165,7 @@ def _read(source: SourceConfig, orient: OrientationStage) -> tuple[Hold, str | N
         everything = (
             calibration.hold_from_recording(recording)
             if orient.passes
-            else calibration.hold_from_samples(orient(list(samples(recording))))
+            else calibration.hold_from_samples(orient(list(iter_samples(recording))))
         )
         return everything, recording.damage, {}
     with open_source(**dataclasses.replace(source, realtime=False).arguments()) as opened:
@@ -179,7 +185,7 @@ def _serial_numbers(sensors: Path | None) -> Mapping[int, str] | None:
 
 
 def _window(
-    name: str, read: tuple[Hold, str | None], from_s: float | None, seconds: float, say: Guide
+    name: str, read: tuple[Hold, str | None], from_s: float | None, seconds: float, say: Prompter
 ) -> tuple[Hold, float]:
     """The part of a recording that is a hold, and its start on the recording's clock, seconds."""
     everything, damage = read
@@ -196,4 +202,4 @@ def _window(
         )
     why = "" if from_s is not None else ", the first as still as the stillest"
     say(f"{name}: hold from {start:.2f} to {start + seconds:.2f} s{why}.")
-    return calibration.cut(everything, start, start + seconds), start
+    return calibration.trim(everything, start, start + seconds), start

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from edgepose.cli.options.outputs import check_files
-from edgepose.errors import EdgeposeError, named
+from edgepose.errors import EdgeposeError, prefix_errors
 from edgepose.utils.output_targets import has_reader
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def check_all_files(rigs: Sequence[WearerConfig], model: Path) -> None:
         inputs |= {whose + flag: file for flag, file in _inputs(rig).items()}
     check_files(outputs, inputs)
     for rig in rigs:
-        with named(rig.name):
+        with prefix_errors(rig.name):
             rig.outputs.check()
     if len(rigs) > 1:
         for flag, file in outputs.items():
@@ -76,14 +76,14 @@ def _inputs(rig: WearerConfig) -> dict[str, Path | None]:
 
 def _lines(rig: WearerConfig) -> dict[str, list[int | None]]:
     """The lines that a wearer listens to, and the ids of their sensors on them as far as a map tells."""
-    from edgepose.sources.line_config import links
+    from edgepose.sources.line_config import line_specs
 
     source = rig.source
     if source.file is not None:
         return {"standard input": []} if str(source.file) == "-" else {}
-    with named(rig.name):
+    with prefix_errors(rig.name):
         sensor_map = _map(rig)
-        found = links(
+        found = line_specs(
             *(source.port, source.baud, source.can, source.bitrate, source.fd, source.protocol), sensor_map
         )
     lines: dict[str, list[int | None]] = {}

@@ -31,7 +31,7 @@ _DO = {
 }
 
 
-class Guide:
+class Prompter:
     """Says things to the wearer: on stdout, or on stderr where stdout is the result."""
 
     def __init__(self, err: bool) -> None:
@@ -44,7 +44,7 @@ class Guide:
         (terminal.say if self.err else terminal.show)(text)
 
 
-def all_reporting(batches: Iterator[Batch], say: Guide) -> Iterator[Batch]:
+def wait_for_all_sensors(batches: Iterator[Batch], say: Prompter) -> Iterator[Batch]:
     """The rest of the batches once all six sensors have reported; says which are missing."""
     passed, said = 0.0, 0
     start_s: float | None = None
@@ -68,12 +68,12 @@ def _names(sensors: set[int]) -> str:
     return ", ".join(PLACEMENTS[i] for i in sorted(sensors))
 
 
-def held(
+def record_hold(
     batches: Iterator[Batch],
     pose: str,
     countdown_s: float,
     hold_s: float,
-    say: Guide,
+    say: Prompter,
     check: Callable[[Hold], Any],
 ) -> Any:
     """What `check` makes of a live hold; one with movement in it is repeated."""
@@ -111,7 +111,7 @@ def _during(
     )
 
 
-def _with_progress(batches: Iterator[Batch], seconds: float, say: Guide) -> list[ImuSample]:
+def _with_progress(batches: Iterator[Batch], seconds: float, say: Prompter) -> list[ImuSample]:
     if say.stream.isatty():
         with click.progressbar(length=100, label="Hold still", file=say.stream, show_eta=False) as bar:
             return _during(batches, seconds, lambda passed: bar.update(int(100 * passed / seconds) - bar.pos))
@@ -126,7 +126,7 @@ def _with_progress(batches: Iterator[Batch], seconds: float, say: Guide) -> list
     return _during(batches, seconds, line)
 
 
-def moved(batches: Iterator[Batch], say: Guide, check: Callable[[Hold], Any]) -> Any:
+def record_motion(batches: Iterator[Batch], say: Prompter, check: Callable[[Hold], Any]) -> Any:
     """What `check` makes of the movements of `calibration.ROUTINE`; too little of them is repeated."""
     say("Keep facing the same way and do what comes.")
     for left in range(REPEATS, -1, -1):
@@ -143,7 +143,7 @@ def moved(batches: Iterator[Batch], say: Guide, check: Callable[[Hold], Any]) ->
     raise AssertionError("the last repeat returns or raises")
 
 
-def wait_for_enter(batches: Iterator[Batch], say: Guide) -> None:
+def wait_for_enter(batches: Iterator[Batch], say: Prompter) -> None:
     """Time to put the sensors on; elsewhere than on a terminal --countdown has to give it."""
     if sys.stdin is None or not sys.stdin.isatty():
         return

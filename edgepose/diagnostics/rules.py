@@ -26,7 +26,7 @@ AGREEMENT_LIMIT, GYRO_SCALE_LIMIT = 0.7, 0.25
 DEGREES_IN_RADIAN = 57.3
 
 
-class Finding(NamedTuple):
+class Diagnosis(NamedTuple):
     """The most important thing about a sensor.
 
     Attributes:
@@ -40,19 +40,19 @@ class Finding(NamedTuple):
     problem: bool = False
 
 
-def judge(sensor: SensorHealth) -> Finding:
+def diagnose(sensor: SensorHealth) -> Diagnosis:
     """The most important problem of a sensor; "ok" if there is none."""
     for name, rule in _PROBLEMS.items():
         if (advice := rule(sensor)) is not None:
-            return Finding(name, advice, True)
+            return Diagnosis(name, advice, True)
     if not sensor.rests:
-        return Finding(
+        return Diagnosis(
             "ok, moving",
             f"hold it still for {2 * REST_S:g} s: gravity, noise and bias are only seen at rest",
         )
     if not sensor.orientation:
-        return Finding("ok, raw", "it sends no orientation: calibrate and run with --filter kalman or vqf")
-    return Finding("ok")
+        return Diagnosis("ok, raw", "it sends no orientation: calibrate and run with --filter kalman or vqf")
+    return Diagnosis("ok")
 
 
 def _no_packets(s: SensorHealth) -> str | None:

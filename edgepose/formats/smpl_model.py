@@ -11,7 +11,7 @@ import numpy as np
 from edgepose.errors import FileFormatError
 from edgepose.placements import PLACEMENTS
 from edgepose.skeleton import MAX_HEIGHT, MIN_HEIGHT, PARENTS, Array, Body, default_body
-from edgepose.utils.safe_pickle import Inert, numbers, read_pickle
+from edgepose.utils.safe_pickle import InertObject, numbers, read_pickle
 
 _WHAT = "SMPL model file (.npz or .pkl)"
 _ADVICE = (
@@ -35,7 +35,7 @@ def _is_known(module: str, name: str) -> bool:
 def _regressor(value: Any, n_vertices: int, path: Path) -> Array:
     """The dense (24, V) joint regressor of a dense or sparse one."""
     name, shape = "J_regressor", (len(PARENTS), n_vertices)
-    if not (isinstance(value, Inert) and type(value).__name__ in SPARSE):
+    if not (isinstance(value, InertObject) and type(value).__name__ in SPARSE):
         dense = numbers(value, name, path).astype(float)
         _check_shape(dense.shape, shape, name, path)
         return dense

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from edgepose.errors import ModelError
-from edgepose.inference.quantisation import quantized_quietly
+from edgepose.inference.quantisation import suppress_quantisation_warning
 from edgepose.placements import PLACEMENTS
 
 if TYPE_CHECKING:
@@ -70,23 +70,23 @@ def trust_file() -> Path:
     return Path(_settings()) / "edgepose" / "trusted-archives"
 
 
-def shipped() -> list[Path]:
+def bundled_archives() -> list[Path]:
     """Archives that come with the package, those trained on everything first."""
     return sorted(MODELS.glob("*.pt"), key=lambda path: ("-" in path.stem, path.stem))
 
 
-def find(name: str) -> Path:
+def find_archive(name: str) -> Path:
     """The shipped archive of that name, or the file at that path.
 
     Raises:
         ModelError: there is neither.
     """
-    for path in shipped():
+    for path in bundled_archives():
         if path.stem == name:
             return path
     if Path(name).is_file():
         return Path(name)
-    names = ", ".join(path.stem for path in shipped()) or "none"
+    names = ", ".join(path.stem for path in bundled_archives()) or "none"
     raise ModelError(f"{name}: no such model; shipped are {names}, anything else is the path of an archive")
 
 
@@ -100,7 +100,7 @@ def _sums(path: Path) -> set[str]:
         raise ModelError(f"{path}: {error.strerror}") from error
 
 
-def inspect(path: Path) -> ArchiveInfo:
+def read_info(path: Path) -> ArchiveInfo:
     """Reads an archive's metadata and sum; runs nothing of it.
 
     Raises:
@@ -157,7 +157,7 @@ def load(info: ArchiveInfo, trust: bool = False) -> torch.jit.ScriptModule:
     """Loads a trusted archive for the CPU, ready to run on one thread.
 
     Args:
-        info: from `inspect`.
+        info: from `read_info`.
         trust: the user vouches for the file.
 
     Raises:
@@ -178,7 +178,7 @@ def load(info: ArchiveInfo, trust: bool = False) -> torch.jit.ScriptModule:
         content = info.path.read_bytes()
         if hashlib.sha256(content).hexdigest() != info.sha256:
             raise ModelError(f"{info.path}: the archive changed while it was being loaded; run again")
-        with quantized_quietly():
+        with suppress_quantisation_warning():
             module: torch.jit.ScriptModule = torch.jit.load(io.BytesIO(content), map_location="cpu")
     except (RuntimeError, ValueError, OSError) as error:
         reason = str(error).strip().splitlines()
@@ -194,7 +194,7 @@ def trust(path: Path) -> ArchiveInfo:
     Raises:
         ModelError: not an archive, or the list cannot be written.
     """
-    info = inspect(path)
+    info = read_info(path)
     if not info.trusted:
         try:
             trust_file().parent.mkdir(parents=True, exist_ok=True)

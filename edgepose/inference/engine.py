@@ -33,16 +33,16 @@ class EngineOutput(NamedTuple):
         filling: fewer frames have been seen than the network's past asks for.
     """
 
-    tag: Any
+    frame: Any
     rotations: Array
     std: Array
-    filling: bool
+    warming_up: bool
 
 
-class Body(NamedTuple):
+class EngineInput(NamedTuple):
     """What goes into an engine: the arguments of `Engine.push`."""
 
-    tag: Any
+    frame: Any
     orientation: Input
     acceleration: Input
 
@@ -103,7 +103,7 @@ class WindowEngine:
         return EngineOutput(self._tags.popleft(), rotations[0].numpy(), std[0].numpy(), index < self._past)
 
 
-class _Row:
+class _StreamState:
     """The stream of one wearer: its state, and what waits for a pose."""
 
     def __init__(self, state: list[torch.Tensor]) -> None:
@@ -123,24 +123,26 @@ class _Row:
 class StreamEngine:
     """Each frame once, with carried state; `future` is 0 for a unidirectional network."""
 
-    def __init__(self, module: torch.jit.ScriptModule, past: int, future: int, together: int = 1) -> None:
+    def __init__(
+        self, module: torch.jit.ScriptModule, past: int, future: int, frames_per_step: int = 1
+    ) -> None:
         """Warms the module up.
 
         Args:
             module: an archive.
             past: as many first poses are marked as filling.
             future: frames that a pose waits for.
-            together: frames that are gathered and run at once, where nobody waits for poses.
+            frames_per_step: frames that are gathered and run at once, where nobody waits for poses.
         """
-        self._module, self._past, self._together = module, past, together
+        self._module, self._past, self._together = module, past, frames_per_step
         self._frames: list[tuple[torch.Tensor, torch.Tensor]] = []
         with torch.inference_mode():
-            self._row = _Row(module.start(1, future))
+            self._row = _StreamState(module.start(1, future))
             still = (torch.eye(3).expand(6, 3, 3), torch.zeros(6, 3))
             for _ in range(WARM_UP + future):
-                self._frames = [still] * together
+                self._frames = [still] * frames_per_step
                 self._run()
-            self._row = _Row(module.start(1, future))
+            self._row = _StreamState(module.start(1, future))
 
     def push(self, tag: Any, orientation: Input, acceleration: Input) -> list[EngineOutput]:
         """See `Engine.push`; with several frames together, the poses of all of them at once."""
@@ -176,7 +178,7 @@ class StreamEngine:
         return self._row.outputs(rotations[0].numpy(), std[0].numpy(), self._past)
 
 
-class BatchEngine:
+class MultiWearerEngine:
     """`StreamEngine` for any number of wearers: those that have a frame take their step together.
 
     Each wearer has a state of its own and gets the poses that it would get alone, whenever the others begin,
@@ -185,7 +187,12 @@ class BatchEngine:
     """
 
     def __init__(
-        self, module: torch.jit.ScriptModule, past: int, future: int, wearers: int, apart: bool = False
+        self,
+        module: torch.jit.ScriptModule,
+        past: int,
+        future: int,
+        wearers: int,
+        isolate_wearers: bool = False,
     ) -> None:
         """Warms the module up.
 
@@ -194,28 +201,28 @@ class BatchEngine:
             past: as many first poses of each wearer are marked as filling.
             future: frames that a pose waits for.
             wearers: how many there are; they are called 0, 1, 2 and so on.
-            apart: one pass for each wearer, where a pose would depend on who else is computed with it.
+            isolate_wearers: run the network once for each wearer, where batching would change results.
         """
-        self._module, self._past, self._apart = module, past, apart
+        self._module, self._past, self._apart = module, past, isolate_wearers
         with torch.inference_mode():
             # Which tensors of a state have a row for each wearer; the others are the same for all.
             self._has_rows = [
                 one.shape != two.shape
                 for one, two in zip(module.start(1, future), module.start(2, future), strict=True)
             ]
-            still = Body(None, np.tile(np.eye(3), (6, 1, 1)), np.zeros((6, 3)))
+            still = EngineInput(None, np.tile(np.eye(3), (6, 1, 1)), np.zeros((6, 3)))
             for count in {1, wearers}:
-                self._rows = [_Row(module.start(1, future)) for _ in range(count)]
+                self._rows = [_StreamState(module.start(1, future)) for _ in range(count)]
                 for _ in range(WARM_UP + future):
                     self.push(dict.fromkeys(range(count), still))
-            self._rows = [_Row(module.start(1, future)) for _ in range(wearers)]
+            self._rows = [_StreamState(module.start(1, future)) for _ in range(wearers)]
 
-    def push(self, bodies: Mapping[int, Body]) -> dict[int, list[EngineOutput]]:
+    def push(self, bodies: Mapping[int, EngineInput]) -> dict[int, list[EngineOutput]]:
         """Takes the next frame of some wearers and gives the poses that are due, by wearer."""
         groups: defaultdict[Any, list[int]] = defaultdict(list)
         for wearer, body in bodies.items():
             row = self._rows[wearer]
-            row.tags.append(body.tag)
+            row.tags.append(body.frame)
             shapes = tuple(tensor.shape for tensor in row.state)
             groups[(wearer, *shapes) if self._apart else shapes].append(wearer)
         outputs = {}
@@ -231,7 +238,7 @@ class BatchEngine:
             rotations, std = self._module.drain(row.state)
         return row.outputs(rotations[0].numpy(), std[0].numpy(), self._past)
 
-    def _step(self, wearers: list[int], bodies: Mapping[int, Body]) -> dict[int, list[EngineOutput]]:
+    def _step(self, wearers: list[int], bodies: Mapping[int, EngineInput]) -> dict[int, list[EngineOutput]]:
         """Poses after one pass for wearers whose states have one shape."""
         rows = [self._rows[wearer] for wearer in wearers]
         orientation = _tensor(np.array([bodies[wearer].orientation for wearer in wearers]))

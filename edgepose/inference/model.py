@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from edgepose.errors import ModelError
 from edgepose.inference import archive
 from edgepose.inference.engine import Engine, StreamEngine
-from edgepose.inference.quantisation import pack
+from edgepose.inference.quantisation import quantise_weights
 
 FRAMES_PER_STEP = 64
 """Frames of a whole recording that the network computes at once."""
@@ -39,12 +39,12 @@ class Model:
         Raises:
             ModelError: there is no such archive, it is damaged or not trusted, or cannot run here.
         """
-        info = archive.inspect(archive.find(str(name)))
+        info = archive.read_info(archive.find_archive(str(name)))
         self.metadata: dict[str, Any] = info.metadata
         self.rate_hz = float(info.metadata["rate_hz"])
         self.past, self.future = int(info.metadata["past"]), int(info.metadata["future"])
         self._module = archive.load(info, trust)
-        self.precision = pack(self._module, info, precision)
+        self.precision = quantise_weights(self._module, info, precision)
 
     def engine(self, frames_per_step: int = 1) -> Engine:
         """What makes poses frame by frame; it has a state of its own.

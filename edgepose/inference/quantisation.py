@@ -62,11 +62,11 @@ def _check_fp16() -> None:
         raise ModelError("this processor has no products of fp16 numbers (asimdfhm)")
 
 
-def pack(
+def quantise_weights(
     module: torch.jit.ScriptModule,
     info: ArchiveInfo,
     choice: str = "auto",
-    tell: Callable[[str], None] = lambda text: None,
+    notify: Callable[[str], None] = lambda text: None,
 ) -> str:
     """Packs the weights of a loaded archive, once.
 
@@ -74,7 +74,7 @@ def pack(
         module: from `archive.load`.
         info: of that archive.
         choice: one of `CHOICES`; "auto" is fp16 where this machine has it and f32 elsewhere.
-        tell: hears why "auto" is not fp16, and that int8 is slow here.
+        notify: hears why "auto" is not fp16, and that int8 is slow here.
 
     Returns:
         The precision in which the module runs now.
@@ -89,16 +89,16 @@ def pack(
         if stored == "fp16":
             with _about(info.path, "export it again in f32"):
                 _check_fp16()
-        _tell_of_slow(stored, tell)
+        _tell_of_slow(stored, notify)
         return str(stored)
     # Archives of older exports cannot pack their weights.
     if choice == "f32" or (choice == "auto" and not hasattr(module, "pack")):
         return "f32"
     if choice == "auto":
-        return _pack_auto(module, tell)
+        return _pack_auto(module, notify)
     with _about(info.path, "use --precision f32"):
         pack_weights(module, choice)
-    _tell_of_slow(choice, tell)
+    _tell_of_slow(choice, notify)
     return choice
 
 
@@ -141,7 +141,7 @@ def pack_weights(module: torch.jit.ScriptModule, precision: str) -> None:
     if precision == "fp16":
         _check_fp16()
     try:
-        with quantized_quietly():
+        with suppress_quantisation_warning():
             module.pack(precision)
     except (RuntimeError, torch.jit.Error) as error:
         reason = str(error).strip().splitlines()[-1].removeprefix("builtins.ValueError: ")
@@ -149,7 +149,7 @@ def pack_weights(module: torch.jit.ScriptModule, precision: str) -> None:
 
 
 @contextmanager
-def quantized_quietly() -> Iterator[None]:
+def suppress_quantisation_warning() -> Iterator[None]:
     """Without torch's warning that quantized tensors are to go; the versions we ask for have them."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="torch.quantize_per_tensor", category=UserWarning)

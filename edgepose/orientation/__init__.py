@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING
 from edgepose.utils.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from edgepose.orientation.estimator import Orienter, SensorStatus
+    from edgepose.orientation.estimator import OrientationEstimator, SensorStatus
     from edgepose.orientation.filter import OrientationFilter
     from edgepose.orientation.settings import FilterSettings
     from edgepose.orientation.smoother import smooth
-    from edgepose.orientation.types import Event, Oriented
+    from edgepose.orientation.types import Event, OrientationResult
 
 __all__ = [
     "Event",
     "FilterSettings",
+    "OrientationEstimator",
     "OrientationFilter",
-    "Oriented",
-    "Orienter",
+    "OrientationResult",
     "SensorStatus",
     "smooth",
 ]
@@ -30,8 +30,8 @@ __getattr__, __dir__ = lazy_names(
         "Event": "edgepose.orientation.types",
         "FilterSettings": "edgepose.orientation.settings",
         "OrientationFilter": "edgepose.orientation.filter",
-        "Oriented": "edgepose.orientation.types",
-        "Orienter": "edgepose.orientation.estimator",
+        "OrientationResult": "edgepose.orientation.types",
+        "OrientationEstimator": "edgepose.orientation.estimator",
         "SensorStatus": "edgepose.orientation.estimator",
         "smooth": "edgepose.orientation.smoother",
     },

@@ -13,7 +13,7 @@ from edgepose.imu import ImuSample, Vector3
 from edgepose.orientation.arrays import NO_FIELD
 from edgepose.orientation.filter import OrientationFilter
 from edgepose.orientation.settings import FilterSettings
-from edgepose.orientation.types import Event, Oriented
+from edgepose.orientation.types import Event, OrientationResult
 from edgepose.orientation.vqf_filter import VqfFilter
 
 
@@ -22,7 +22,7 @@ class SensorFilter(Protocol):
 
     def update(
         self, time_s: ArrayLike, gyr: ArrayLike, acc: ArrayLike, mag: ArrayLike | None = None
-    ) -> Oriented:
+    ) -> OrientationResult:
         """See `OrientationFilter.update`."""
 
 
@@ -46,7 +46,7 @@ class SensorStatus(NamedTuple):
     events: dict[Event, int]
 
 
-class Orienter:
+class OrientationEstimator:
     """Gives samples orientations, each sensor by a filter of its own."""
 
     def __init__(
@@ -67,7 +67,7 @@ class Orienter:
         self._spare: list[SensorFilter] = [self._class(settings)]
         self._magnetometer = magnetometer
         self._filters: dict[int, SensorFilter] = {}
-        self._last: dict[int, Oriented] = {}
+        self._last: dict[int, OrientationResult] = {}
         self._events: defaultdict[int, Counter[int]] = defaultdict(Counter)
         self._fields: dict[int, Vector3] = {}  # that came in samples of their own
 

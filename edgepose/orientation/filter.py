@@ -19,9 +19,9 @@ from edgepose.orientation import error_model as model
 from edgepose.orientation.arrays import NO_FIELD, columns
 from edgepose.orientation.magnetic_reference import MagneticReference
 from edgepose.orientation.rest import RestDetector
-from edgepose.orientation.sample_checks import FieldWatch, Intake
+from edgepose.orientation.sample_checks import MagnetometerMonitor, SampleChecker
 from edgepose.orientation.settings import FilterSettings
-from edgepose.orientation.types import Event, Oriented
+from edgepose.orientation.types import Event, OrientationResult
 
 Array = NDArray[np.float64]
 
@@ -75,9 +75,9 @@ class OrientationFilter:
         self._settings = settings or FilterSettings()
         self._kalman = KalmanFilter(dim_x=model.SIZE, dim_z=3)
         self._kalman.x = np.zeros(model.SIZE)
-        self._intake = Intake(self._settings)
+        self._intake = SampleChecker(self._settings)
         self._rest = RestDetector(self._settings)
-        self._watch = FieldWatch(self._settings)
+        self._watch = MagnetometerMonitor(self._settings)
         self._reference = MagneticReference(self._settings)
         self._row = self._last = 0  # number of the sample, of the last good one
         self._started = False
@@ -102,7 +102,7 @@ class OrientationFilter:
 
     def update(
         self, time_s: ArrayLike, gyr: ArrayLike, acc: ArrayLike, mag: ArrayLike | None = None
-    ) -> Oriented:
+    ) -> OrientationResult:
         """Orientations of the next samples.
 
         Args:
@@ -125,7 +125,7 @@ class OrientationFilter:
             flags.append(events)
             which.append(len(known) - 1)
         bias, sigma, rest, disturbed = (np.array(column)[which] for column in zip(*known, strict=True))
-        return Oriented(
+        return OrientationResult(
             np.array(quats).reshape(-1, 4), bias, sigma, rest, disturbed, np.array(flags, np.uint8)
         )
 
@@ -159,7 +159,9 @@ class OrientationFilter:
                 self._lost_speed += s.lost_share * hypot(*acc) * dt
             kx, ky, kz, bx, by, bz = self._correction
             x, y, z = rate
-            self._quat = rot.turn(self._quat, (kx * x - bx) * dt, (ky * y - by) * dt, (kz * z - bz) * dt)
+            self._quat = rot.integrate_rotvec(
+                self._quat, (kx * x - bx) * dt, (ky * y - by) * dt, (kz * z - bz) * dt
+            )
             self._quats.append(self._quat)
             if not self._watch.check(dt, mag):
                 mag = NO_FIELD
@@ -201,7 +203,7 @@ class OrientationFilter:
     def _find_north(self, field: Array, row: int) -> None:
         """Turn the inertial frame's Y axis to a field's direction, which is the first one."""
         angle = atan2(field[0], field[1])
-        turn = rot.about_z(angle)
+        turn = rot.quat_about_z(angle)
         self._quat = tuple(rot.quat_multiply(turn, self._quat).tolist())
         self._velocity = rot.quat_rotate(turn, self._velocity)
         frame = np.eye(model.SIZE)
@@ -279,7 +281,7 @@ class OrientationFilter:
 
     def _take_out(self, error: Array, rotation: Array) -> None:
         """Correct the state by errors, at an orientation (3, 3)."""
-        quat = rot.turn(self._quat, *(error[model.TURN] @ rotation).tolist())
+        quat = rot.integrate_rotvec(self._quat, *(error[model.TURN] @ rotation).tolist())
         size = hypot(*quat)
         self._quat = (quat[0] / size, quat[1] / size, quat[2] / size, quat[3] / size)
         self._bias = self._bias + error[model.BIAS]

@@ -10,10 +10,10 @@ from edgepose.errors import EdgeposeError
 from edgepose.imu import Recording, SensorData
 from edgepose.orientation.filter import OrientationFilter
 from edgepose.orientation.smoother import smooth
-from edgepose.orientation.types import Oriented
+from edgepose.orientation.types import OrientationResult
 from edgepose.orientation.vqf_filter import VqfFilter
 
-_FILTERS: dict[str, Callable[..., Oriented]] = {
+_FILTERS: dict[str, Callable[..., OrientationResult]] = {
     "kalman": lambda *data: OrientationFilter().update(*data),
     "smoother": smooth,
     "vqf": lambda *data: VqfFilter().update(*data),
@@ -42,7 +42,7 @@ def orient_recording(recording: Recording, filter: str, name: str = "recording")
     return recording._replace(sensors=sensors, metadata={**recording.metadata, "filter": filter})
 
 
-def _orient(data: SensorData, run: Callable[..., Oriented]) -> SensorData:
+def _orient(data: SensorData, run: Callable[..., OrientationResult]) -> SensorData:
     assert data.gyr is not None
     assert data.acc is not None
     rows = ~np.isnan(data.gyr[:, 0] + data.acc[:, 0])

@@ -17,7 +17,7 @@ _LEAST_PEAK_RATE, _LEAST_PEAK_FORCE = 4.0, 19.0  # ranges end above 250 deg/s an
 _GAP, _BAD, _STAMP, _SATURATED = (int(e) for e in (Event.GAP, Event.BAD, Event.STAMP, Event.SATURATED))
 
 
-class Intake:
+class SampleChecker:
     """What came before the next sample, as far as it says whether that one is good.
 
     Attributes:
@@ -77,7 +77,7 @@ class Intake:
         return _SATURATED if end or force > self._settings.shock else 0
 
 
-class FieldWatch:
+class MagnetometerMonitor:
     """Whether one sensor's magnetometer speaks.
 
     Attributes:

@@ -9,7 +9,7 @@ from edgepose import rotations as rot
 from edgepose.orientation import error_model as model
 from edgepose.orientation.filter import OrientationFilter, Step
 from edgepose.orientation.settings import FilterSettings
-from edgepose.orientation.types import Oriented
+from edgepose.orientation.types import OrientationResult
 
 Array = NDArray[np.float64]
 
@@ -20,7 +20,7 @@ def smooth(
     acc: ArrayLike,
     mag: ArrayLike | None = None,
     settings: FilterSettings | None = None,
-) -> Oriented:
+) -> OrientationResult:
     """Orientations of a whole recording of one sensor, in the frame in which `OrientationFilter` ends.
 
     The filter runs once; then errors that were left go back from each correction to the one before
@@ -45,7 +45,7 @@ def smooth(
         return result
     left, sigma = _errors_left(steps)
     quat = rot.quat_multiply(rot.rotvec_to_quat(_by_row(steps, left, len(result.quat))), result.quat)
-    quat = rot.quat_multiply(rot.about_z(_turned_later(steps, len(result.quat))), quat)
+    quat = rot.quat_multiply(rot.quat_about_z(_turned_later(steps, len(result.quat))), quat)
     # What holds at a step holds for the block before it; the rows after the last step have its values.
     of_row = np.searchsorted([step.row for step in steps], np.arange(len(quat)))
     of_row = np.minimum(of_row, len(steps) - 1)

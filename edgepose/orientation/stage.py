@@ -8,7 +8,7 @@ from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
 
 if TYPE_CHECKING:
-    from edgepose.orientation.estimator import Orienter
+    from edgepose.orientation.estimator import OrientationEstimator
 
 
 class OrientationStage:
@@ -24,18 +24,18 @@ class OrientationStage:
         self._filter, self._magnetometer = filter, magnetometer
         self._with_north: set[int] = set()
         self._made: set[int] = set()  # sensors that have been oriented
-        self._orienter: Orienter | None = None
+        self._orienter: OrientationEstimator | None = None
         if filter != "none":
-            from edgepose.orientation.estimator import Orienter
+            from edgepose.orientation.estimator import OrientationEstimator
 
-            self._orienter = Orienter(filter, magnetometer)
+            self._orienter = OrientationEstimator(filter, magnetometer)
 
     @property
     def passes(self) -> bool:
         """Whether samples pass as they are."""
         return self._orienter is None
 
-    def anew(self) -> OrientationStage:
+    def fresh(self) -> OrientationStage:
         """The same, with no sample seen, for another recording."""
         return OrientationStage(self._filter, self._magnetometer)
 

@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 
 class Event(IntFlag):
-    """What was wrong with a sample, as bits of `Oriented.flagged`."""
+    """What was wrong with a sample, as bits of `OrientationResult.flagged`."""
 
     GAP = 1
     """Samples are missing before this one."""
@@ -28,7 +28,7 @@ class Event(IntFlag):
     """The tilt was taken anew from this sample's force, after a long gap."""
 
 
-class Oriented(NamedTuple):
+class OrientationResult(NamedTuple):
     """A row for each sample.
 
     Attributes:

@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 from edgepose import rotations as rot
 from edgepose.errors import EdgeposeError
 from edgepose.orientation.arrays import columns
-from edgepose.orientation.sample_checks import FieldWatch, Intake
+from edgepose.orientation.sample_checks import MagnetometerMonitor, SampleChecker
 from edgepose.orientation.settings import FilterSettings
-from edgepose.orientation.types import Event, Oriented
+from edgepose.orientation.types import Event, OrientationResult
 
 Array = NDArray[np.float64]
 
@@ -47,8 +47,8 @@ class VqfFilter:
             ) from None
         self._class: Any = VQF
         settings = settings or FilterSettings()
-        self._intake = Intake(settings)
-        self._watch = FieldWatch(settings)
+        self._intake = SampleChecker(settings)
+        self._watch = MagnetometerMonitor(settings)
         self._period_s = self._mag_period_s = _FIRST_PERIOD_S
         self._vqf = self._new()
         self._learning: list[_Timed] | None = []
@@ -58,7 +58,7 @@ class VqfFilter:
 
     def update(
         self, time_s: ArrayLike, gyr: ArrayLike, acc: ArrayLike, mag: ArrayLike | None = None
-    ) -> Oriented:
+    ) -> OrientationResult:
         """Orientations of the next samples; arguments as in `OrientationFilter.update`.
 
         Raises:
@@ -67,7 +67,7 @@ class VqfFilter:
         rows = [self._take(*sample) for sample in zip(*columns(time_s, gyr, acc, mag), strict=True)]
         count = len(rows)
         quat, bias, sigma, rest, disturbed, flags = zip(*rows, strict=True) if rows else ((),) * 6
-        return Oriented(
+        return OrientationResult(
             np.array(quat).reshape(count, 4),
             np.array(bias).reshape(count, 3),
             np.repeat(np.array(sigma, float)[:, None], 3, axis=1),
@@ -92,7 +92,7 @@ class VqfFilter:
             if self._watch.seen:
                 self._quat = self._vqf.getQuat9D()
             else:
-                self._quat = rot.quat_multiply(rot.about_z(self._heading), self._vqf.getQuat6D())
+                self._quat = rot.quat_multiply(rot.quat_about_z(self._heading), self._vqf.getQuat6D())
         bias, sigma = self._vqf.getBiasEstimate()
         disturbed = self._watch.seen and not self._watch.lost and self._vqf.getMagDistDetected()
         events |= _MAG_LOST if self._watch.lost else 0
@@ -104,7 +104,7 @@ class VqfFilter:
             known = self._vqf.getBiasEstimate()
             self._vqf = self._new()
             self._vqf.setBiasEstimate(*known)
-            self._heading = float(rot.heading(self._quat))
+            self._heading = float(rot.yaw_of_quat(self._quat))
             if self._learning is not None:
                 self._learning = []  # what came before is in the heading already
         self._started = True

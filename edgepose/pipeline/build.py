@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from edgepose.calibration import load_calibration
-from edgepose.calibration.misfit import Misfits
-from edgepose.calibration.rezero import Headings
+from edgepose.calibration.misfit import MisfitDetector
+from edgepose.calibration.rezero import HeadingRezero
 from edgepose.config import WearerConfig
-from edgepose.errors import CalibrationError, EdgeposeError, FileFormatError, named
+from edgepose.errors import CalibrationError, EdgeposeError, FileFormatError, prefix_errors
 from edgepose.orientation.stage import OrientationStage
-from edgepose.pipeline.frame_synchronizer import FrameClock
+from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.remote_control import RezeroRequests
 from edgepose.pipeline.rig_comparison import other_devices
-from edgepose.pipeline.run import RunSummary, Walk
+from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
 from edgepose.placements import PLACEMENTS
 from edgepose.sinks.open import open_outputs
 from edgepose.sources import open_source
@@ -44,7 +44,7 @@ class OpenWearer:
         config: WearerConfig,
         calibration: Calibration,
         by_key: Callable[[], list[float]],
-        waits: bool,
+        blocking: bool,
         notify: Notify,
     ) -> None:
         """Opens the source.
@@ -54,16 +54,16 @@ class OpenWearer:
             config: the wearer's.
             calibration: the wearer's, see `load_wearer_calibration`.
             by_key: re-zero requests from the keyboard.
-            waits: see `edgepose.sources.open_source`.
+            blocking: see `edgepose.sources.open_source`.
             notify: takes lines for the user.
 
         Raises:
             EdgeposeError: the source cannot be opened, or a filter or address is not to be had here.
         """
-        self.say = _prefixed(config.name, notify)
+        self.notify = _prefixed(config.name, notify)
         self._config, self._calibration = config, calibration
-        with named(config.name):
-            self.source = stack.enter_context(open_source(**config.source.arguments(), waits=waits))
+        with prefix_errors(config.name):
+            self.source = stack.enter_context(open_source(**config.source.arguments(), blocking=blocking))
             self._requests = RezeroRequests(stack, config.control, by_key)
             self._orient = OrientationStage(config.filter, magnetometer=calibration.north)
         self._sinks: list[Sink] = []
@@ -79,10 +79,10 @@ class OpenWearer:
         Raises:
             EdgeposeError: one cannot be written to.
         """
-        with named(self._config.name):
+        with prefix_errors(self._config.name):
             self._sinks = open_outputs(stack, self._config.outputs, rate, stopped)
 
-    def walk(self, rate: float, several: bool, on_pose: Callable[[RunSummary], None]) -> Walk:
+    def pipeline(self, rate: float, several: bool, on_pose: Callable[[RunSummary], None]) -> WearerPipeline:
         """From samples to the outputs.
 
         Args:
@@ -92,53 +92,55 @@ class OpenWearer:
             on_pose: called after each pose.
         """
         source = self._config.source
-        headings = Headings(
+        headings = HeadingRezero(
             self._calibration,
-            hold_first=source.live and _begins_anew(self._calibration),
+            hold_first=source.live and _restarts_with_filter(self._calibration),
             requests=self._requests.poll,
-            tell=self.say,
+            notify=self.notify,
         )
-        return Walk(
-            FrameClock(rate, grid=several and source.file is None),
+        return WearerPipeline(
+            FrameSynchronizer(rate, grid=several and source.file is None),
             headings,
             self._sinks,
             self._orient,
-            self.say if source.live else lambda text: None,
+            self.notify if source.live else lambda text: None,
             on_pose,
-            Misfits(self._calibration, self._other_devices),
-            self.say,
+            MisfitDetector(self._calibration, self._other_devices),
+            self.notify,
         )
 
     def _other_devices(self) -> str | None:
         return other_devices(self._calibration, self.source.devices)
 
-    def report(self, walk: Walk, rate: float, future: int) -> EdgeposeError | None:
-        """Says the counts of a finished walk; gives what went wrong, if anything did."""
-        summary, counts = walk.summary, self.source.counters
+    def report(self, pipeline: WearerPipeline, rate: float, future: int) -> EdgeposeError | None:
+        """Says the counts of a finished pipeline; gives what went wrong, if anything did."""
+        summary, counts = pipeline.summary, self.source.counters
         speed = summary.poses / summary.seconds if summary.seconds else 0.0
-        self.say(
+        self.notify(
             f"poses    {summary.poses} in {summary.seconds:.1f} s, {speed:.1f} a second; "
-            f"{summary.filling} while the window was filling"
+            f"{summary.warming_up} while the window was filling"
         )
-        self.say(
+        self.notify(
             f"packets  {counts.packets} good, {counts.lost} lost, {counts.bad} bad; "
-            f"{walk.clock.dropped} samples too late or twice"
+            f"{pipeline.clock.dropped} samples too late or twice"
         )
-        if walk.clock.restarts:
-            self.say(
-                f"clock    began anew {walk.clock.restarts} times, "
+        if pipeline.clock.restarts:
+            self.notify(
+                f"clock    began anew {pipeline.clock.restarts} times, "
                 "after all sensors were silent for a minute or more"
             )
         if summary.held:
             worst = sorted(zip(summary.held_by_sensor, PLACEMENTS, strict=True), reverse=True)
-            self.say("held     " + ", ".join(f"{name} in {count} frames" for count, name in worst if count))
+            self.notify(
+                "held     " + ", ".join(f"{name} in {count} frames" for count, name in worst if count)
+            )
         if summary.latencies_s and self._config.source.live:
-            self.say(_latency(summary, rate, future))
+            self.notify(_latency(summary, rate, future))
         lines = self._orient.summary_lines()
         for sink in self._sinks:
             lines += sink.summary_lines()
         for line in lines + self._requests.summary_lines():
-            self.say(line)
+            self.notify(line)
         if summary.error is None and self.source.damage:
             return FileFormatError(self.source.damage)
         return summary.error
@@ -160,7 +162,7 @@ def load_wearer_calibration(config: WearerConfig, notify: Notify) -> Calibration
         EdgeposeError: it cannot be read, or orientations are not made as they were for it.
     """
     calibration = load_calibration(config.calibration)
-    with named(config.name):
+    with prefix_errors(config.name):
         _check_filter(calibration, config, notify)
     return calibration
 
@@ -180,14 +182,14 @@ def _check_filter(calibration: Calibration, config: WearerConfig, notify: Notify
             "the calibration was made with magnetometers: leave --no-mag out, or calibrate again with it"
         )
     made_from = calibration.metadata.get("source")
-    if not config.source.live and _begins_anew(calibration) and made_from != config.source.name:
+    if not config.source.live and _restarts_with_filter(calibration) and made_from != config.source.name:
         _prefixed(config.name, notify)(
             f"warning: the calibration was made from {made_from}, and headings of a filter without "
             "magnetometers begin anew in each recording: calibrate from this one"
         )
 
 
-def _begins_anew(calibration: Calibration) -> bool:
+def _restarts_with_filter(calibration: Calibration) -> bool:
     """Whether a filter without a north has begun anew since the calibration."""
     return calibration.filter != "none" and not calibration.north
 

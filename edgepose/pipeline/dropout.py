@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.placements import PLACEMENTS, ROOT
-from edgepose.rotations import about_axis, turn_about_y
+from edgepose.rotations import rotation_about_axis, yaw_of_matrix
 
 Array = NDArray[np.float64]
 
 _LOWER_LEGS = np.array([name.endswith("lower_leg") for name in PLACEMENTS])
 
 
-def carried(
+def extrapolate_dropouts(
     orientation: Array, acceleration: Array, held: NDArray[np.bool_], before: Array | None
 ) -> tuple[Array, Array]:
     """Bones with those of silent sensors moved along.
@@ -39,18 +39,18 @@ def carried(
     if held[ROOT]:
         legs = _LOWER_LEGS & ~held
         turns = _turns(before[legs], orientation[legs])
-        orientation[ROOT] = about_axis("y", turns.mean() if legs.any() else 0.0) @ before[ROOT]
+        orientation[ROOT] = rotation_about_axis("y", turns.mean() if legs.any() else 0.0) @ before[ROOT]
         acceleration[ROOT] = 0.0
     turn = orientation[ROOT] @ before[ROOT].T
     others = held & (np.arange(len(held)) != ROOT)
     legs = others & _LOWER_LEGS
     orientation[others] = turn @ before[others]
-    orientation[legs] = about_axis("y", _turns(before[ROOT], orientation[ROOT])) @ before[legs]
+    orientation[legs] = rotation_about_axis("y", _turns(before[ROOT], orientation[ROOT])) @ before[legs]
     acceleration[others] = acceleration[ROOT]
     return orientation, acceleration
 
 
 def _turns(before: Array, now: Array) -> Array:
     """How far headings of (..., 3, 3) turned, (...) from -pi to pi."""
-    turns: Array = (turn_about_y(now) - turn_about_y(before) + np.pi) % (2.0 * np.pi) - np.pi
+    turns: Array = (yaw_of_matrix(now) - yaw_of_matrix(before) + np.pi) % (2.0 * np.pi) - np.pi
     return turns

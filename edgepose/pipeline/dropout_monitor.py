@@ -14,7 +14,7 @@ QUIET_S = 30.0
 """Least time between two losses of one sensor that are told, seconds: a loose plug comes and goes."""
 
 
-class Silences:
+class DropoutMonitor:
     """Watches frames."""
 
     def __init__(self) -> None:
@@ -23,7 +23,7 @@ class Silences:
         self._told_s = [-inf] * len(PLACEMENTS)
         self._is_told = [False] * len(PLACEMENTS)
 
-    def of(self, frame: ImuFrame) -> list[str]:
+    def update(self, frame: ImuFrame) -> list[str]:
         """What there is to tell of a frame: one line for each sensor that is lost or back."""
         lines = []
         for i, (name, held) in enumerate(zip(PLACEMENTS, frame.held.tolist(), strict=True)):

@@ -88,7 +88,7 @@ class _Sensor:
         return _WAIT_PERIODS * self.period_s + _WAIT_S
 
 
-class FrameClock:
+class FrameSynchronizer:
     """Makes frames at ticks `t0 + k / rate`; t0 is when the last of the six sensors sent its first sample.
 
     A frame is ready once every sensor has a sample at or after its tick. A late sensor is waited for, on the

@@ -15,7 +15,7 @@ from edgepose.rotations import matrix_to_euler_zxy
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.sinks.pose_file import PoseFileSink
 from edgepose.sinks.spooled import SpooledSink
-from edgepose.skeleton import JOINTS, PARENTS, Body, default_body, standing_place
+from edgepose.skeleton import JOINTS, PARENTS, Body, default_body, standing_pelvis_position
 from edgepose.utils.growing_files import GrowingFile
 from edgepose.utils.output_targets import is_stream
 
@@ -96,7 +96,7 @@ class BvhSink(PoseFileSink):
             EdgeposeError: the file cannot be written.
         """
         offsets = (body or default_body()).offsets.copy()
-        self._standing = standing_place(offsets)
+        self._standing = standing_pelvis_position(offsets)
         self._channels = np.array(depth_first())
         self._before = np.zeros((len(JOINTS), 3))
         self._poses: list[PoseFrame] = []

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.poses.csv_columns import FORMS, numbers, pose_columns
+from edgepose.formats.poses.csv_columns import ROTATION_FORMATS, numbers, pose_columns
 from edgepose.pose import PoseFrame, format_status
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.sinks.pose_file import PoseFileSink
@@ -35,7 +35,7 @@ class CsvSink(PoseFileSink):
 
         Args:
             path: file to write; "-" is standard output. It appears with the first pose.
-            rotations: a key of `FORMS`; angles are in radians.
+            rotations: a key of `ROTATION_FORMATS`; angles are in radians.
             std: add the network's standard deviation of each joint, radians.
             translation: add the place of the pelvis, metres, which every pose must then have.
             overwrite: whether it may take the place of a file.
@@ -45,8 +45,10 @@ class CsvSink(PoseFileSink):
         Raises:
             EdgeposeError: the file cannot be written.
         """
-        if rotations not in FORMS:
-            raise EdgeposeError(f"unknown rotations {rotations!r}: choose one of {', '.join(FORMS)}")
+        if rotations not in ROTATION_FORMATS:
+            raise EdgeposeError(
+                f"unknown rotations {rotations!r}: choose one of {', '.join(ROTATION_FORMATS)}"
+            )
         self._rotations, self._std, self._translation = rotations, std, translation
         columns = pose_columns(rotations, std, translation)
         self._format = ",".join(["%d,%.6f,%s"] + ["%.6f"] * (len(columns) - 3)) + "\n"

@@ -14,7 +14,7 @@ from edgepose.pose import PoseFrame
 from edgepose.rotations import matrix_to_quat
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.sinks.udp import DatagramSink
-from edgepose.skeleton import JOINTS, Body, default_body, standing_place
+from edgepose.skeleton import JOINTS, Body, default_body, standing_pelvis_position
 
 BONES = {
     "Hips": "pelvis",
@@ -89,7 +89,7 @@ class VmcSink(DatagramSink):
             body: whose bone lengths are sent; the default body if None.
         """
         offsets = (body or default_body()).offsets.copy()
-        self._standing = standing_place(offsets)
+        self._standing = standing_pelvis_position(offsets)
         offsets[_ON_UPPER_CHEST] += offsets[_UPPER_CHEST]
         self._places = offsets[_INDEX] * TO_UNITY
         self._start_s: float | None = None

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from edgepose import rotations as rot
 from edgepose.sip.kinematics import (
-    Posed,
     SensorPoints,
+    SensorStates,
     orientation_jacobian,
     pose_sensors,
     position_jacobian,
 )
-from edgepose.sip.parameterisation import Rig, coordinates
+from edgepose.sip.parameterisation import PoseParameterisation, coordinates
 
 Array = NDArray[np.float64]
 
@@ -43,7 +43,7 @@ class Problem(NamedTuple):
         weights: of the terms.
     """
 
-    rig: Rig
+    rig: PoseParameterisation
     body: SensorPoints
     orientation: Array
     acceleration: Array
@@ -78,11 +78,11 @@ class Evaluation(NamedTuple):
         costs: of all of these.
     """
 
-    posed: Posed
-    turn: Array
-    pull: Array
-    apart: Array
-    beyond: Array
+    states: SensorStates
+    orientation_residual: Array
+    acceleration_residual: Array
+    prior_residual: Array
+    limit_residual: Array
     costs: Costs
 
 
@@ -131,31 +131,31 @@ def frame_system(problem: Problem, evaluation: Evaluation) -> tuple[Array, Array
     """
     rig, weights = problem.rig, problem.weights
     # e(x + d) = log(exp(J d) R_est R^-1): exact, where SIP eq. 24 takes the inverse Jacobian for one.
-    turns = rot.inverse_left_jacobian(evaluation.turn) @ _rows(
-        orientation_jacobian(evaluation.posed, problem.body)
+    turns = rot.inverse_left_jacobian(evaluation.orientation_residual) @ _rows(
+        orientation_jacobian(evaluation.states, problem.body)
     )
     jacobian = _on_rig(rig, turns)
     scaled = weights.ori / turns.shape[1] * np.swapaxes(jacobian, 1, 2)
     matrix = scaled @ jacobian
-    gradient = (scaled @ evaluation.turn.reshape(len(jacobian), -1, 1))[..., 0]
+    gradient = (scaled @ evaluation.orientation_residual.reshape(len(jacobian), -1, 1))[..., 0]
     mahal, limits = weights.anthro * weights.mahal, weights.anthro * weights.limits
     matrix[:, 3:, 3:] += mahal * rig.root.T @ rig.root
-    gradient[:, 3:] += mahal * evaluation.apart @ rig.root + limits * evaluation.beyond
+    gradient[:, 3:] += mahal * evaluation.prior_residual @ rig.root + limits * evaluation.limit_residual
     inner = np.arange(3, matrix.shape[1])
-    matrix[:, inner, inner] += limits * (evaluation.beyond != 0.0)
+    matrix[:, inner, inner] += limits * (evaluation.limit_residual != 0.0)
     return matrix, gradient
 
 
 def sensor_movement(problem: Problem, evaluation: Evaluation) -> Array:
     """Jacobian (T, 3 N, P) of the sensors' positions from the pelvis, metres."""
-    return _on_rig(problem.rig, _rows(position_jacobian(evaluation.posed, problem.body)))
+    return _on_rig(problem.rig, _rows(position_jacobian(evaluation.states, problem.body)))
 
 
 def _rows(jacobian: Array) -> Array:
     return jacobian.reshape(*jacobian.shape[:3], -1)
 
 
-def _on_rig(rig: Rig, jacobian: Array) -> Array:
+def _on_rig(rig: PoseParameterisation, jacobian: Array) -> Array:
     """(T, 3 N, P) of a Jacobian (T, N, 3, 72) by exponential coordinates."""
     frames, sensors = jacobian.shape[:2]
     return (jacobian.reshape(-1, jacobian.shape[-1]) @ rig.basis).reshape(frames, 3 * sensors, -1)

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from edgepose.calibration import Calibration
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.base import from_samples, samples
+from edgepose.formats.recordings.base import iter_samples, recording_from_samples
 from edgepose.formats.recordings.registry import read_sensors
 from edgepose.imu import Recording
 from edgepose.placements import PLACEMENTS, SITES
-from edgepose.sip.measurements import Mount, mounts, mounts_from_hold
+from edgepose.sip.measurements import SensorMount, mounts, mounts_from_hold
 
 DEFAULT_HOLD_S = 4.0
 
@@ -32,16 +32,18 @@ def read(path: Path, calibration: Calibration) -> Recording:
             f"{path}: the calibration was made with --filter {calibration.filter}, which takes the six "
             f"placements only, and there is {', '.join(others)}; use orientations that the sensors send"
         )
-    from edgepose.orientation import Orienter
+    from edgepose.orientation import OrientationEstimator
 
-    orienter = Orienter(calibration.filter, magnetometer=calibration.north)
-    oriented = from_samples(orienter.orient(list(samples(recording))), recording.metadata, name=str(path))
+    orienter = OrientationEstimator(calibration.filter, magnetometer=calibration.north)
+    oriented = recording_from_samples(
+        orienter.orient(list(iter_samples(recording))), recording.metadata, name=str(path)
+    )
     return oriented._replace(damage=recording.damage)
 
 
 def mounted(
     path: Path, recording: Recording, calibration: Calibration, hold_from_s: float | None
-) -> dict[str, Mount]:
+) -> dict[str, SensorMount]:
     """How each sensor of a recording is mounted, by name.
 
     The calibration knows the six placements. Others are taken from the calibration's pose, which the wearer

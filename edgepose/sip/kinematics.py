@@ -45,7 +45,7 @@ class SensorPoints(NamedTuple):
     points: Array
 
 
-class Posed(NamedTuple):
+class SensorStates(NamedTuple):
     """Sensors of a posed body.
 
     Attributes:
@@ -61,23 +61,23 @@ class Posed(NamedTuple):
     axes: Array
 
 
-def pose_sensors(angles: Array, body: SensorPoints) -> Posed:
+def pose_sensors(angles: Array, body: SensorPoints) -> SensorStates:
     """Sensors of a body in poses (T, 24, 3) of exponential coordinates (SIP eq. 5, 15)."""
     rotations, joints = forward_kinematics(rot.rotvec_to_matrix(angles), body.offsets)
     axes = rot.left_jacobian(angles)
     # A joint's axes turn with its parent; the pelvis has none.
     axes[:, 1:] = rotations[:, list(PARENTS[1:])] @ axes[:, 1:]
     bones = rotations[:, body.bones]
-    return Posed(bones, joints[:, body.bones] + (bones @ body.points[..., None])[..., 0], joints, axes)
+    return SensorStates(bones, joints[:, body.bones] + (bones @ body.points[..., None])[..., 0], joints, axes)
 
 
-def orientation_jacobian(posed: Posed, body: SensorPoints) -> Array:
+def orientation_jacobian(posed: SensorStates, body: SensorPoints) -> Array:
     """Turn of each sensor in T for a change of the pose: (T, N, 3, 24, 3), rad (SIP eq. 24)."""
     mask = TURNS[body.bones].astype(float)
     return np.moveaxis(posed.axes, 1, 2)[:, None] * mask[:, None, :, None]
 
 
-def position_jacobian(posed: Posed, body: SensorPoints) -> Array:
+def position_jacobian(posed: SensorStates, body: SensorPoints) -> Array:
     """Movement of each sensor from the pelvis for a change of the pose: (T, N, 3, 24, 3), m (SIP eq. 27)."""
     mask = TURNS[body.bones].astype(float)
     levers = (posed.position[:, :, None] - posed.joints[:, None]) * mask[..., None]

@@ -161,7 +161,7 @@ def _joint_step(
         shaped = second_difference(values, problem.rate).reshape(frames, sensors, -1)
         return project(shaped, problem.valid).reshape(values.shape)
 
-    right = here.pull.reshape(frames, rows, 1) - residual(moved)
+    right = here.acceleration_residual.reshape(frames, rows, 1) - residual(moved)
     band = _band(spread, problem.valid, problem.rate, problem.weights.acc / sensors)
     from scipy.linalg import solveh_banded
 

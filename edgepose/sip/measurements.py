@@ -56,7 +56,7 @@ class Measurements(NamedTuple):
         return np.array([SITES[name] for name in self.names])
 
 
-class Mount(NamedTuple):
+class SensorMount(NamedTuple):
     """How one sensor's readings become a bone's: R_TB = body_from_inertial R_IS inverse(bone_from_sensor).
 
     Attributes:
@@ -68,17 +68,17 @@ class Mount(NamedTuple):
     bone_from_sensor: Array
 
 
-def mounts(calibration: Calibration) -> dict[str, Mount]:
+def mounts(calibration: Calibration) -> dict[str, SensorMount]:
     """Mounts of the six sensors that a calibration knows, by placement."""
     r_ti = rot.quat_to_matrix(calibration.body_from_inertial)
-    left = r_ti @ rot.quat_to_matrix(rot.about_z(calibration.heading_offset))
+    left = r_ti @ rot.quat_to_matrix(rot.quat_about_z(calibration.heading_offset))
     right = rot.quat_to_matrix(calibration.bone_from_sensor)
-    return {name: Mount(left[i], right[i]) for i, name in enumerate(PLACEMENTS)}
+    return {name: SensorMount(left[i], right[i]) for i, name in enumerate(PLACEMENTS)}
 
 
 def mounts_from_hold(
     recording: Recording, calibration: Calibration, names: Sequence[str], start_s: float, end_s: float
-) -> dict[str, Mount]:
+) -> dict[str, SensorMount]:
     """Mounts of further sensors, which share the others' north, from the calibration's pose held once more.
 
     Args:
@@ -103,7 +103,7 @@ def mounts_from_hold(
                 "the calibration's pose there, say with --hold-from when"
             )
         r_is = rot.quat_to_matrix(rot.mean_rotation(inside))
-        found[name] = Mount(r_ti, rot.transpose(_held_bone(calibration.pose, name)) @ r_ti @ r_is)
+        found[name] = SensorMount(r_ti, rot.transpose(_held_bone(calibration.pose, name)) @ r_ti @ r_is)
     return found
 
 
@@ -116,7 +116,7 @@ def _held_bone(pose: str, name: str) -> Array:
     return POSES[pose][PLACEMENTS.index(known)]
 
 
-def measure(recording: Recording, mounted: dict[str, Mount], rate: float) -> Measurements:
+def measure(recording: Recording, mounted: dict[str, SensorMount], rate: float) -> Measurements:
     """Frames of the sensors that are mounted, from where all of them have begun to where the last one ends.
 
     Args:
@@ -187,7 +187,7 @@ def _distinct(times: Array, values: Array) -> tuple[Array, Array]:
     return unique, values[rows[first]]
 
 
-def _track(name: str, data: SensorData, mount: Mount) -> _Track:
+def _track(name: str, data: SensorData, mount: SensorMount) -> _Track:
     times, quats = _oriented(name, data)
     acc_times, acc = _distinct(data.time_s, np.empty((0, 3)) if data.acc is None else data.acc)
     inertial = rot.quat_rotate(_orientation_at(times, quats, acc_times), acc) - [0.0, 0.0, GRAVITY]

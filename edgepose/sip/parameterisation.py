@@ -22,7 +22,7 @@ WIDTH = 3 * JOINT_COUNT
 """Exponential coordinates of a pose."""
 
 
-class Rig(NamedTuple):
+class PoseParameterisation(NamedTuple):
     """A rig of P parameters.
 
     Attributes:
@@ -45,7 +45,7 @@ class Rig(NamedTuple):
     rest: Array
 
 
-def smpl_rig(prior: Prior, bones: ArrayLike) -> Rig:
+def smpl_rig(prior: Prior, bones: ArrayLike) -> PoseParameterisation:
     """SMPL's joints with three degrees of freedom each, for sensors on some bones.
 
     A joint that turns none of these bones moves no residual but the prior's, which is Gaussian: its best
@@ -60,7 +60,7 @@ def smpl_rig(prior: Prior, bones: ArrayLike) -> Rig:
     regression, rest = np.zeros((WIDTH, len(inner))), np.zeros(WIDTH)
     regression[others + 3] = gain
     rest[others + 3] = prior.mean[others]
-    return Rig(
+    return PoseParameterisation(
         np.eye(WIDTH)[:, chosen],
         prior.mean[inner],
         _root(covariance),
@@ -82,7 +82,7 @@ _HINGES: Sequence[tuple[str, str]] = (
 hinges at knees and ankles, elbows that bend and twist."""
 
 
-def hinge_rig(prior: Prior) -> Rig:
+def hinge_rig(prior: Prior) -> PoseParameterisation:
     """SIP-M: 28 angles (31 parameters with the translation) of a skeleton as one rigs by hand (SIP 5.2).
 
     The prior of an angle is that of the same coordinate of SMPL; the other joints are stiff.
@@ -90,7 +90,7 @@ def hinge_rig(prior: Prior) -> Rig:
     rows = [0, 1, 2] + [3 * JOINTS.index(name) + "xyz".index(axis) for name, axes in _HINGES for axis in axes]
     inner = np.array(rows[3:]) - 3
     none = np.zeros((WIDTH, len(inner)))
-    return Rig(
+    return PoseParameterisation(
         np.eye(WIDTH)[:, rows],
         prior.mean[inner],
         _root(prior.covariance[np.ix_(inner, inner)]),
@@ -106,7 +106,7 @@ def _root(covariance: Array) -> Array:
     return np.linalg.inv(np.linalg.cholesky(covariance))
 
 
-def coordinates(rig: Rig, parameters: Array) -> Array:
+def coordinates(rig: PoseParameterisation, parameters: Array) -> Array:
     """Exponential coordinates (T, 24, 3) of parameters (T, P); those that nothing moves as the prior has
     them.
     """

@@ -19,7 +19,7 @@ PULL_LIMIT = 2.5
 """RMS of an acceleration residual above which a sensor does not fit, m/s^2; 0.2 to 1 are usual."""
 
 
-def joined(solutions: Sequence[Solution]) -> Solution:
+def concatenate(solutions: Sequence[Solution]) -> Solution:
     """Consecutive solutions as one."""
     arrays = {
         name: np.concatenate([getattr(s, name) for s in solutions])

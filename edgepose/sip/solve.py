@@ -17,7 +17,7 @@ from edgepose.sip.energy import Problem, Weights, second_difference
 from edgepose.sip.kinematics import SensorPoints
 from edgepose.sip.levenberg_marquardt import SIP_EVALUATIONS, Minimum, inertial_poser, orientation_poser
 from edgepose.sip.measurements import Measurements
-from edgepose.sip.parameterisation import Rig, coordinates
+from edgepose.sip.parameterisation import PoseParameterisation, coordinates
 
 Array = NDArray[np.float64]
 
@@ -43,7 +43,7 @@ class Settings(NamedTuple):
     """
 
     method: Method
-    rig: Rig
+    rig: PoseParameterisation
     body: SensorPoints
     weights: Weights
     evaluations: int = SIP_EVALUATIONS
@@ -104,7 +104,7 @@ def solve(
     held: Solution | None = None  # what the next chunk passes over
     for number, solution in enumerate(_solutions(problems, settings, jobs, on_progress), start=1):
         if held is not None:
-            solution = _passed_over(held, solution)
+            solution = _crossfade(held, solution)
         last = number == len(parts)
         stop = None if last else parts[number].start - parts[number - 1].start
         yield _rows(solution, slice(0, stop))
@@ -183,14 +183,14 @@ def _problem(measurements: Measurements, part: slice, settings: Settings) -> Pro
 
 def _solution(problem: Problem, minimum: Minimum, evaluations: int) -> Solution:
     here, valid = minimum.evaluation, problem.valid[..., None]
-    left = problem.acceleration - second_difference(here.posed.position, problem.rate)
+    left = problem.acceleration - second_difference(here.states.position, problem.rate)
     with np.errstate(invalid="ignore"):
         acceleration = (valid * left).sum(axis=1) / valid.sum(axis=1)
     return Solution(
         rot.rotvec_to_matrix(coordinates(problem.rig, minimum.parameters)),
         np.stack(here.costs, axis=1),
-        np.linalg.norm(here.turn, axis=-1),
-        np.linalg.norm(here.pull, axis=-1),
+        np.linalg.norm(here.orientation_residual, axis=-1),
+        np.linalg.norm(here.acceleration_residual, axis=-1),
         acceleration,
         evaluations,
     )
@@ -201,7 +201,7 @@ def _rows(solution: Solution, rows: slice) -> Solution:
     return solution._replace(**columns)
 
 
-def _passed_over(before: Solution, after: Solution) -> Solution:
+def _crossfade(before: Solution, after: Solution) -> Solution:
     """`after`, its first frames turned gradually from those of `before`, which are the same instants."""
     frames = len(before.rotations)
     share = (np.arange(frames) + 0.5) / frames

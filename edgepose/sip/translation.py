@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.sip.solve import Solution
-from edgepose.skeleton import JOINTS, forward_kinematics, standing_place
+from edgepose.skeleton import JOINTS, forward_kinematics, standing_pelvis_position
 
 Array = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ def pelvis_path(solution: Solution, offsets: Array, rate: float) -> Array:
     acceleration = solution.acceleration
     frames = len(acceleration)
     if frames < 3:
-        return np.tile(standing_place(offsets), (frames, 1))
+        return np.tile(standing_pelvis_position(offsets), (frames, 1))
     from scipy.linalg import solveh_banded
 
     # Speeds v between frames, by least squares: v[t] - v[t-1] is the acceleration over a frame, v is the
@@ -61,7 +61,9 @@ def pelvis_path(solution: Solution, offsets: Array, rate: float) -> Array:
         # While the weight passes from foot to foot, the lower one may be the one that swings.
         slips = np.linalg.norm(speed - support, axis=1) / (2.0 * SLIP)
         trust = 1.0 / (1.0 + slips**2) ** 2
-    return standing_place(offsets) + np.concatenate([np.zeros((1, 3)), np.cumsum(speed, axis=0) / rate])
+    return standing_pelvis_position(offsets) + np.concatenate(
+        [np.zeros((1, 3)), np.cumsum(speed, axis=0) / rate]
+    )
 
 
 def _support_speed(rotations: Array, offsets: Array, rate: float) -> Array:

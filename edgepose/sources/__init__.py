@@ -45,7 +45,7 @@ POLL_S = 0.02
 """Longest time between two batches of a live source, seconds."""
 
 
-class Counters(NamedTuple):
+class SourceCounters(NamedTuple):
     """What has come in so far, for the summary at the end.
 
     Attributes:
@@ -83,7 +83,7 @@ class Source(AbstractContextManager["Source"], Protocol):
     """See the module's text."""
 
     @property
-    def counters(self) -> Counters:
+    def counters(self) -> SourceCounters:
         """What has come in so far."""
 
     @property
@@ -107,9 +107,9 @@ class Source(AbstractContextManager["Source"], Protocol):
         """
 
 
-def total(counters: Iterable[Counters]) -> Counters:
+def sum_counters(counters: Iterable[SourceCounters]) -> SourceCounters:
     """Counters of several lines together."""
-    return Counters(*(sum(column) for column in zip(Counters(), *counters, strict=True)))
+    return SourceCounters(*(sum(column) for column in zip(SourceCounters(), *counters, strict=True)))
 
 
 def open_source(
@@ -124,7 +124,7 @@ def open_source(
     protocol: str = "auto",
     sensors: Path | str | None = None,
     lenient: bool = False,
-    waits: bool = True,
+    blocking: bool = True,
 ) -> Source:
     """The source that the options ask for; nothing is opened before it is entered.
 
@@ -141,7 +141,7 @@ def open_source(
         sensors: map of devices to placements; ports and buses that it names need no `port` and `can`.
         lenient: take what there is: of a recording the good rows of any sensors, of lines those that speak;
             those that do not are told and waited for.
-        waits: a batch may take as long as the module's text says; if not, it is there at once, empty where
+        blocking: a batch may take as long as the module's text says; if not, it is there at once, empty where
             nothing has come, for those who look after several sources.
 
     Raises:
@@ -156,8 +156,8 @@ def open_source(
     if file is not None:
         from edgepose.sources.replay import open_file
 
-        return open_file(Path(file), realtime, protocol, sensor_map, lenient, waits)
-    from edgepose.sources.line_config import links
+        return open_file(Path(file), realtime, protocol, sensor_map, lenient, blocking)
+    from edgepose.sources.line_config import line_specs
     from edgepose.sources.live import LiveSource
 
-    return LiveSource(links(port, baud, can, bitrate, fd, protocol, sensor_map), lenient, waits)
+    return LiveSource(line_specs(port, baud, can, bitrate, fd, protocol, sensor_map), lenient, blocking)

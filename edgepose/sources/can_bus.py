@@ -14,7 +14,7 @@ import can
 
 from edgepose.errors import DeviceError, FileFormatError
 from edgepose.sources import POLL_S
-from edgepose.sources.live import Gone
+from edgepose.sources.live import LineDisconnectedError
 
 # It tells of every maker's library that is not installed, and of every clock that is not.
 logging.getLogger("can").setLevel(logging.CRITICAL)
@@ -118,7 +118,7 @@ class CanBus:
                     return messages, False
         except (can.CanError, OSError):
             if not messages:
-                raise Gone from None
+                raise LineDisconnectedError from None
         return messages, True
 
     def close(self) -> None:

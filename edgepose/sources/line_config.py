@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from edgepose.errors import ConfigError
-from edgepose.sources.line_decoder import Places
-from edgepose.sources.live import Handle, Link
-from edgepose.sources.protocol_detection import candidates
+from edgepose.sources.line_decoder import PlacementById
+from edgepose.sources.live import LineSpec, Transport
+from edgepose.sources.protocol_detection import candidate_protocols
 from edgepose.sources.sensor_map import PortSettings, SensorMap, channel, default_places
 from firmware_protocols.registry import Protocol
 
@@ -18,7 +18,7 @@ BITRATE = 500_000
 """Speed of a CAN bus of which nothing is known, bit/s."""
 
 
-def links(
+def line_specs(
     port: str | None,
     baud: int | None,
     can: str | None,
@@ -26,7 +26,7 @@ def links(
     fd: bool,
     protocol: str,
     sensor_map: SensorMap | None,
-) -> list[Link]:
+) -> list[LineSpec]:
     """Ports and buses to listen to; the arguments are those of `open_source`.
 
     Raises:
@@ -56,7 +56,7 @@ def links(
         if ":" not in bus:
             raise ConfigError(f"{bus}: give --can as INTERFACE:CHANNEL, such as socketcan:can0")
 
-    def places(line: str, index: int) -> Callable[[Protocol], Places]:
+    def places(line: str, index: int) -> Callable[[Protocol], PlacementById]:
         if sensor_map is not None:
             return lambda spoken: sensor_map.places(line)
         return lambda spoken: default_places(line, spoken, index, count)
@@ -73,15 +73,17 @@ def links(
     return result
 
 
-def serial_link(name: str, protocol: str, baud: int | None, places: Callable[[Protocol], Places]) -> Link:
+def serial_link(
+    name: str, protocol: str, baud: int | None, places: Callable[[Protocol], PlacementById]
+) -> LineSpec:
     """One serial port.
 
     Raises:
         ConfigError: no such protocol.
     """
-    protocols = candidates(protocol, "bytes", live=True)
+    protocols = candidate_protocols(protocol, "bytes", live=True)
     named = protocols[0] if len(protocols) == 1 else None
-    speed = baud or (named.speed if named else BAUD)
+    speed = baud or (named.default_bitrate if named else BAUD)
     requests: list[tuple[bytes, int]] = []
     if named is not None and named.request is not None:
         requests = [named.request(sensor) for sensor in places(named) if sensor is not None]
@@ -90,28 +92,28 @@ def serial_link(name: str, protocol: str, baud: int | None, places: Callable[[Pr
                 f"{name}: devices of {named.name} are asked by id; give their ids with --sensors"
             )
 
-    def open_it() -> Handle:
+    def open_it() -> Transport:
         # pyserial is not needed to read files.
         from edgepose.sources.serial_port import SerialPort
 
         return SerialPort(name, speed, requests)
 
     check = ("--port and that the device is on and sending", f"--baud (now {speed}) and --protocol")
-    return Link(name, open_it, protocols, places, "bytes", check)
+    return LineSpec(name, open_it, protocols, places, "bytes", check)
 
 
 def can_link(
-    name: str, protocol: str, bitrate: int | None, fd: bool, places: Callable[[Protocol], Places]
-) -> Link:
+    name: str, protocol: str, bitrate: int | None, fd: bool, places: Callable[[Protocol], PlacementById]
+) -> LineSpec:
     """One CAN bus.
 
     Raises:
         ConfigError: no such protocol.
     """
-    protocols = candidates(protocol, "can", live=True)
-    speed = bitrate or (protocols[0].speed if len(protocols) == 1 else BITRATE)
+    protocols = candidate_protocols(protocol, "can", live=True)
+    speed = bitrate or (protocols[0].default_bitrate if len(protocols) == 1 else BITRATE)
 
-    def open_it() -> Handle:
+    def open_it() -> Transport:
         # python-can takes a while to import.
         from edgepose.sources.can_bus import CanBus
 
@@ -121,7 +123,7 @@ def can_link(
         f"that the devices are on and that --bitrate (now {speed}) is theirs",
         "--protocol, --fd and the ids that the devices are set to",
     )
-    return Link(name, open_it, protocols, places, "frames", check)
+    return LineSpec(name, open_it, protocols, places, "frames", check)
 
 
 def _names(flag: str, text: str | None) -> Sequence[str]:

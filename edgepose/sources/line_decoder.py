@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
-from edgepose.sources import Counters, Device
+from edgepose.sources import Device, SourceCounters
 from edgepose.sources.protocol_detection import Chunk, Detector, decode
 from firmware_protocols.base import Decoder, DeviceInfo, Protocol
 from firmware_protocols.sample import Sample
@@ -21,14 +21,14 @@ LISTEN_S = 1.0
 LISTEN_BYTES = 1 << 16
 """The same for captures, which have no times."""
 
-Places = Mapping[int | None, int]
+PlacementById = Mapping[int | None, int]
 """Index into PLACEMENTS by the device's id on the line; None stands for the only device, whatever its id."""
 
 Clock = Callable[[int, int | None, float], float]
 """Time of a measurement, seconds, of sensor, device time in microseconds, and arrival in seconds."""
 
 
-class Stream:
+class LineDecoder:
     """Detection, decoder, clocks, counters and the map from ids to placements of one line.
 
     Attributes:
@@ -42,9 +42,9 @@ class Stream:
         self,
         name: str,
         protocols: Sequence[Protocol],
-        places: Callable[[Protocol], Places],
+        places: Callable[[Protocol], PlacementById],
         clock: Callable[[int], Clock],
-        claimed: dict[int, str],
+        placement_owner: dict[int, str],
     ) -> None:
         """Start with nothing seen.
 
@@ -53,7 +53,7 @@ class Stream:
             protocols: what the line may speak.
             places: the line's map of ids, once the protocol is known.
             clock: makes the line's clock, given where the devices' times wrap, microseconds.
-            claimed: placements that have come, with the name of their line; shared by all lines.
+            placement_owner: placements that have come, with the name of their line; shared by all lines.
         """
         self.name = name
         self.protocol: Protocol | None = None
@@ -63,23 +63,23 @@ class Stream:
         self._detector: Detector | None = Detector(name, protocols)
         self._places_of = places
         self._clock_of = clock
-        self._claimed = claimed
+        self._placement_owner = placement_owner
         self._decoder: Decoder | None = None
         self._clock: Clock | None = None
-        self._places: Places = {}
+        self._places: PlacementById = {}
         self._known: dict[int, int] = {}  # placement by id, of those that have come
         self._unknown: dict[int, int] = {}  # packets by id
         if len(protocols) == 1:
             self._settle(protocols[0], self._detector.decoders[0])
 
     @property
-    def counters(self) -> Counters:
+    def counters(self) -> SourceCounters:
         """What has come in so far."""
         if self._decoder is None:
-            return Counters()
+            return SourceCounters()
         c = self._decoder.counters
         unknown = sum(self._unknown.values())
-        return Counters(c.packets - unknown, c.lost, c.bad, unknown)
+        return SourceCounters(c.packets - unknown, c.lost, c.bad, unknown)
 
     @property
     def devices(self) -> dict[int, Device]:
@@ -95,7 +95,7 @@ class Stream:
     @property
     def ids(self) -> str:
         """The ids that belong to placements, for a message."""
-        return words(sorted(sensor for sensor in self._places if sensor is not None))
+        return format_ids(sorted(sensor for sensor in self._places if sensor is not None))
 
     def feed(self, chunk: Chunk, arrival_s: float) -> list[ImuSample]:
         """Samples completed by what comes next.
@@ -169,7 +169,7 @@ class Stream:
                 )
             self._unknown[sensor] = self._unknown.get(sensor, 0) + 1
             return None
-        other = self._claimed.setdefault(place, self.name)
+        other = self._placement_owner.setdefault(place, self.name)
         if other != self.name:
             raise EdgeposeError(
                 f"{other} and {self.name} both have a sensor for {PLACEMENTS[place]}, id {sensor}; "
@@ -187,7 +187,7 @@ class Stream:
                 )
 
 
-def words(ids: Sequence[int]) -> str:
+def format_ids(ids: Sequence[int]) -> str:
     """Ids for a message: "0 to 5", or one by one."""
     if len(ids) > 2 and list(ids) == list(range(ids[0], ids[0] + len(ids))):
         return f"{ids[0]} to {ids[-1]}"

@@ -16,9 +16,9 @@ from typing import Any, NamedTuple, Protocol
 from edgepose.errors import DeviceError, EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
-from edgepose.sources import POLL_S, Batch, Batches, Counters, Device, total
+from edgepose.sources import POLL_S, Batch, Batches, Device, SourceCounters, sum_counters
 from edgepose.sources.clock_sync import DeviceClock, HostClocks
-from edgepose.sources.line_decoder import Clock, Places, Stream
+from edgepose.sources.line_decoder import Clock, LineDecoder, PlacementById
 from edgepose.sources.protocol_detection import Chunk
 from firmware_protocols import registry
 
@@ -36,27 +36,27 @@ NOISE_S = 3.0
 REOPEN_S = 0.5
 """Time between two attempts to open a line that has gone, seconds."""
 
-FULL_LOOKS = 32
+FULL_POLLS = 32
 """Looks in a row that may leave something on a line; no system keeps more, and what goes on is a flood."""
 
 _SETTLE_S = 0.1
 """How long to throw away at least: what has waited in the system comes in several pieces."""
 
-_TWINS = 20  # jumps of a clock within a second that one device does not make
+_DUPLICATE_JUMPS = 20  # jumps of a clock within a second that one device does not make
 
 
-class Gone(Exception):
+class LineDisconnectedError(Exception):
     """The port or bus has disappeared."""
 
 
-class Handle(Protocol):
+class Transport(Protocol):
     """An open port or bus."""
 
     def read(self) -> tuple[Chunk, bool]:
         """What is there, waiting up to POLL_S for the first of it, and whether more waits already.
 
         Raises:
-            Gone: there is nothing to read from any more.
+            LineDisconnectedError: there is nothing to read from any more.
         """
 
     def close(self) -> None:
@@ -70,7 +70,7 @@ class Handle(Protocol):
         """
 
 
-class Link(NamedTuple):
+class LineSpec(NamedTuple):
     """One line to listen to.
 
     Attributes:
@@ -83,14 +83,14 @@ class Link(NamedTuple):
     """
 
     name: str
-    open: Callable[[], Handle]
+    open: Callable[[], Transport]
     protocols: Sequence[registry.Protocol]
-    places: Callable[[registry.Protocol], Places]
+    places: Callable[[registry.Protocol], PlacementById]
     unit: str
     check: tuple[str, str]
 
 
-class _Line:
+class _LineReader:
     """Reads one line, and opens it again when it was gone.
 
     A thread waits for the line; if nobody is to wait, and the line can be looked at, only while it is being
@@ -99,23 +99,23 @@ class _Line:
 
     def __init__(
         self,
-        link: Link,
-        handle: Handle,
+        link: LineSpec,
+        handle: Transport,
         claimed: dict[int, str],
         queue: SimpleQueue,
         now: Callable[[], float],
-        waits: bool,
+        blocking: bool,
     ) -> None:
         self.link = link
-        self.handle: Handle | None = handle
+        self.handle: Transport | None = handle
         self.clocks: HostClocks | None = None
-        self.stream = Stream(link.name, link.protocols, link.places, self._clock, claimed)
+        self.stream = LineDecoder(link.name, link.protocols, link.places, self._clock, claimed)
         self.jumps: dict[int, int] = {}  # of the devices' clocks, a second ago
-        self.twins = False
-        self.told = False  # that nothing usable comes
+        self.duplicate_ids = False
+        self.warned = False  # that nothing usable comes
         self._queue = queue
         self._now = now
-        self._waits = waits
+        self._blocking = blocking
         self._look: Callable[[], tuple[Chunk, bool]] | None = None  # while no thread reads
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, args=(self._drain,), daemon=True, name=link.name)
@@ -127,13 +127,13 @@ class _Line:
     def start(self) -> None:
         self._thread.start()
 
-    def look(self) -> tuple[Chunk, bool]:
+    def poll(self) -> tuple[Chunk, bool]:
         """What has come, and whether more may wait, where no thread reads; nothing where one does."""
         if self._look is None:
             return b"", False
         try:
             return self._look()
-        except Gone:
+        except LineDisconnectedError:
             self._look = None
             self._thread = threading.Thread(
                 target=self._run, args=(self._reopen,), daemon=True, name=self.link.name
@@ -146,14 +146,14 @@ class _Line:
             first()
             while not self._stop.is_set():
                 assert self.handle is not None
-                if not self._waits and self.handle.waiting is not None:
+                if not self._blocking and self.handle.waiting is not None:
                     self._look = self.handle.waiting
                     return
                 try:
                     chunk, _ = self.handle.read()
                     if chunk:
                         self._queue.put((self, self._now(), chunk))
-                except Gone:
+                except LineDisconnectedError:
                     self._reopen()
         except BaseException as error:  # for the thread that can tell the user
             self._queue.put((self, self._now(), _told(self.link, error)))
@@ -165,7 +165,7 @@ class _Line:
             try:
                 if not self.handle.read()[1] and passed_s >= _SETTLE_S:
                     return
-            except Gone:  # the next read tells
+            except LineDisconnectedError:  # the next read tells
                 return
 
     def _reopen(self) -> None:
@@ -195,11 +195,11 @@ class _Line:
             self.handle.close()
 
 
-Arrival = tuple[_Line, float, Any]
+Arrival = tuple[_LineReader, float, Any]
 """A line, when something came over it, and what: a chunk, or what ended its thread."""
 
 
-class _Came(NamedTuple):
+class _Arrivals(NamedTuple):
     """What there is for a batch.
 
     Attributes:
@@ -218,28 +218,28 @@ class LiveSource:
 
     def __init__(
         self,
-        links: Sequence[Link],
+        links: Sequence[LineSpec],
         lenient: bool = False,
-        waits: bool = True,
+        blocking: bool = True,
     ) -> None:
         """Nothing is opened yet.
 
         Args:
             links: what to listen to.
             lenient: warn of a line on which nothing usable comes, and go on with the others.
-            waits: see `open_source`.
+            blocking: see `open_source`.
         """
-        self._waits = waits
+        self._blocking = blocking
         self._lenient = lenient
         self._links = links
-        self._lines: list[_Line] = []
+        self._lines: list[_LineReader] = []
         self._queue: SimpleQueue = SimpleQueue()
         self._open = ExitStack()
 
     @property
-    def counters(self) -> Counters:
+    def counters(self) -> SourceCounters:
         """What has come in so far."""
-        return total(line.stream.counters for line in self._lines)
+        return sum_counters(line.stream.counters for line in self._lines)
 
     @property
     def clocks(self) -> Mapping[int, DeviceClock]:
@@ -272,7 +272,7 @@ class LiveSource:
             for link in self._links:
                 handle = link.open()
                 stack.callback(handle.close)
-                line = _Line(link, handle, claimed, self._queue, _now, self._waits)
+                line = _LineReader(link, handle, claimed, self._queue, _now, self._blocking)
                 self._lines.append(line)
             stack.pop_all()
         for line in self._lines:
@@ -295,7 +295,7 @@ class LiveSource:
         for line in self._lines:
             line.start()
         try:
-            for came, since_s, emptied in self._waited() if self._waits else self._looks():
+            for came, since_s, emptied in self._wait_for_data() if self._blocking else self._poll_lines():
                 samples, raw, error = _fed(came)
                 # On a machine that is behind, what has not been taken from queue or line is not missing yet.
                 if emptied:
@@ -309,44 +309,44 @@ class LiveSource:
                 if now_s - checked_s > 1.0:
                     checked_s = now_s
                     for line in self._lines:
-                        _warn_of_twins(line)
+                        _warn_of_duplicate_ids(line)
         finally:
             for line in self._lines:
                 line.stop()
 
-    def _waited(self) -> Iterator[_Came]:
+    def _wait_for_data(self) -> Iterator[_Arrivals]:
         """The next that comes, or nothing where nothing comes within POLL_S."""
         while True:
             try:
                 came = [self._queue.get(timeout=POLL_S)]
             except Empty:
                 came = []
-            yield _Came(came, inf, True)
+            yield _Arrivals(came, inf, True)
 
-    def _looks(self) -> Iterator[_Came]:
+    def _poll_lines(self) -> Iterator[_Arrivals]:
         """All that has come."""
         since_s, full = _now(), 0
         while True:
-            look_s, left = _now(), False
+            poll_s, left = _now(), False
             came: list[Arrival] = [self._queue.get() for _ in range(self._queue.qsize())]
             for line in self._lines:
-                chunk, more = line.look()
+                chunk, more = line.poll()
                 left |= more
                 if chunk:
                     came.append((line, _now(), chunk))
             full = full + 1 if left else 0
-            yield _Came(came, since_s, not left or full > FULL_LOOKS)
-            since_s = look_s
+            yield _Arrivals(came, since_s, not left or full > FULL_POLLS)
+            since_s = poll_s
 
-    def _check_start(self, line: _Line, now_s: float, start_s: float) -> None:
-        if line.told:
+    def _check_start(self, line: _LineReader, now_s: float, start_s: float) -> None:
+        if line.warned:
             return
         try:
             _check_start(line, now_s, start_s)
         except EdgeposeError as error:
             if not self._lenient:
                 raise
-            line.told = True
+            line.warned = True
             _log.warning("%s", error)
 
 
@@ -376,7 +376,7 @@ def _unix_s() -> float:
     return time.time() - time.monotonic()
 
 
-def _told(link: Link, error: BaseException) -> EdgeposeError:
+def _told(link: LineSpec, error: BaseException) -> EdgeposeError:
     """What ended a line's thread, for the user; makers' libraries fail in ways that nobody has foreseen."""
     if isinstance(error, EdgeposeError):
         return error
@@ -388,7 +388,7 @@ def _told(link: Link, error: BaseException) -> EdgeposeError:
     return told
 
 
-def _check_start(line: _Line, now_s: float, start_s: float) -> None:
+def _check_start(line: _LineReader, now_s: float, start_s: float) -> None:
     stream, link = line.stream, line.link
     if stream.first_s is None:
         if now_s - start_s > SILENCE_S and line.handle is not None:
@@ -407,12 +407,12 @@ def _check_start(line: _Line, now_s: float, start_s: float) -> None:
         )
 
 
-def _warn_of_twins(line: _Line) -> None:
+def _warn_of_duplicate_ids(line: _LineReader) -> None:
     """A clock that began anew is told; two devices with one id look like one that jumps to and fro."""
     devices = {} if line.clocks is None else line.clocks.devices
     for place, clock in devices.items():
-        if clock.resets - line.jumps.get(place, 0) >= _TWINS and not line.twins:
-            line.twins = True
+        if clock.resets - line.jumps.get(place, 0) >= _DUPLICATE_JUMPS and not line.duplicate_ids:
+            line.duplicate_ids = True
             _log.warning(
                 "%s: the clock of the sensor for %s jumps to and fro; are there two devices with its id?",
                 line.link.name,

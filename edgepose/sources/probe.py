@@ -9,14 +9,14 @@ from typing import NamedTuple
 from edgepose.errors import EdgeposeError
 from edgepose.sources.line_config import BAUD, can_link, serial_link
 from edgepose.sources.line_decoder import LISTEN_S
-from edgepose.sources.live import Gone, Link
+from edgepose.sources.live import LineDisconnectedError, LineSpec
 from edgepose.sources.protocol_detection import Detector
 
 BAUDS = (BAUD, 921600, 460800, 230400, 57600, 38400, 9600)
 """Speeds that are tried, the most likely first, bit/s."""
 
 
-class Finding(NamedTuple):
+class ProbeResult(NamedTuple):
     """What a line says.
 
     Attributes:
@@ -30,31 +30,31 @@ class Finding(NamedTuple):
     rates_hz: dict[int, float]
 
 
-def probe_port(name: str) -> tuple[Finding, int]:
+def probe_port(name: str) -> tuple[ProbeResult, int]:
     """What is on a serial port, and the speed at which it was understood, bit/s.
 
     Raises:
         EdgeposeError: it cannot be opened, or formats fit equally well.
     """
-    finding = Finding(None, 0, {})
+    finding = ProbeResult(None, 0, {})
     for baud in BAUDS:
-        finding = listen(serial_link(name, "auto", baud, lambda spoken: {}))
+        finding = probe_line(serial_link(name, "auto", baud, lambda spoken: {}))
         # A wrong speed gives wrong bytes, not none.
         if finding.protocol is not None or not finding.amount:
             return finding, baud
     return finding, BAUD
 
 
-def probe_bus(name: str, bitrate: int | None = None) -> Finding:
+def probe_bus(name: str, bitrate: int | None = None) -> ProbeResult:
     """What is on a CAN bus. Other bit rates are not tried: that would disturb those who talk on it.
 
     Raises:
         EdgeposeError: it cannot be opened, or formats fit equally well.
     """
-    return listen(can_link(name, "auto", bitrate, False, lambda spoken: {}))
+    return probe_line(can_link(name, "auto", bitrate, False, lambda spoken: {}))
 
 
-def listen(link: Link) -> Finding:
+def probe_line(link: LineSpec) -> ProbeResult:
     """What comes over a line within a little more than a second.
 
     Raises:
@@ -73,16 +73,16 @@ def listen(link: Link) -> Finding:
             amount += len(chunk)
             if chunk:
                 detector.feed(chunk, time.monotonic())
-    except Gone:
+    except LineDisconnectedError:
         raise EdgeposeError(f"{link.name}: gone while it was listened to") from None
     finally:
         handle.close()
     found = detector.best(True)
     if found is None:
-        return Finding(None, amount, {})
+        return ProbeResult(None, amount, {})
     protocol, _, heard = found
     counts = Counter(sample.sensor for _, samples in heard for sample in samples)
     # A sample less than came has passed between the first and the last.
     span_s = heard[-1][0] - heard[0][0]
     rates = {sensor: max(n - 1, 0) / span_s if span_s else 0.0 for sensor, n in sorted(counts.items())}
-    return Finding(protocol.name, amount, rates)
+    return ProbeResult(protocol.name, amount, rates)

@@ -47,7 +47,7 @@ def protocol_named(name: str) -> Protocol:
     return PROTOCOLS[name]
 
 
-def candidates(name: str, transport: Literal["bytes", "can"], live: bool) -> list[Protocol]:
+def candidate_protocols(name: str, transport: Literal["bytes", "can"], live: bool) -> list[Protocol]:
     """The protocols that a line may speak.
 
     Args:
@@ -162,10 +162,10 @@ def _text_lines(path: Path) -> Protocol:
     return Protocol(
         name=path.name,
         transport="bytes",
-        speed=115200,
-        text="text lines as a file says",
+        default_bitrate=115200,
+        description="text lines as a file says",
         decoder=partial(TextDecoder, pattern),
         encoder=None,
         ids=range(6),
-        alone="sensor" not in (pattern.regex or "") and "sensor" not in pattern.columns,
+        single_device="sensor" not in (pattern.regex or "") and "sensor" not in pattern.columns,
     )

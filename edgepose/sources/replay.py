@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.base import samples
+from edgepose.formats.recordings.base import iter_samples
 from edgepose.formats.recordings.raw_capture import read_capture
 from edgepose.formats.recordings.registry import (
     find_format,
@@ -18,10 +18,10 @@ from edgepose.formats.recordings.registry import (
     salvage_recording,
 )
 from edgepose.imu import ImuSample, Recording
-from edgepose.sources import Batch, Batches, Counters, Device, Source, total
+from edgepose.sources import Batch, Batches, Device, Source, SourceCounters, sum_counters
 from edgepose.sources.clock_sync import CaptureClock, DeviceClock, HostClocks
-from edgepose.sources.line_decoder import Clock, Places, Stream
-from edgepose.sources.protocol_detection import Chunk, candidates, protocol_named
+from edgepose.sources.line_decoder import Clock, LineDecoder, PlacementById
+from edgepose.sources.protocol_detection import Chunk, candidate_protocols, protocol_named
 from edgepose.sources.sensor_map import SensorMap, default_places
 from firmware_protocols.registry import Protocol
 
@@ -44,7 +44,7 @@ class RecordingSource:
         path: Path,
         realtime: bool,
         lenient: bool = False,
-        waits: bool = True,
+        blocking: bool = True,
         ids: Mapping[int, str] | None = None,
     ) -> None:
         """Nothing is read yet.
@@ -53,19 +53,19 @@ class RecordingSource:
             path: the file, or the folder of a session.
             realtime: deliver it at its own pace.
             lenient: take the good rows of any sensors; without, all six and no bad row.
-            waits: see `open_source`.
+            blocking: see `open_source`.
             ids: placements by serial number, see `read_recording`.
         """
         self._path = path
         self._read = salvage_recording if lenient else read_recording
-        self._realtime, self._waits, self._ids = realtime, waits, ids
+        self._realtime, self._blocking, self._ids = realtime, blocking, ids
         self._recording: Recording | None = None
         self._packets = 0
 
     @property
-    def counters(self) -> Counters:
+    def counters(self) -> SourceCounters:
         """What has come in so far."""
-        return Counters(self._packets)
+        return SourceCounters(self._packets)
 
     @property
     def clocks(self) -> Mapping[int, DeviceClock]:
@@ -99,8 +99,8 @@ class RecordingSource:
     def __iter__(self) -> Batches:
         """All samples in time order, a hundredth of a second at a time."""
         assert self._recording is not None, "the source has not been entered"
-        rows = samples(self._recording)
-        for now_s, batch, late_s in _batches(rows, self._realtime, self._waits):
+        rows = iter_samples(self._recording)
+        for now_s, batch, late_s in _batches(rows, self._realtime, self._blocking):
             self._packets += len(batch)
             yield Batch(now_s, batch, backlog_s=late_s)
 
@@ -113,8 +113,8 @@ class LogSource:
         path: Path,
         realtime: bool,
         chunks: Chunks,
-        stream: Callable[[str], Stream],
-        waits: bool = True,
+        stream: Callable[[str], LineDecoder],
+        blocking: bool = True,
     ) -> None:
         """Nothing is opened yet.
 
@@ -123,19 +123,21 @@ class LogSource:
             realtime: deliver it at its own pace.
             chunks: reads the file: name of a line, time in seconds, and what came over it, None if it is bad.
             stream: makes the stream of a line.
-            waits: see `open_source`.
+            blocking: see `open_source`.
         """
         self._path = path
-        self._realtime, self._waits = realtime, waits
+        self._realtime, self._blocking = realtime, blocking
         self._chunks = chunks
         self._stream = stream
-        self._streams: dict[str, Stream] = {}
+        self._streams: dict[str, LineDecoder] = {}
         self._bad = 0
 
     @property
-    def counters(self) -> Counters:
+    def counters(self) -> SourceCounters:
         """What has come in so far."""
-        return total([Counters(bad=self._bad), *(stream.counters for stream in self._streams.values())])
+        return sum_counters(
+            [SourceCounters(bad=self._bad), *(stream.counters for stream in self._streams.values())]
+        )
 
     @property
     def clocks(self) -> Mapping[int, DeviceClock]:
@@ -181,7 +183,7 @@ class LogSource:
         Raises:
             EdgeposeError: the file cannot be read to its end, or there is no packet in it.
         """
-        for now_s, batch, late_s in _batches(self._samples(), self._realtime, self._waits):
+        for now_s, batch, late_s in _batches(self._samples(), self._realtime, self._blocking):
             yield Batch(now_s, batch, backlog_s=late_s)
         if not self.counters.packets:
             raise EdgeposeError(f"{self._path}: {self._problem()}")
@@ -221,7 +223,7 @@ def open_file(
     protocol: str,
     sensor_map: SensorMap | None,
     lenient: bool = False,
-    waits: bool = True,
+    blocking: bool = True,
 ) -> Source:
     """The source that a file is; the arguments are those of `edgepose.sources.open_source`.
 
@@ -232,17 +234,19 @@ def open_file(
         if protocol != "auto":
             protocol_named(protocol)  # a wrong name is told although it would not be needed
         ids = None if sensor_map is None else sensor_map.serial_numbers()
-        return RecordingSource(path, realtime, lenient, waits, ids)
+        return RecordingSource(path, realtime, lenient, blocking, ids)
     named = None if protocol == "auto" else protocol_named(protocol)
     if is_can_log(path) and (named is None or named.transport == "can"):
         from edgepose.sources.can_bus import read_log
 
-        protocols = candidates(protocol, "can", live=False)
-        return LogSource(path, realtime, read_log, _streams(path, protocols, sensor_map, _log_clock), waits)
+        protocols = candidate_protocols(protocol, "can", live=False)
+        return LogSource(
+            path, realtime, read_log, _streams(path, protocols, sensor_map, _log_clock), blocking
+        )
     if path.suffix.lower() in CAPTURES or (named is not None and named.transport == "bytes"):
-        protocols = candidates(protocol, "bytes", live=False)
+        protocols = candidate_protocols(protocol, "bytes", live=False)
         streams = _streams(path, protocols, sensor_map, _capture_clock)
-        return LogSource(path, realtime, _read_capture, streams, waits)
+        return LogSource(path, realtime, _read_capture, streams, blocking)
     if not path.suffix and not path.exists():
         raise EdgeposeError(f"{path}: no such file or folder")
     raise EdgeposeError(
@@ -279,20 +283,20 @@ def _streams(
     protocols: Sequence[Protocol],
     sensor_map: SensorMap | None,
     clock: Callable[[str], Callable[[int], Clock]],
-) -> Callable[[str], Stream]:
+) -> Callable[[str], LineDecoder]:
     """Makes the streams of a file's lines."""
     claimed: dict[int, str] = {}
 
-    def make(name: str) -> Stream:
+    def make(name: str) -> LineDecoder:
         whole = f"{path}: channel {name}" if name else str(path)
 
-        def places(protocol: Protocol) -> Places:
+        def places(protocol: Protocol) -> PlacementById:
             if sensor_map is None:
                 return default_places(whole, protocol, 0, 1)
             # A capture does not say of which port it is.
             return sensor_map.places(name) if name else sensor_map.all_places()
 
-        return Stream(whole, protocols, places, clock(whole), claimed)
+        return LineDecoder(whole, protocols, places, clock(whole), claimed)
 
     return make
 
@@ -328,10 +332,10 @@ def _read_capture(path: Path) -> Iterator[tuple[str, float, bytes]]:
 
 
 def _batches(
-    rows: Iterator[ImuSample], realtime: bool, waits: bool
+    rows: Iterator[ImuSample], realtime: bool, blocking: bool
 ) -> Iterator[tuple[float, list[ImuSample], float]]:
     """Samples in slices of time, and how late each is; `now_s` is that of the newest sample, or goes on with
-    the clock where realtime is asked for; until a slice is due there are empty ones unless this waits."""
+    the clock where realtime is asked for; until a slice is due there are empty ones unless this blocks."""
     now_s = end_s = -inf
     batch: list[ImuSample] = []
     offset_s = 0.0
@@ -345,7 +349,7 @@ def _batches(
             offset_s = sample.time_s - time.monotonic()
         while sample.time_s >= end_s:
             if realtime:
-                while not waits and end_s - offset_s > time.monotonic():
+                while not blocking and end_s - offset_s > time.monotonic():
                     yield now_s, [], 0.0
                 time.sleep(max(0.0, end_s - offset_s - time.monotonic()))
                 now_s = end_s

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from edgepose.errors import ConfigError
 from edgepose.placements import PLACEMENTS
-from edgepose.sources.line_decoder import Places
+from edgepose.sources.line_decoder import PlacementById
 from edgepose.utils.text_files import read_toml
 from firmware_protocols.registry import Protocol
 
@@ -74,7 +74,7 @@ class SensorMap(NamedTuple):
         """How a line is read."""
         return self.ports.get(line, PortSettings())
 
-    def places(self, line: str) -> Places:
+    def places(self, line: str) -> PlacementById:
         """Placements by id on one line."""
         return {
             device.id: i
@@ -87,7 +87,7 @@ class SensorMap(NamedTuple):
         """Placements by id, for sessions of files that are named after serial numbers."""
         return {device.id: name for name, device in self.devices.items() if device.id is not None}
 
-    def all_places(self) -> Places:
+    def all_places(self) -> PlacementById:
         """Placements by id, of a line whose name is not known.
 
         Raises:
@@ -107,7 +107,7 @@ def channel(bus: str) -> str:
     return bus.split(":", 1)[-1]
 
 
-def default_places(line: str, protocol: Protocol, index: int, count: int) -> Places:
+def default_places(line: str, protocol: Protocol, index: int, count: int) -> PlacementById:
     """Placements by id on one line, without a map.
 
     Args:
@@ -119,7 +119,7 @@ def default_places(line: str, protocol: Protocol, index: int, count: int) -> Pla
     Raises:
         ConfigError: nothing can be assumed.
     """
-    if protocol.alone and count == len(PLACEMENTS):
+    if protocol.single_device and count == len(PLACEMENTS):
         return {None: index}
     if protocol.ids:
         return {sensor: i for i, sensor in enumerate(protocol.ids)}

@@ -11,7 +11,7 @@ from serial.tools import list_ports
 
 from edgepose.errors import DeviceError
 from edgepose.sources import POLL_S
-from edgepose.sources.live import Gone
+from edgepose.sources.live import LineDisconnectedError
 
 try:
     from termios import error as _TerminalError  # no OSError, and pyserial lets it through
@@ -69,7 +69,7 @@ class SerialPort:
         except (OSError, _TerminalError):
             if data:
                 return data, False  # the next read tells
-            raise Gone from None
+            raise LineDisconnectedError from None
 
     @property
     def waiting(self) -> Callable[[], tuple[bytes, bool]] | None:
@@ -83,7 +83,7 @@ class SerialPort:
                 data += self._serial.read(count)
         except (OSError, _TerminalError):
             if not data:  # else the next look tells
-                raise Gone from None
+                raise LineDisconnectedError from None
         return data, len(data) >= _FULL
 
     def close(self) -> None:

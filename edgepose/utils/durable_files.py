@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 
 from edgepose.errors import EdgeposeError
 from edgepose.utils.output_streams import copy_to_stream
-from edgepose.utils.output_targets import Target, explain, find_target
+from edgepose.utils.output_targets import Target, find_target, write_error_message
 
 
 def replace_file(name: str | Path, write: Callable[[Path], None], what: str, *, overwrite: bool) -> None:
@@ -75,7 +75,7 @@ def _named(part: Path, target: Target, what: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise EdgeposeError(explain(error, target.name, what)) from error
+        raise EdgeposeError(write_error_message(error, target.name, what)) from error
     except EdgeposeError as error:  # of a sink, which knows the file by its other name
         raise EdgeposeError(str(error).replace(str(part), target.name)) from error
 

@@ -17,7 +17,7 @@ from typing import Any
 from edgepose.errors import EdgeposeError
 from edgepose.utils.durable_files import new_file, other_name, put_in_place
 from edgepose.utils.output_streams import OutputStream, never
-from edgepose.utils.output_targets import Target, explain, find_target
+from edgepose.utils.output_targets import Target, find_target, write_error_message
 
 FLUSH_S = 1.0
 """A killed program loses at most what came in this time, seconds."""
@@ -74,7 +74,7 @@ class GrowingFile:
         self.regular = True
 
     def _explained(self, error: OSError) -> EdgeposeError:
-        return EdgeposeError(explain(error, self._target.name, self._what))
+        return EdgeposeError(write_error_message(error, self._target.name, self._what))
 
     @property
     def exists(self) -> bool:
@@ -183,7 +183,7 @@ def _drop_end(file: Any, count: int) -> None:
         file.seek(size)
 
 
-class Appender:
+class DurableAppender:
     """An output that grows by whole pieces.
 
     A thread of its own writes and syncs them about once a second: a slow card must not keep the reader of a

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from edgepose.errors import EdgeposeError
-from edgepose.utils.output_targets import Target, descriptor, explain, find_target
+from edgepose.utils.output_targets import Target, descriptor, find_target, write_error_message
 
 PATIENCE_S = 1.0
 """Time that the reader of a pipe has to take anything once the run is to end, seconds."""
@@ -56,7 +56,7 @@ class OutputStream:
         try:
             self.file = self._open()
         except OSError as error:
-            raise EdgeposeError(explain(error, target.name, what)) from error
+            raise EdgeposeError(write_error_message(error, target.name, what)) from error
         self._poll = _poll_of(self.file)
         self.regular = self._poll is not None and stat.S_ISREG(os.fstat(self.file.fileno()).st_mode)
         if self.regular:
@@ -170,4 +170,4 @@ def copy_to_stream(source: Path, name: str, what: str, stopped: Callable[[], boo
         finally:
             stream.close()
     except OSError as error:
-        raise EdgeposeError(explain(error, name, what)) from error
+        raise EdgeposeError(write_error_message(error, name, what)) from error

@@ -63,10 +63,10 @@ def find_target(name: str | Path, what: str) -> Target:
     except FileNotFoundError as error:
         end = Path(os.path.realpath(path))
         if not end.parent.is_dir():
-            raise EdgeposeError(explain(error, text, what)) from error
+            raise EdgeposeError(write_error_message(error, text, what)) from error
         return Target(text, end, False, False)
     except OSError as error:
-        raise EdgeposeError(explain(error, text, what)) from error
+        raise EdgeposeError(write_error_message(error, text, what)) from error
     if stat.S_ISDIR(mode):
         raise EdgeposeError(f"cannot write {what} to {text}: Is a directory; name a file in it")
     if stat.S_ISBLK(mode) or stat.S_ISSOCK(mode):
@@ -172,7 +172,7 @@ def has_reader(name: str | Path) -> bool:
         return False
 
 
-def explain(error: OSError, name: str, what: str) -> str:
+def write_error_message(error: OSError, name: str, what: str) -> str:
     """The line for the user where writing has failed."""
     name = "standard output" if name == "-" else name
     if isinstance(error, BrokenPipeError):

@@ -31,7 +31,7 @@ MOST_KEY_PARTS = 100
 """Parts of a tuple that is a key: hashing goes through all of them, each time."""
 
 
-class Inert:
+class InertObject:
     """Stands in for an object of any class: keeps what the pickle says about it, does nothing."""
 
     def __init__(self, *args: Any) -> None:
@@ -44,7 +44,7 @@ class Inert:
         self.state = state
 
 
-class _DType(Inert):
+class _DType(InertObject):
     """A numpy dtype, as the code and the state that it was written with."""
 
     def build(self) -> np.dtype:
@@ -56,7 +56,7 @@ class _DType(Inert):
         return dtype.newbyteorder(">") if big else dtype
 
 
-class _Array(Inert):
+class _Array(InertObject):
     """A numpy array, as the state that it was written with: version, shape, dtype, column order, bytes."""
 
     def build(self) -> np.ndarray:
@@ -103,7 +103,7 @@ def _functions(make_set: Callable[..., set[Any]]) -> dict[tuple[str, str], Any]:
     """What a pickle may call, by module and name, made anew for each file."""
     # A pickle can set attributes of what it names, so it gets classes and functions of its own.
     functions: dict[tuple[str, str], Any] = {
-        ("numpy", "ndarray"): type("ndarray", (Inert,), {}),
+        ("numpy", "ndarray"): type("ndarray", (InertObject,), {}),
         ("numpy", "dtype"): type("dtype", (_DType,), {}),
         ("_codecs", "encode"): lambda text, encoding: _encode(text, encoding),
     }
@@ -154,7 +154,7 @@ class _Unpickler(_PythonUnpickler):
         if (module, name) in self.functions:
             return self.functions[module, name]
         if self.inert(module, name):
-            return type(name, (Inert,), {})
+            return type(name, (InertObject,), {})
         raise FileFormatError(f"{self.path}: the file asks for {module}.{name}, {self.advice}")
 
     def _tuple_of(self, items: list[Any]) -> _Tuple:
@@ -240,7 +240,7 @@ def read_pickle(
         path: file to read.
         what: the file should be, for messages.
         advice: why a class or function that the file asks for is not given, and what to do.
-        inert: whether a class, by module and name, is known and becomes an `Inert`.
+        inert: whether a class, by module and name, is known and becomes an `InertObject`.
 
     Raises:
         FileFormatError: the file asks for code, is broken, or is no dictionary.
@@ -287,7 +287,7 @@ def _bounded(value: Any) -> Any:
 
 def array_of(value: Any, name: str, path: Path) -> np.ndarray:
     """As `numbers`, with NaN and infinity as they are."""
-    if isinstance(value, Inert) and isinstance(value.state, dict):
+    if isinstance(value, InertObject) and isinstance(value.state, dict):
         value = value.state.get("x")
     try:
         array = value.build() if isinstance(value, _Array) else np.asarray(_bounded(value))

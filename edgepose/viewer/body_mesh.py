@@ -26,7 +26,7 @@ HEAD, HEAD_SIZE = (0.0, 0.09, 0.02), (0.08, 0.115, 0.095)
 NOSE, NOSE_SIZE = (0.0, 0.075, 0.12), (0.016, 0.022, 0.016)
 
 
-class Solids(NamedTuple):
+class BodyMesh(NamedTuple):
     """Solids of one kind: cylinders of radius and length 1 along Z, or balls of radius 1, about their centre.
 
     Attributes:
@@ -59,7 +59,7 @@ def _radius(joint: int) -> float:
     return RADII[JOINTS[joint].rpartition("_")[2]]
 
 
-def build(offsets: ArrayLike) -> tuple[Solids, Solids]:
+def build(offsets: ArrayLike) -> tuple[BodyMesh, BodyMesh]:
     """Cylinders and balls of a body; offsets (24, 3), metres."""
     offsets = np.asarray(offsets, float)
     bones = [(PARENTS[j], np.zeros(3), offsets[j], _radius(j), _side(j)) for j in range(1, len(JOINTS))]
@@ -67,7 +67,7 @@ def build(offsets: ArrayLike) -> tuple[Solids, Solids]:
     along = np.stack([end - start for _, start, end, _, _ in bones])
     lengths = np.linalg.norm(along, axis=1)
     directions = along + np.array([1e-6, 0.0, 0.0])  # any, where a bone has no length or runs against Z
-    cylinders = Solids(
+    cylinders = BodyMesh(
         np.array([joint for joint, *_ in bones]),
         minimal_rotation([0.0, 0.0, 1.0], directions),
         np.stack([(start + end) / 2 for _, start, end, _, _ in bones]),
@@ -79,7 +79,7 @@ def build(offsets: ArrayLike) -> tuple[Solids, Solids]:
     balls = [(joint, end, (radius,) * 3, side) for joint, _, end, radius, side in bones]
     balls += [(0, np.zeros(3), (RADII["spine1"],) * 3, "trunk")]
     balls += [(15, np.array(HEAD), HEAD_SIZE, "trunk"), (15, np.array(NOSE), NOSE_SIZE, "trunk")]
-    return cylinders, Solids(
+    return cylinders, BodyMesh(
         np.array([joint for joint, *_ in balls]),
         np.tile(np.eye(3), (len(balls), 1, 1)),
         np.stack([place for _, place, _, _ in balls]),

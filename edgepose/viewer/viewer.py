@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
-from edgepose.pose import PoseFrame, Poses, held_sensors, longest_holds
+from edgepose.pose import PoseFrame, PoseSequence, held_sensors, longest_holds
 from edgepose.sinks.udp import decode
 from edgepose.skeleton import Body, forward_kinematics
 from edgepose.viewer.body_mesh import build, ground
@@ -43,7 +43,7 @@ WINDOW_S = 5.0
 SPEEDS = ("0.25", "0.5", "1", "2", "4")
 
 
-class Figure:
+class SkeletonView:
     """A body in the scene."""
 
     def __init__(
@@ -133,7 +133,7 @@ class Viewer:
         )
         self._server.initial_camera.position = (0.8, 1.3, 2.1)
         self._server.initial_camera.look_at = (0.0, 0.9, 0.0)
-        self.figure = Figure(self._server, "pose", body, POSE, None)
+        self.figure = SkeletonView(self._server, "pose", body, POSE, None)
         self._told = 0.0
 
     def close(self) -> None:
@@ -143,7 +143,7 @@ class Viewer:
 
     # --- poses of a file ------------------------------------------------------------------------------------
 
-    def play(self, poses: Poses, reference: Poses | None, stopped: Callable[[], bool]) -> None:
+    def play(self, poses: PoseSequence, reference: PoseSequence | None, stopped: Callable[[], bool]) -> None:
         """Show poses of a file, over and over, until `stopped`.
 
         Args:
@@ -158,7 +158,7 @@ class Viewer:
         track = _Track(self.figure, poses, self._body)
         second = None
         if reference is not None:
-            figure = Figure(self._server, "reference", self._body, REFERENCE, 0.4)
+            figure = SkeletonView(self._server, "reference", self._body, REFERENCE, 0.4)
             second = _Track(figure, reference, self._body)
         held = held_sensors(poses.held)
         window = max(1, round(WINDOW_S * poses.rate))
@@ -192,7 +192,7 @@ class Viewer:
             stopped: asked for every picture.
         """
         text = self._server.gui.add_markdown("waiting for poses")
-        stream = Stream()
+        stream = UdpPoseStream()
         receiver.setblocking(False)
         while not stopped():
             # Awake as a pose comes, and not at a pace of its own that would skip some.
@@ -243,7 +243,7 @@ class _TimeLine:
 class _Track:
     """A figure and the poses that it takes."""
 
-    def __init__(self, figure: Figure, poses: Poses, body: Body) -> None:
+    def __init__(self, figure: SkeletonView, poses: PoseSequence, body: Body) -> None:
         self.poses = poses
         self._figure = figure
         self._places = _on_the_ground(poses, body)
@@ -252,7 +252,7 @@ class _Track:
         self._figure.show(self.poses.rotations[i], None if self._places is None else self._places[i])
 
 
-class Stream:
+class UdpPoseStream:
     """Poses that come as datagrams, and what there is to say of the last seconds of them."""
 
     def __init__(self) -> None:
@@ -309,14 +309,14 @@ def plain(status: str) -> str:
     return re.sub(r"[^A-Za-z0-9_ ;]", "?", status[:200])
 
 
-def _beside(reference: Poses, poses: Poses, i: int) -> int:
+def _beside(reference: PoseSequence, poses: PoseSequence, i: int) -> int:
     """Index of the reference pose that is nearest to pose i."""
     common = reference.time_s[0] <= poses.time_s[-1] and poses.time_s[0] <= reference.time_s[-1]
     start = 0.0 if common else poses.time_s[0] - reference.time_s[0]
     return int(np.abs(reference.time_s - (poses.time_s[i] - start)).argmin())
 
 
-def _on_the_ground(poses: Poses, body: Body) -> Array | None:
+def _on_the_ground(poses: PoseSequence, body: Body) -> Array | None:
     """Places of the pelvis (T, 3), metres, the lowest point of all on the ground; None if unknown."""
     if poses.translation is None:
         return None

@@ -48,8 +48,8 @@ def _parse(line: bytes) -> Sample | None:
 PROTOCOL = Protocol(
     name="example-lines",
     transport="bytes",
-    speed=115200,
-    text="lines of the example plug-in",
+    default_bitrate=115200,
+    description="lines of the example plug-in",
     decoder=ExampleDecoder,
     encoder=None,
     ids=range(6),

@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from edgepose.inference.features import network_input
-from edgepose.pipeline.dropout import carried
+from edgepose.pipeline.dropout import extrapolate_dropouts
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import JOINTS, default_body
 from edgepose_export.mocap import read_motion, resample
@@ -15,9 +15,9 @@ from edgepose_export.synthesis.augmentation import (
     SENSOR_MIRROR,
     Augmentation,
     augment,
+    drop_sensor,
     mirror,
     rotations_of,
-    silenced,
 )
 from edgepose_export.synthesis.virtual_imus import recording_arrays, virtual_imus
 from edgepose_export.training.dataset import read_take, root_relative_pose
@@ -187,12 +187,14 @@ def test_silent_sensors_are_those_of_a_run():
     acceleration = torch.tensor(random.normal(size=(2, 100, 6, 3))).float()
     first, end = torch.tensor([1, 30]), torch.tensor([60, 400])
     for sensor in range(len(PLACEMENTS)):
-        got = silenced(orientation, acceleration, sensor, first, end)
+        got = drop_sensor(orientation, acceleration, sensor, first, end)
         for i in range(2):
             before, expected = None, []
             for t in range(100):
                 held = (np.arange(6) == sensor) & bool(first[i] <= t < end[i])
-                frame = carried(orientation[i, t].double().numpy(), acceleration[i, t].numpy(), held, before)
+                frame = extrapolate_dropouts(
+                    orientation[i, t].double().numpy(), acceleration[i, t].numpy(), held, before
+                )
                 before = frame[0]
                 expected.append(frame)
             for a, b in zip(got, zip(*expected, strict=True), strict=True):

@@ -39,7 +39,7 @@ def test_noise_and_bias_are_those_of_the_data_sheet():
 
 
 def test_a_magnetometer_measures_the_field():
-    turned = REST._replace(quat=np.tile(rot.about_z(np.pi / 2), (N, 1)))
+    turned = REST._replace(quat=np.tile(rot.quat_about_z(np.pi / 2), (N, 1)))
     chip = raw(turned, BMI270, 1, magnetometer=True)
     np.testing.assert_allclose(chip.mag.mean(axis=0), [FIELD_UT[1], -FIELD_UT[0], FIELD_UT[2]], atol=0.02)
 
@@ -56,6 +56,6 @@ def test_each_exercise_moves_its_sensors_and_returns_to_the_straight_pose():
     for k, exercise in enumerate(ROUTINE):
         rows = bones[k * length : (k + 1) * length]
         for bone, name in zip(BONES, PLACEMENTS, strict=True):
-            turned = np.degrees(rot.angle_between(rows[:, bone], straight_pose()[bone])).max()
+            turned = np.degrees(rot.geodesic_angle(rows[:, bone], straight_pose()[bone])).max()
             assert (turned > 25.0) == (name in exercise.sensors), (exercise.text, name, turned)
         np.testing.assert_allclose(rows[0], straight_pose(), atol=1e-9)

@@ -102,7 +102,7 @@ def test_figures_of_another_model_stand_beside(made, tmp_path):
     folder, _, _ = made
     to = ("export", folder / "run" / "best.pt", "--out", tmp_path / "tiny.pt", "--beside", "rnn")
     edgepose(*to, "--measure", folder / "recordings")
-    measures = archive.inspect(tmp_path / "tiny.pt").metadata["measures"]
+    measures = archive.read_info(tmp_path / "tiny.pt").metadata["measures"]
     assert set(measures) == {"cmu-walk-run", "cmu-02", "bandai-styles"}
     for rows in measures.values():
         other, own = rows["`rnn`, online, step by step"], rows["online, stream (5 future)"]
@@ -116,7 +116,7 @@ def test_metadata(made):
     folder, said, _ = made
     path = folder / "new" / "tiny.pt"
     assert f"wrote {path}" in said[2]
-    about = archive.inspect(path).metadata
+    about = archive.read_info(path).metadata
     assert about["format"] == archive.FORMAT
     assert (about["name"], about["kind"], about["hidden"]) == ("tiny", "birnn", 8)
     assert about["parameters"] == sum(
@@ -151,7 +151,7 @@ def test_metadata(made):
 def test_card(made):
     folder, _, _ = made
     card = (folder / "new" / "tiny.md").read_text(encoding="utf-8")
-    about = archive.inspect(folder / "new" / "tiny.pt").metadata
+    about = archive.read_info(folder / "new" / "tiny.pt").metadata
     for text in (
         "# tiny",
         "bidirectional LSTM",
@@ -201,7 +201,7 @@ def test_models_and_evaluate(made):
         "8 nearest neighbours of the frame",
     ]
     # The archive's own figures come back.
-    mean, deviation, _ = archive.inspect(path).metadata["measures"]["cmu-02"]["offline, whole take"][
+    mean, deviation, _ = archive.read_info(path).metadata["measures"]["cmu-02"]["offline, whole take"][
         "sip_error_deg"
     ]
     assert f"{mean:.2f} ± {deviation:.2f}" in rows[2]
@@ -250,7 +250,7 @@ def test_unidirectional(made, tmp_path):
     edgepose("train", "--config", config, "--data", data, "--out", tmp_path / "run", "--threads", 1)
     path = tmp_path / "rnn.pt"
     edgepose("export", tmp_path / "run" / "checkpoint.pt", "--out", path)
-    about = archive.inspect(path).metadata
+    about = archive.read_info(path).metadata
     assert (about["kind"], about["past"], about["future"], about["measures"]) == ("rnn", 0, 0, {})
     card = path.with_suffix(".md").read_text(encoding="utf-8")
     assert "unidirectional" in card
@@ -322,7 +322,7 @@ def test_mean_weights_of_checkpoints(made, tmp_path):
     first, tuned = folder / "run" / "best.pt", tmp_path / "tuned" / "checkpoint.pt"
     edgepose(*train, "--out", tuned.parent, "--init", first, "--steps", 3)
     edgepose("export", tuned, first, "--out", tmp_path / "mean.pt")
-    about = archive.inspect(tmp_path / "mean.pt").metadata
+    about = archive.read_info(tmp_path / "mean.pt").metadata
     assert (about["training"]["checkpoints"], about["training"]["steps"]) == (2, 3)
     card = (tmp_path / "mean.md").read_text(encoding="utf-8")
     assert "3 steps in the last of 2 trainings, the mean of whose weights this is." in card
@@ -335,7 +335,7 @@ def test_mean_weights_of_checkpoints(made, tmp_path):
     network.load_state_dict(weights)
     expected = script(network, Statistics(**states[0]["statistics"]))
     still = torch.eye(3).expand(1, 9, 6, 3, 3), torch.zeros(1, 9, 6, 3)
-    module = archive.load(archive.inspect(tmp_path / "mean.pt"), trust=True)
+    module = archive.load(archive.read_info(tmp_path / "mean.pt"), trust=True)
     for got, wanted in zip(module(*still), expected(*still), strict=True):
         torch.testing.assert_close(got, wanted)
     (tmp_path / "wide.toml").write_text(CONFIG.replace("hidden = 8", "hidden = 9"))
@@ -349,7 +349,7 @@ def test_mean_weights_of_checkpoints(made, tmp_path):
 def test_rounded_weights(made, tmp_path):
     folder, _, _ = made
     edgepose("export", folder / "run" / "best.pt", "--out", tmp_path / "short.pt", "--rounded")
-    info = archive.inspect(tmp_path / "short.pt")
+    info = archive.read_info(tmp_path / "short.pt")
     assert info.metadata["rounded"]
     assert "weights, rounded by about a hundredth." in (card := (tmp_path / "short.md").read_text("utf-8"))
     assert "--out short.pt --rounded --measure" in card
@@ -448,7 +448,7 @@ def test_heat_map(made, tmp_path):
 def test_deviations_are_fitted_at_export(made):
     """The factors of the validation take stand in the archive's description and in what it predicts."""
     folder, _, _ = made
-    about = archive.inspect(folder / "new" / "tiny.pt").metadata
+    about = archive.read_info(folder / "new" / "tiny.pt").metadata
     factors = about["std_scale"]
     assert set(factors) == set(JOINTS)
     fitted = [factors[name] for name in about["joints"]]

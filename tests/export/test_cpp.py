@@ -22,10 +22,10 @@ def test_stream_from_cpp(tmp_path):
     abi = f"-D_GLIBCXX_USE_CXX11_ABI={int(torch.compiled_with_cxx11_abi())}"
     command = [compiler, "-std=c++20", "-O0", abi, str(SOURCE), *includes, *libraries, "-o", str(program)]
     subprocess.run(command, check=True)
-    path = archive.find("birnn")
+    path = archive.find_archive("birnn")
     words = subprocess.run([program, path], capture_output=True, text=True, check=True).stdout.split()
     assert words[:9] == ["0", "0", "0", "0", "0", "1", "1", "1", "5"]
-    module = archive.load(archive.inspect(path))
+    module = archive.load(archive.read_info(path))
     state = module.start(1, 5)
     for _ in range(8):
         rotations, _, state = module.stream(torch.eye(3).expand(1, 6, 3, 3), torch.zeros(1, 6, 3), state)

@@ -119,7 +119,7 @@ def test_archive_on_disk(made, shape, tmp_path, wearers):
     network, _, module = made
     about = describe("small", network, CHECKPOINT, 99, 99)
     save(module, tmp_path / "small.pt", about)
-    info = archives.inspect(tmp_path / "small.pt")
+    info = archives.read_info(tmp_path / "small.pt")
     assert (info.metadata["past"], info.metadata["future"]) == (network.past, network.future)
     assert f"{network.past} past" in card(info.metadata)
     loaded = archives.load(info, trust=True)

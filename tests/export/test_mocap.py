@@ -8,7 +8,7 @@ import pytest
 from edgepose.errors import EdgeposeError
 from edgepose.formats.bvh import read_bvh
 from edgepose.formats.joint_tree import forward
-from edgepose.rotations import about_axis, angle_between, matrix_to_rotvec, rotvec_to_matrix
+from edgepose.rotations import geodesic_angle, matrix_to_rotvec, rotation_about_axis, rotvec_to_matrix
 from edgepose.skeleton import local_from_global
 from edgepose_export.mocap import Motion, pieces, read_motion, resample
 from edgepose_export.mocap.amc import find_asf, read_amc, read_asf
@@ -28,7 +28,7 @@ def degrees_between(u, v):
 
 def without_heading(rotations):
     yaw = np.arctan2(rotations[:, 0, 0, 2], rotations[:, 0, 2, 2])
-    return about_axis("y", -yaw)[:, None] @ rotations
+    return rotation_about_axis("y", -yaw)[:, None] @ rotations
 
 
 # --- real takes ---------------------------------------------------------------------------------------------
@@ -59,7 +59,7 @@ def test_amc_agrees_with_bvh_of_the_same_take():
     amc, bvh = read_motion(AMC), read_motion(CMU)
     assert len(amc.rotations) == len(bvh.rotations) == 60
     assert amc.rate == bvh.rate == 120.0
-    assert np.degrees(angle_between(amc.rotations, bvh.rotations)).max() < 0.01
+    assert np.degrees(geodesic_angle(amc.rotations, bvh.rotations)).max() < 0.01
     np.testing.assert_allclose(amc.translation, bvh.translation, atol=1e-5)
 
 
@@ -179,7 +179,7 @@ def test_resampling_follows_a_smooth_motion():
     assert found.rate == 60.0
     assert len(found.rotations) == 181
     inner = slice(6, -6)  # the ends of a spline are less exact
-    assert np.degrees(angle_between(found.rotations, wanted.rotations))[inner].max() < 0.02
+    assert np.degrees(geodesic_angle(found.rotations, wanted.rotations))[inner].max() < 0.02
     np.testing.assert_allclose(found.translation, wanted.translation, atol=1e-9)
     np.testing.assert_allclose(np.linalg.det(found.rotations), 1.0, atol=1e-9)
 
@@ -188,9 +188,9 @@ def test_resampling_keeps_frames_that_are_on_the_new_grid():
     motion = read_motion(CMU)
     found = resample(motion, 60.0)
     assert len(found.rotations) == 30
-    assert angle_between(found.rotations, motion.rotations[::2]).max() < 1e-9
+    assert geodesic_angle(found.rotations, motion.rotations[::2]).max() < 1e-9
     back = resample(resample(read_motion(WALK), 60.0), 30.0)
-    assert angle_between(back.rotations, read_motion(WALK).rotations).max() < 1e-9
+    assert geodesic_angle(back.rotations, read_motion(WALK).rotations).max() < 1e-9
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3])
@@ -211,7 +211,7 @@ def test_no_spikes_in_accelerations_after_resampling():
 def test_pieces_are_cut_at_jumps():
     motion = spinning(120.0, 600)
     assert [len(p.rotations) for p in pieces(motion)] == [600]
-    motion.rotations[200:, 0] = motion.rotations[200:, 0] @ about_axis("y", np.pi)
+    motion.rotations[200:, 0] = motion.rotations[200:, 0] @ rotation_about_axis("y", np.pi)
     motion.translation[450:] += 5.0
     motion.rotations[300, 7] = np.eye(3)  # feet do not count
     parts = pieces(motion)
@@ -226,10 +226,10 @@ def test_pieces_are_cut_at_jumps():
 def amass_fields(motion, width, rate_name="mocap_framerate"):
     """The fields of an AMASS file, whose world has Z up, for a motion in our world."""
     rotvec = matrix_to_rotvec(local_from_global(motion.rotations))
-    rotvec[:, 0] = matrix_to_rotvec(about_axis("x", np.pi / 2) @ motion.rotations[:, 0])
+    rotvec[:, 0] = matrix_to_rotvec(rotation_about_axis("x", np.pi / 2) @ motion.rotations[:, 0])
     poses = np.zeros((len(rotvec), width))
     poses[:, : min(width, 72)] = rotvec.reshape(len(rotvec), 72)
-    trans = motion.translation @ about_axis("x", np.pi / 2).T
+    trans = motion.translation @ rotation_about_axis("x", np.pi / 2).T
     return {"poses": poses, "trans": trans, rate_name: np.array(motion.rate), "gender": np.array("neutral")}
 
 
@@ -241,7 +241,7 @@ def test_amass_round_trip(tmp_path, width, name):
     np.savez(tmp_path / "m.npz", **amass_fields(motion, width, name))
     found = read_motion(tmp_path / "m.npz")
     assert (found.rate, found.source) == (30.0, "amass")
-    assert angle_between(found.rotations[:, :22], motion.rotations[:, :22]).max() < 1e-9
+    assert geodesic_angle(found.rotations[:, :22], motion.rotations[:, :22]).max() < 1e-9
     np.testing.assert_allclose(found.translation, motion.translation, atol=1e-12)
     if width > 72:  # 22 and 23 are fingers or a jaw there
         np.testing.assert_allclose(found.rotations[:, 22], found.rotations[:, 20], atol=1e-12)
@@ -340,7 +340,9 @@ def test_bvh_channels_in_any_order(tmp_path):
     assert found.parents == (-1, 0, 1)
     assert found.rate == 30.0
     np.testing.assert_array_equal(found.offsets, [[0, 0, 0], [0, 2, 0], [1, 0, 0]])
-    y, z, x = (about_axis(axis, np.radians(angle)) for axis, angle in zip("yzx", (20, 30, 40), strict=True))
+    y, z, x = (
+        rotation_about_axis(axis, np.radians(angle)) for axis, angle in zip("yzx", (20, 30, 40), strict=True)
+    )
     np.testing.assert_allclose(found.rotations[1, 1], y @ z @ x, atol=1e-12)
     np.testing.assert_array_equal(found.rotations[1, 2], np.eye(3))
     np.testing.assert_array_equal(found.positions[:, 2], [[1, 0, 0], [1, 0, 5]])

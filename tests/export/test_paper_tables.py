@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from edgepose.analysis.figures import check_picture
-from edgepose.analysis.metrics import Measure, sip_error
+from edgepose.analysis.metrics import Metric, sip_error
 from edgepose.errors import EdgeposeError
 from edgepose_export.evaluation import plots
 from edgepose_export.evaluation.evaluate import Mode, run_archive, run_windows, window_errors
@@ -20,8 +20,8 @@ RNN = {"kind": "rnn", "past": 0, "future": 0}
 
 def row(angle, position, frames):
     return {
-        "sip_error_deg": Measure(angle, angle / 2, frames),
-        "position_error_cm": Measure(position, position / 2, frames),
+        "sip_error_deg": Metric(angle, angle / 2, frames),
+        "position_error_cm": Metric(position, position / 2, frames),
     }
 
 

@@ -22,7 +22,7 @@ from edgepose_export.synthesis.virtual_imus import recording_arrays, virtual_imu
 from edgepose_export.training.config import TrainConfig
 from edgepose_export.training.dataset import read_take, tape
 from edgepose_export.training.distributed import ALONE, Processes
-from edgepose_export.training.trainer import Trainer, read_checkpoint, statistics_of
+from edgepose_export.training.trainer import Trainer, compute_statistics, read_checkpoint
 
 DATA = Path(__file__).parents[1] / "data" / "mocap"
 CONFIG = """
@@ -136,7 +136,7 @@ def test_one_run_of_two_processes(run):
     assert shares == [["01_01", "05_01"], ["01_02"]]
     # The statistics are those of all takes.
     takes = [read_take(folder / "recordings" / f"{name}.npz") for name in ("01_01", "01_02", "05_01")]
-    alone = statistics_of(tape(takes), NetworkShape("rnn", 8), ALONE)
+    alone = compute_statistics(tape(takes), NetworkShape("rnn", 8), ALONE)
     for name, numbers in alone._asdict().items():
         torch.testing.assert_close(state["statistics"][name], numbers)
     # The processes draw differently.

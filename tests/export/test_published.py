@@ -236,7 +236,7 @@ def write_vicon(folder, bones, hang=0.0):
     turns = {name: theirs[:, joint] for name, joint in VICON.items()}
     places = dict.fromkeys(VICON, np.zeros((len(bones), 3)))
     for far, (near, rest) in LIMBS.items():
-        down = rot.about_axis("z", -hang * rest[0]) @ rest
+        down = rot.rotation_about_axis("z", -hang * rest[0]) @ rest
         places[far] = places[near] + 10.0 * bones[:, VICON[near]] @ down @ GLOBAL_FROM_BODY.T
     folder.mkdir(parents=True)
     quats = {name: rot.matrix_to_quat(turns[name])[:, [1, 2, 3, 0]] for name in VICON}
@@ -302,7 +302,7 @@ def test_a_take_with_two_files_of_sensors_is_one(totalcapture):
 def test_limbs_point_as_vicons_do_whatever_its_t_pose(tmp_path, true_bones):
     read = read_vicon(write_vicon(tmp_path / "S1" / "acting1", true_bones, hang=0.15))
     for arm, side in ((16, 1), (17, -1), (18, 1), (19, -1)):
-        hanging = rot.about_axis("z", -0.15 * side) @ [side, 0, 0]
+        hanging = rot.rotation_about_axis("z", -0.15 * side) @ [side, 0, 0]
         np.testing.assert_allclose(read[:, arm] @ [side, 0, 0], true_bones[:, arm] @ hanging, atol=1e-6)
     straight = [joint for joint in range(16) if joint]
     np.testing.assert_allclose(read[:, straight], true_bones[:, straight], atol=1e-7)
@@ -310,7 +310,7 @@ def test_limbs_point_as_vicons_do_whatever_its_t_pose(tmp_path, true_bones):
 
 def test_vicon_of_another_take(totalcapture, true_bones):
     folder, path = totalcapture
-    turned = write_vicon(folder / "S1" / "acting1", rot.about_axis("y", 1.0) @ true_bones)
+    turned = write_vicon(folder / "S1" / "acting1", rot.rotation_about_axis("y", 1.0) @ true_bones)
     with pytest.raises(EdgeposeError, match="its bones are 57 degrees from what the sensors say"):
         read_totalcapture(path, folder, {"s1_acting1": turned})
 

@@ -52,7 +52,7 @@ def test_the_wearer_sits_and_stands_on_feet_that_stay_where_they_are(upper: Moti
 def test_nothing_jerks(upper: Motion) -> None:
     take = seated(upper, BODY, np.random.default_rng(7))
     legs = [0, 1, 2, 4, 5]
-    turns = rot.angle_between(take.rotations[1:, legs], take.rotations[:-1, legs]) * 60
+    turns = rot.geodesic_angle(take.rotations[1:, legs], take.rotations[:-1, legs]) * 60
     assert turns.max() < 6.0
     force = virtual_imus(take, BODY).force[:, [2, 3, 5]]
     assert np.linalg.norm(force, axis=-1).max() < 30.0

@@ -76,7 +76,7 @@ def test_circling_body():
 def test_turning_body():
     """A body that spins about the vertical: each sensor is drawn to the axis by its distance times w^2."""
     w, t = 4.0, np.arange(60) / RATE
-    pose = rot.about_axis("y", w * t)[:, None] @ np.tile(np.eye(3), (24, 1, 1))
+    pose = rot.rotation_about_axis("y", w * t)[:, None] @ np.tile(np.eye(3), (24, 1, 1))
     motion = still(60)._replace(rotations=pose)
     body = default_body()
     imus = virtual_imus(motion, body, MOUNTING)
@@ -96,7 +96,7 @@ def test_turning_body():
 def test_one_swinging_forearm_moves_only_its_own_sensor():
     t = np.arange(60) / RATE
     pose = np.tile(np.eye(3), (60, 24, 1, 1))
-    pose[:, [18, 20, 22]] = rot.about_axis("z", 0.5 * np.sin(5 * t))[:, None]
+    pose[:, [18, 20, 22]] = rot.rotation_about_axis("z", 0.5 * np.sin(5 * t))[:, None]
     offsets, sensors = default_body().offsets, np.zeros((6, 3))
     sensors[0] = [0.2, 0.0, 0.0]
     acceleration = body_acceleration(
@@ -130,7 +130,7 @@ def test_hold_then_the_take():
     assert held.rotations[200 + blend, 0, 0, 2] == pytest.approx(0, abs=1e-9)
     assert held.rotations[200 + blend, 0, 2, 2] > 0
     # No joint jumps on the way.
-    steps = rot.angle_between(held.rotations[1:], held.rotations[:-1])[: 200 + blend]
+    steps = rot.geodesic_angle(held.rotations[1:], held.rotations[:-1])[: 200 + blend]
     assert np.rad2deg(steps.max()) < 4
 
 
@@ -166,14 +166,16 @@ def test_recording_round_trip(mounted):
 def test_calibrating_a_mounted_recording_gives_the_true_bones_back(mounted):
     path, motion, imus = mounted
     recording = read_recording(path)
-    hold = calibration.cut(calibration.hold_from_recording(recording), 0.0, 2.9)
+    hold = calibration.trim(calibration.hold_from_recording(recording), 0.0, 2.9)
     made = calibration.calibrate(
         calibration.check_hold(hold), pose="straight", body_frame="heading:0", created="2026-01-01T00:00:00Z"
     )
     np.testing.assert_allclose(rot.quat_to_matrix(made.bone_from_sensor), MOUNTING, atol=1e-5)
     orientation = np.stack([recording.sensors[name].quat for name in PLACEMENTS], axis=1)
     force = np.stack([recording.sensors[name].acc for name in PLACEMENTS], axis=1)
-    bones, acceleration = calibration.apply(made, orientation, rot.quat_rotate(orientation, force))
+    bones, acceleration = calibration.apply_calibration(
+        made, orientation, rot.quat_rotate(orientation, force)
+    )
     np.testing.assert_allclose(bones, motion.rotations[:, list(BONES)], atol=1e-5)
     np.testing.assert_allclose(acceleration, body_acceleration(imus), atol=1e-4)
 

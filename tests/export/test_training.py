@@ -87,7 +87,7 @@ def same(a, b):
 
 def test_targets_are_what_the_decoder_turns_into_the_pose(shape, takes):
     together = tape(takes)
-    statistics = training.statistics_of(together, shape)
+    statistics = training.compute_statistics(together, shape)
     targets = training.pose_targets(together.relative, shape)
     mean = (targets - statistics.target_mean) / statistics.target_std
     pose, _ = PoseDecoder(shape, *statistics[2:])(together.orientation, mean, torch.ones_like(mean))
@@ -113,13 +113,13 @@ def test_tape(takes):
 
 def test_statistics(takes):
     together = tape(takes)
-    local = training.statistics_of(together, NetworkShape("rnn", 8))
+    local = training.compute_statistics(together, NetworkShape("rnn", 8))
     targets = training.pose_targets(together.relative, NetworkShape("rnn", 8))
     assert targets.shape[1] == 135
     torch.testing.assert_close(local.target_mean, targets.mean(0))
     torch.testing.assert_close(local.target_std, targets.std(0).clamp_min(1e-2))
     # In the root's frame a degree weighs the same at every joint.
-    common = training.statistics_of(together, SMALL.network).target_std
+    common = training.compute_statistics(together, SMALL.network).target_std
     assert common.shape == (60,)
     assert common.unique().numel() == 1
     assert all(torch.isfinite(x).all() and (x > 0).all() for x in (local.input_std, common))
@@ -143,8 +143,8 @@ def test_trembling_costs_and_a_steady_error_does_not(takes):
     true = torch.linspace(0, 1, 9)[None, :, None].expand(2, 9, 3)
     steady = true + torch.linspace(0.1, 0.5, 9)[:, None]
     trembling = true + 0.1 * torch.tensor([1.0, -1.0]).repeat(5)[:9, None]
-    assert training.tremble_loss(steady, true) < 1e-12
-    torch.testing.assert_close(training.tremble_loss(trembling, true), torch.tensor(0.4**2))
+    assert training.smoothness_loss(steady, true) < 1e-12
+    torch.testing.assert_close(training.smoothness_loss(trembling, true), torch.tensor(0.4**2))
     smooth = replace(SMALL, smoothness=100.0)
 
     def trembles(config, takes):
@@ -152,7 +152,7 @@ def test_trembling_costs_and_a_steady_error_does_not(takes):
         for _ in range(60):
             one.train_step()
         x, _ = one.averaged(torch.randn(4, 20, 60, generator=torch.Generator().manual_seed(1)))
-        return training.tremble_loss(x, torch.zeros_like(x))
+        return training.smoothness_loss(x, torch.zeros_like(x))
 
     assert trembles(smooth, takes) < 0.5 * trembles(SMALL, takes)
 
@@ -194,7 +194,7 @@ def test_windows_stay_inside_takes(takes):
 @pytest.mark.parametrize("share", [0.25, 0.5])
 def test_share_of_cmu(takes, share):
     starts = training.window_starts(tape(takes), 20, False)
-    drawn = training.draw(starts, 40, share, torch.Generator().manual_seed(0))
+    drawn = training.sample_windows(starts, 40, share, torch.Generator().manual_seed(0))
     assert len(drawn) == 40
     assert sum(int(s) in starts[1].tolist() for s in drawn) == 40 * share
 

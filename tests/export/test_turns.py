@@ -7,7 +7,7 @@ import pytest
 
 from edgepose.analysis.metrics import joint_angle_error
 from edgepose.inference import archive
-from edgepose.rotations import about_axis
+from edgepose.rotations import rotation_about_axis
 from edgepose.skeleton import default_body
 from edgepose_export.evaluation.evaluate import modes_of, run_archive
 from edgepose_export.mocap import read_motion, resample
@@ -22,7 +22,7 @@ def walking_on_the_spot(folder, deg_s):
     motion = resample(read_motion(WALK))
     there = np.arange(len(motion.rotations))
     frames = np.resize(np.concatenate([there, there[-2:0:-1]]), 240)
-    turn = about_axis("y", np.radians(deg_s) / RATE * np.arange(240))
+    turn = rotation_about_axis("y", np.radians(deg_s) / RATE * np.arange(240))
     translation = motion.translation[frames] * [0.0, 1.0, 0.0]
     motion = motion._replace(rotations=turn[:, None] @ motion.rotations[frames], translation=translation)
     path = folder / f"{deg_s}.npz"
@@ -32,7 +32,7 @@ def walking_on_the_spot(folder, deg_s):
 
 @pytest.mark.parametrize("name", ["birnn", "rnn", "birnn-cmu", "rnn-cmu"])
 def test_turns_do_not_leave_the_body_behind(name, tmp_path):
-    info = archive.inspect(archive.find(name))
+    info = archive.read_info(archive.find_archive(name))
     (mode,) = (mode for mode in modes_of(info.metadata) if mode.name == "stream")
     takes = [walking_on_the_spot(tmp_path, deg_s) for deg_s in (0, 180, -180)]
     poses = run_archive(archive.load(info), takes, mode)

@@ -20,7 +20,7 @@ NO_TIME = {
 def test_what_is_encoded_is_decoded(name):
     protocol = PROTOCOLS[name]
     decoder, encode = protocol.decoder(), protocol.encoder()
-    sensors = [0] if protocol.alone and name != "mavlink" else list(protocol.ids)
+    sensors = [0] if protocol.single_device and name != "mavlink" else list(protocol.ids)
     got = []
     for seq in range(20):
         for sensor in sensors:
@@ -56,7 +56,7 @@ def test_names_ids_and_words():
         assert name == name.lower()
         assert "\n" not in protocol.text
         assert len(set(protocol.ids)) == len(protocol.ids) in (0, 6)
-        assert protocol.ids or protocol.alone
+        assert protocol.ids or protocol.single_device
 
 
 def test_families_are_imported_only_when_used():
@@ -114,11 +114,11 @@ def encode(sample):
 PROTOCOL = Protocol(
     name="boots",
     transport="bytes",
-    speed=9600,
-    text="sensors in boots",
+    default_bitrate=9600,
+    description="sensors in boots",
     decoder=BootsDecoder,
     encoder=uncounted(encode),
-    alone=True,
+    single_device=True,
 )
 """
 

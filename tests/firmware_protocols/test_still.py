@@ -28,7 +28,7 @@ def sent_and_read(name, quat):
     """What comes out of a few samples of a sensor at rest."""
     protocol = PROTOCOLS[name]
     decoder, encode = protocol.decoder(), protocol.encoder()
-    sensor = 0 if protocol.alone else protocol.ids[0]
+    sensor = 0 if protocol.single_device else protocol.ids[0]
     still = Sample(sensor, None, quat, rotate_back(quat, UP), (0.0, 0.0, 0.0), (20.0, 0.0, -40.0), 25.0)
     samples = []
     # Some decoders have to see first what a sensor sends.

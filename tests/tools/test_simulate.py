@@ -19,7 +19,7 @@ import can
 import numpy as np
 import pytest
 
-from edgepose.formats.recordings.base import from_samples
+from edgepose.formats.recordings.base import recording_from_samples
 from edgepose.formats.recordings.csv import write_csv
 from edgepose.formats.recordings.npz import write_npz
 from edgepose.formats.recordings.registry import read_recording
@@ -50,7 +50,7 @@ def recording(tmp_path_factory):
         for i in range(6)
     ]
     path = tmp_path_factory.mktemp("simulate") / "recording.npz"
-    write_npz(path, from_samples(samples))
+    write_npz(path, recording_from_samples(samples))
     return path
 
 
@@ -269,9 +269,9 @@ def test_other_wire_formats(recording, name, lines):
     first = [data.quat[0] for data in read_recording(recording).sensors.values()]
     for line, samples in enumerate(got):
         for sample in samples:
-            index = line if spoken.alone else list(spoken.ids).index(sample.sensor)
+            index = line if spoken.single_device else list(spoken.ids).index(sample.sensor)
             assert abs(np.dot(sample.quat, first[index])) == pytest.approx(1.0, abs=1e-6)
-    if not spoken.alone:
+    if not spoken.single_device:
         assert {sample.sensor for sample in got[0]} == set(spoken.ids)
 
 
@@ -322,7 +322,7 @@ def test_every_format_takes_the_samples_of_a_clip():
     for name, spoken in PROTOCOLS.items():
         data = recording.sensors["pelvis"]
         sensor = tool["Sensor"](5, data, data.time_s[0], spoken.encoder())
-        sensor.prepare(spoken, 0 if spoken.alone else spoken.ids[5])
+        sensor.prepare(spoken, 0 if spoken.single_device else spoken.ids[5])
         sensor.measure(0)
         assert sensor.wire, name
     # The clip stands straight first: gravity is all there is.

@@ -45,8 +45,8 @@ def bench(ctx: click.Context, models: tuple[str, ...], trust: bool, as_json: boo
 def _speed(models: tuple[str, ...], trust: bool, as_json: bool) -> None:
     from edgepose.inference import archive
 
-    infos = [archive.inspect(archive.find(name)) for name in models]
-    infos = infos or [archive.inspect(path) for path in archive.shipped()]
+    infos = [archive.read_info(archive.find_archive(name)) for name in models]
+    infos = infos or [archive.read_info(path) for path in archive.bundled_archives()]
     if not infos:
         raise click.UsageError("no model is shipped; name one with --model")
 

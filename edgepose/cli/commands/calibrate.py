@@ -14,10 +14,10 @@ import numpy as np
 
 from edgepose import __version__, calibration
 from edgepose.calibration import Calibration, HeadingReset, HoldSummary
-from edgepose.cli.calibration_session import ROUTINE_S, Plan, finds_forward, live, recorded
+from edgepose.cli.calibration_session import ROUTINE_S, CalibrationPlan, finds_forward, live, recorded
 from edgepose.cli.options.outputs import check_files, overwrite_option
 from edgepose.cli.options.source import filter_options, source_options
-from edgepose.cli.prompts import Guide
+from edgepose.cli.prompts import Prompter
 from edgepose.cli.terminal import messages as terminal
 from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
@@ -158,9 +158,11 @@ def calibrate(
     _check_writable(out, overwrite)
     said = None if source.sensors is None else read_map(source.sensors)
     mounted = {} if said is None else {name: device.mounting for name, device in said.devices.items()}
-    plan = Plan(pose, heading_reset, _words(heading_reset, mounted), motion, hold, from_s, countdown)
+    plan = CalibrationPlan(
+        pose, heading_reset, _words(heading_reset, mounted), motion, hold, from_s, countdown
+    )
     orient = OrientationStage(filter, magnetometer=not no_mag)
-    say = Guide(err=out == "-")
+    say = Prompter(err=out == "-")
     metadata: dict[str, Any] = {
         "program": f"edgepose {__version__}",
         "source": source.name,

@@ -19,14 +19,14 @@ import click
 from edgepose.cli.options.source import source_options
 from edgepose.cli.terminal.live_page import Page, is_coloured, is_terminal
 from edgepose.cli.terminal.messages import printable, say, show
-from edgepose.cli.terminal.stop_signal import Stop
+from edgepose.cli.terminal.stop_signal import StopSignal
 from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
 
 if TYPE_CHECKING:
-    from edgepose.diagnostics.rules import Finding
-    from edgepose.diagnostics.sensor_health import Health, SensorHealth
-    from edgepose.sources import Counters, Source
+    from edgepose.diagnostics.rules import Diagnosis
+    from edgepose.diagnostics.sensor_health import SensorHealth, SensorHealthMonitor
+    from edgepose.sources import Source, SourceCounters
 
 _log = logging.getLogger(__name__)
 
@@ -44,8 +44,8 @@ class State(NamedTuple):
     """
 
     seconds: float
-    counters: Counters
-    sensors: list[tuple[SensorHealth, Finding]]
+    counters: SourceCounters
+    sensors: list[tuple[SensorHealth, Diagnosis]]
 
     @property
     def problems(self) -> int:
@@ -86,19 +86,19 @@ def check(
       edgepose check --file walk.npz
     """
     from edgepose.calibration import load_calibration
-    from edgepose.diagnostics.sensor_health import Health
+    from edgepose.diagnostics.sensor_health import SensorHealthMonitor
     from edgepose.pipeline.rig_comparison import other_devices
     from edgepose.sources import open_source
 
     fitting = None if calibration is None else load_calibration(calibration)
-    health = Health(fitting)
+    health = SensorHealthMonitor(fitting)
     if seconds is None:
         seconds = DEFAULT_S if source.live and not is_terminal() else math.inf
     with ExitStack() as stack:
         page = stack.enter_context(Page()) if is_terminal() and source.live and not as_json else None
         warnings = stack.enter_context(_warnings(hidden=page is not None))
         opened = stack.enter_context(open_source(**source.arguments(), lenient=True))
-        stop = stack.enter_context(Stop())
+        stop = stack.enter_context(StopSignal())
 
         def watch(now: Callable[[], State]) -> None:
             if page is not None:
@@ -129,20 +129,20 @@ def check(
 
 def _listen(
     source: Source,
-    health: Health,
+    health: SensorHealthMonitor,
     live: bool,
     seconds: float,
     stopped: Callable[[], bool],
     watch: Callable[[Callable[[], State]], None],
 ) -> tuple[State, EdgeposeError | None]:
     """The state at the end, and the error that was it; `watch` is called a few times a second."""
-    from edgepose.diagnostics.rules import judge
+    from edgepose.diagnostics.rules import diagnose
 
     start_s: float | None = None
     now_s = shown_s = 0.0
 
     def state() -> State:
-        sensors = [(sensor, judge(sensor)) for sensor in health.report(now_s, source.clocks)]
+        sensors = [(sensor, diagnose(sensor)) for sensor in health.report(now_s, source.clocks)]
         return State(0.0 if start_s is None else now_s - start_s, source.counters, sensors)
 
     try:
@@ -250,7 +250,7 @@ def _width(columns: list[list[str]]) -> int:
     return sum(max(map(len, cells)) + 2 for cells in columns) - 2
 
 
-def _colour(finding: Finding) -> str:
+def _colour(finding: Diagnosis) -> str:
     if finding.problem:
         return "red"
     return "yellow" if finding.advice else "green"

@@ -11,7 +11,7 @@ from edgepose.cli.terminal.messages import say, show
 from edgepose.errors import EdgeposeError
 
 if TYPE_CHECKING:
-    from edgepose.sources.probe import Finding
+    from edgepose.sources.probe import ProbeResult
 
 
 @click.command(short_help="List serial ports and CAN interfaces.")
@@ -111,7 +111,7 @@ def _tell(name: str) -> None:
         say(f"listening to {name} ...")
 
 
-def _says(finding: Finding, unit: str, speed: str) -> str:
+def _says(finding: ProbeResult, unit: str, speed: str) -> str:
     if finding.protocol is None:
         if not finding.amount:
             return "nothing comes"

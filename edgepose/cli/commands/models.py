@@ -30,14 +30,14 @@ def models(names: tuple[str, ...], trust: bool) -> None:
     if not names:
         _list()
     for name in names:
-        path = archive.find(name)
-        _show(archive.trust(path) if trust else archive.inspect(path))
+        path = archive.find_archive(name)
+        _show(archive.trust(path) if trust else archive.read_info(path))
 
 
 def _list() -> None:
     rows = [("name", "kind", "units", "frames", "size", "trained on")]
-    for path in archive.shipped():
-        about = archive.inspect(path).metadata
+    for path in archive.bundled_archives():
+        about = archive.read_info(path).metadata
         frames = (
             f"{about['past']} past, {about['future']} future"
             if about["kind"] == "birnn"

@@ -15,7 +15,7 @@ from edgepose import __version__
 from edgepose.cli.options.outputs import check_files, overwrite_option
 from edgepose.cli.options.source import source_options
 from edgepose.cli.terminal.messages import end_status, has_terminal, say, status
-from edgepose.cli.terminal.stop_signal import Stop
+from edgepose.cli.terminal.stop_signal import StopSignal
 from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
@@ -63,7 +63,7 @@ def record(source: SourceConfig, out: str, seconds: float | None, overwrite: boo
         check_files(written, {"--file": source.file, "--sensors": source.sensors})
         recorder.check_free(out, overwrite)
         opened = stack.enter_context(open_source(**source.arguments()))
-        stop = stack.enter_context(Stop())
+        stop = stack.enter_context(StopSignal())
         output = recorder.open_output(out, _metadata(source), overwrite)
         say(f"recording to {out}; Ctrl-C ends it. Samples are counted in the order {', '.join(PLACEMENTS)}")
         summary = recorder.record(

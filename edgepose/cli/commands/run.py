@@ -14,17 +14,17 @@ from edgepose.cli.conflicts import check_all_files
 from edgepose.cli.options.wearer import rig_options
 from edgepose.cli.terminal.keys import Keys
 from edgepose.cli.terminal.messages import end_status, has_terminal, say, status
-from edgepose.cli.terminal.stop_signal import Stop
+from edgepose.cli.terminal.stop_signal import StopSignal
 from edgepose.errors import EdgeposeError
-from edgepose.inference.quantisation import CHOICES, pack
+from edgepose.inference.quantisation import CHOICES, quantise_weights
 
 if TYPE_CHECKING:
     import torch
 
     from edgepose.config import WearerConfig
-    from edgepose.inference.engine import BatchEngine, Engine
+    from edgepose.inference.engine import Engine, MultiWearerEngine
     from edgepose.pipeline.build import OpenWearer
-    from edgepose.pipeline.run import RunSummary, Walk
+    from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
 
 
 @rig_options
@@ -94,7 +94,7 @@ def run(
     from edgepose.pipeline.build import OpenWearer, load_wearer_calibration
     from edgepose.pipeline.remote_control import key_requests
 
-    path = archive.find(model)
+    path = archive.find_archive(model)
     check_all_files(rigs, path)
     live, several = rigs[0].source.live, len(rigs) > 1
     if other := [rig.name for rig in rigs if rig.source.live != live]:
@@ -103,7 +103,7 @@ def run(
         )
 
     calibrations = [load_wearer_calibration(rig, say) for rig in rigs]
-    info = archive.inspect(path)
+    info = archive.read_info(path)
     kind, rate = info.metadata["kind"], float(info.metadata["rate_hz"])
     past = info.metadata["past"] if past is None else past
     future = info.metadata["future"] if future is None else future
@@ -124,9 +124,9 @@ def run(
         if live:
             stack.enter_context(keys)
         module = archive.load(info, trust)
-        precision = pack(module, info, precision, say)
+        precision = quantise_weights(module, info, precision, say)
         engine = _engine(module, past, future, rigs, windows, precision)
-        stop = stack.enter_context(Stop())
+        stop = stack.enter_context(StopSignal())
         for rig in opened:
             rig.open_outputs(stack, rate, lambda: stop.asked)
         whose = f"{len(rigs)} wearers with " if several else ""
@@ -135,9 +135,9 @@ def run(
             f"running {whose}{model} ({kind}, {'window' if windows else 'stream'}) in {precision}; "
             f"Ctrl-C ends the run{hint}"
         )
-        walks = _walks(opened, engine, rate, live, stop)
+        pipelines = _run_all(opened, engine, rate, live, stop)
     end_status()
-    reports = [rig.report(walk, rate, future) for rig, walk in zip(opened, walks, strict=True)]
+    reports = [rig.report(pipeline, rate, future) for rig, pipeline in zip(opened, pipelines, strict=True)]
     failed = {rig.name: error for rig, error in zip(rigs, reports, strict=True) if error is not None}
     if several and failed:
         told = "; ".join(f"{name}: {error}" for name, error in failed.items())
@@ -155,14 +155,14 @@ def _engine(
     rigs: list[WearerConfig],
     windows: bool,
     precision: str,
-) -> Engine | BatchEngine:
+) -> Engine | MultiWearerEngine:
     """What makes poses of these wearers' frames."""
-    from edgepose.inference.engine import BatchEngine, StreamEngine, WindowEngine
+    from edgepose.inference.engine import MultiWearerEngine, StreamEngine, WindowEngine
 
     # What int8 weights are multiplied with is scaled with all that is computed at once.
     apart = precision == "int8"
     if len(rigs) > 1:
-        return BatchEngine(module, past, future, len(rigs), apart)
+        return MultiWearerEngine(module, past, future, len(rigs), apart)
     if windows:
         return WindowEngine(module, past, future)
     # Of a recording nobody waits for single poses.
@@ -172,27 +172,29 @@ def _engine(
     return StreamEngine(module, past, future, TOGETHER if many else 1)
 
 
-def _walks(
-    opened: list[OpenWearer], engine: Engine | BatchEngine, rate: float, live: bool, stop: Stop
-) -> list[Walk]:
-    """The wearers' walks, to their ends."""
-    from edgepose.inference.engine import BatchEngine
-    from edgepose.pipeline.multi_wearer import LOOK_S, Wearer, run_together
+def _run_all(
+    opened: list[OpenWearer], engine: Engine | MultiWearerEngine, rate: float, live: bool, stop: StopSignal
+) -> list[WearerPipeline]:
+    """The wearers' pipelines, to their ends."""
+    from edgepose.inference.engine import MultiWearerEngine
+    from edgepose.pipeline.multi_wearer import POLL_S, Wearer, run_together
     from edgepose.pipeline.run import run as run_alone
 
     progress, nothing = _progress(), lambda summary: None
-    several = isinstance(engine, BatchEngine)
-    walks = [rig.walk(rate, several, nothing if several else progress) for rig in opened]
+    several = isinstance(engine, MultiWearerEngine)
+    pipelines = [rig.pipeline(rate, several, nothing if several else progress) for rig in opened]
     # What is alive now stays: going through all of it once in a while would hold up a frame by 0.1 s.
     gc.collect()
     gc.freeze()
-    if isinstance(engine, BatchEngine):
-        wearers = [Wearer(rig.source, walk, rig.say) for rig, walk in zip(opened, walks, strict=True)]
-        run_together(wearers, engine, LOOK_S if live else 0.0, lambda: stop.asked, progress)
+    if isinstance(engine, MultiWearerEngine):
+        wearers = [
+            Wearer(rig.source, pipeline, rig.notify) for rig, pipeline in zip(opened, pipelines, strict=True)
+        ]
+        run_together(wearers, engine, POLL_S if live else 0.0, lambda: stop.asked, progress)
     else:
-        run_alone(walks[0], opened[0].source, engine, lambda: stop.asked)
-        walks[0].close()
-    return walks
+        run_alone(pipelines[0], opened[0].source, engine, lambda: stop.asked)
+        pipelines[0].close()
+    return pipelines
 
 
 TOGETHER = 64
@@ -210,11 +212,11 @@ def _progress() -> Callable[[RunSummary], None]:
     def show(summary: RunSummary) -> None:
         nonlocal shown_s, poses, told
         now_s = time.monotonic()
-        if summary.behind_s > BEHIND_S and not told:
+        if summary.backlog_s > BEHIND_S and not told:
             told = True
             say(
                 f"this machine does not keep up: poses are "
-                f"{summary.behind_s:.1f} s late; use --model rnn, --online stream, or end other programs"
+                f"{summary.backlog_s:.1f} s late; use --model rnn, --online stream, or end other programs"
             )
         if now_s - shown_s >= every_s:
             rate = (summary.poses - poses) / (now_s - shown_s)

@@ -193,7 +193,7 @@ def solve(
         solutions, interrupted = _collect(solve_all(measurements, settings, jobs, _progress()))
         if not solutions:
             raise KeyboardInterrupt
-        solution = report.joined(solutions)
+        solution = report.concatenate(solutions)
         _write(sinks, solution, measurements, pelvis_path(solution, points.offsets, rate))
         for sink in sinks:
             sink.close()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from edgepose.cli.terminal.messages import say
-from edgepose.cli.terminal.stop_signal import Stop
+from edgepose.cli.terminal.stop_signal import StopSignal
 from edgepose.errors import EdgeposeError
 from edgepose.utils.sockets import resolve
 
@@ -71,7 +71,7 @@ def view(
     body = default_body(height)
     parent = os.getppid()
     with ExitStack() as stack:
-        stop = stack.enter_context(Stop())
+        stop = stack.enter_context(StopSignal())
         if udp is not None:
             receiver = stack.enter_context(_listen(udp))
             viewer = stack.enter_context(closing(_open(host, port, body)))

@@ -11,7 +11,7 @@ import click
 from edgepose.cli.options.gathered import gathered
 from edgepose.config import OutputConfig, parse_host_and_port
 from edgepose.errors import EdgeposeError
-from edgepose.formats.poses.csv_columns import FORMS
+from edgepose.formats.poses.csv_columns import ROTATION_FORMATS
 from edgepose.utils.output_targets import identity, is_null
 from edgepose.utils.sockets import Destination, parse_destination
 
@@ -72,7 +72,7 @@ def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--csv", metavar="FILE", help="Write poses as CSV; - is standard output."),
         click.option(
             "--rotations",
-            type=click.Choice(list(FORMS)),
+            type=click.Choice(list(ROTATION_FORMATS)),
             default="axis-angle",
             show_default=True,
             help="Representation of rotations in the CSV.",

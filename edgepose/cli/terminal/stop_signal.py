@@ -13,7 +13,7 @@ def endings() -> list[int]:
     return [number for number in numbers if number is not None and signal.getsignal(number) != signal.SIG_IGN]
 
 
-class Stop:
+class StopSignal:
     """Whether one of these signals has come. A second one interrupts at once, as outside of this."""
 
     def __init__(self) -> None:
@@ -21,7 +21,7 @@ class Stop:
         self.asked = False
         self._before: dict[int, Any] = {}
 
-    def __enter__(self) -> Stop:
+    def __enter__(self) -> StopSignal:
         """Note signals from now on."""
         for number in endings():
             self._before[number] = signal.signal(number, self._note)

@@ -19,7 +19,7 @@ _FOLD_S = 2.0  # how often samples become numbers where nobody asks for them
 _MOST_PENDING = 5000
 
 
-class Health:
+class SensorHealthMonitor:
     """Takes the samples of a rig and says at any time how its sensors do."""
 
     def __init__(self, calibration: Calibration | None = None) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose import rotations as rot
-from edgepose.calibration.checks import GRAVITY, GRAVITY_TILT_LIMIT_DEG, tilt_deg, why_not_up
+from edgepose.calibration.checks import GRAVITY, GRAVITY_TILT_LIMIT_DEG, diagnose_gravity_direction, tilt_deg
 from edgepose.diagnostics.sensor_health.columns import ACC, GYR, QUANTITIES, QUAT, TIME, deviation
 from edgepose.rotations import Array
 
@@ -131,7 +131,7 @@ class Rests:
         convention = None
         if tilt > GRAVITY_TILT_LIMIT_DEG:
             quats = np.stack([own.quat for own in self._rests])
-            convention = why_not_up(quats, np.stack([own.acc for own in self._rests]))
+            convention = diagnose_gravity_direction(quats, np.stack([own.acc for own in self._rests]))
         error = float(np.linalg.norm(forces - [0.0, 0.0, GRAVITY], axis=1).max())
         return alone._replace(gravity_error_m_s2=error, tilt_deg=tilt, convention=convention)
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from edgepose.calibration.checks import two_sensors
+from edgepose.calibration.checks import detect_alternating_devices
 from edgepose.diagnostics.sensor_health.columns import FEWEST, QUAT, TIME, WIDTH, WINDOW_S
 from edgepose.diagnostics.sensor_health.completeness import Completeness
 from edgepose.diagnostics.sensor_health.field import measure_field
@@ -98,4 +98,4 @@ class Sensor:
             return None
         quats = self.window[-200:, QUAT]
         quats = quats[np.isfinite(quats).all(axis=1)]
-        return two_sensors(quats) if len(quats) >= FEWEST else None
+        return detect_alternating_devices(quats) if len(quats) >= FEWEST else None

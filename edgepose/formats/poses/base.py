@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from edgepose.formats.joint_tree import LARGEST
 from edgepose.formats.registered import FileFormat
-from edgepose.pose import Poses
+from edgepose.pose import PoseSequence
 
 LARGEST_TIME = 1e12
 """Seconds, and numbers of frames, beyond this are taken for damage."""
@@ -29,7 +29,7 @@ class PoseFormat(FileFormat):
             default all do.
     """
 
-    read: Callable[[Path], tuple[Poses, str | None]]
+    read: Callable[[Path], tuple[PoseSequence, str | None]]
     holds_poses: Callable[[Path], bool] = lambda path: True
 
 

@@ -11,8 +11,8 @@ from edgepose.errors import FileFormatError
 from edgepose.formats.bvh import salvage_bvh
 from edgepose.formats.joint_tree import JointTree
 from edgepose.formats.poses.base import PoseFormat, all_new
-from edgepose.pose import Poses
-from edgepose.skeleton import JOINTS, PARENTS, standing_place
+from edgepose.pose import PoseSequence
+from edgepose.skeleton import JOINTS, PARENTS, standing_pelvis_position
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ _LIMBS = {
 _SAME_PLACE_M = 1e-5  # BVH has four decimals of a centimetre
 
 
-def read_bvh(path: Path) -> tuple[Poses, str | None]:
+def read_bvh(path: Path) -> tuple[PoseSequence, str | None]:
     """Poses of a BVH file with SMPL's joints, whose world has the axes of T."""
     tree, problem = salvage_bvh(path)
     places = _smpl_joints(path, tree)
@@ -41,10 +41,10 @@ def read_bvh(path: Path) -> tuple[Poses, str | None]:
             offsets[joint] = metres * tree.offsets[places[name]]
     translation = metres * tree.positions[:, 0]
     # Where `BvhSink` puts those of whom it knows no place.
-    known = np.abs(translation - standing_place(offsets)).max() > _SAME_PLACE_M
+    known = np.abs(translation - standing_pelvis_position(offsets)).max() > _SAME_PLACE_M
     times = np.arange(count) / tree.rate
     place = translation if known else None
-    poses = Poses(np.arange(count), times, rotations, place, *all_new(count))
+    poses = PoseSequence(np.arange(count), times, rotations, place, *all_new(count))
     return poses, problem
 
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError, FileFormatError
 from edgepose.formats.poses.base import LARGEST_TIME, PoseFormat, is_absurd
-from edgepose.formats.poses.csv_columns import FORMS, pose_columns
-from edgepose.pose import Poses, parse_status
+from edgepose.formats.poses.csv_columns import ROTATION_FORMATS, pose_columns
+from edgepose.pose import PoseSequence, parse_status
 from edgepose.rotations import euler_to_matrix, nearest_rotation, quat_to_matrix, rotvec_to_matrix
 from edgepose.skeleton import JOINTS
 
@@ -33,9 +33,9 @@ BLOCK = 4096
 _HEADER = b"frame,time_s,status,"
 
 
-def read_csv(path: Path) -> tuple[Poses, str | None]:
+def read_csv(path: Path) -> tuple[PoseSequence, str | None]:
     """The poses before the first bad one, and what is wrong with that; "-" is standard input."""
-    blocks: list[Poses] = []
+    blocks: list[PoseSequence] = []
     problem = None
     try:
         blocks.extend(read_blocks(path))  # one by one: what has come before an error stays
@@ -46,7 +46,7 @@ def read_csv(path: Path) -> tuple[Poses, str | None]:
     return _concatenate(blocks), problem
 
 
-def read_blocks(path: str | Path) -> Iterator[Poses]:
+def read_blocks(path: str | Path) -> Iterator[PoseSequence]:
     """Poses of a CSV file in blocks of up to `BLOCK`, at least one, in any of the representations, which
     is found from its header; "-" is standard input.
 
@@ -73,7 +73,7 @@ class _BadRowError(FileFormatError):
         self.row = row
 
 
-def _read_rows(file: TextIO, name: str) -> Iterator[Poses]:
+def _read_rows(file: TextIO, name: str) -> Iterator[PoseSequence]:
     rows = csv.reader(_lines(file))
     first = 2
     last: tuple[int, float] | None = None
@@ -81,7 +81,9 @@ def _read_rows(file: TextIO, name: str) -> Iterator[Poses]:
         form, std, moves = _recognise(next(rows, []), name)
         columns = len(pose_columns(form, std, moves))
         while block := list(islice(rows, BLOCK)):
-            read = partial(_block, first=first, last=last, columns=columns, form=form, moves=moves, name=name)
+            read = partial(
+                _block, first=first, last=last, columns=columns, form=form, has_translation=moves, name=name
+            )
             poses, error = _good(block, first, read)
             if poses is not None:
                 first, last = first + len(poses.frames), (int(poses.frames[-1]), float(poses.time_s[-1]))
@@ -97,8 +99,8 @@ def _read_rows(file: TextIO, name: str) -> Iterator[Poses]:
 
 
 def _good(
-    rows: list[list[str]], first: int, read: Callable[[list[list[str]]], Poses]
-) -> tuple[Poses | None, EdgeposeError | None]:
+    rows: list[list[str]], first: int, read: Callable[[list[list[str]]], PoseSequence]
+) -> tuple[PoseSequence | None, EdgeposeError | None]:
     """The poses before the first bad row, and what is wrong with that; the first row has number `first`."""
     problem = None
     while rows:
@@ -122,7 +124,7 @@ def _lines(file: TextIO) -> Iterator[str]:
 
 def _recognise(header: list[str], name: str) -> tuple[str, bool, bool]:
     """Representation, whether there are standard deviations and translation, as a header announces them."""
-    for form in FORMS:
+    for form in ROTATION_FORMATS:
         for std in (False, True):
             for moves in (False, True):
                 if header == pose_columns(form, std, moves):
@@ -141,9 +143,9 @@ def _block(
     last: tuple[int, float] | None,
     columns: int,
     form: str,
-    moves: bool,
+    has_translation: bool,
     name: str,
-) -> Poses:
+) -> PoseSequence:
     """Poses of rows of which the first has number `first`, after the frame and time `last`."""
     frame_before, time_before = last or (None, -np.inf)
     frames, times, numbers = array("q"), array("d"), array("d")
@@ -177,15 +179,15 @@ def _block(
     if bad.any():
         what = "a number is infinite or not a number, or far too large"
         raise _BadRowError(name, int(bad.argmax()) + first, what)
-    width = len(FORMS[form])
+    width = len(ROTATION_FORMATS[form])
     rotations, off = _rotations(
         form, values[:, : len(JOINTS) * width].reshape(len(frames), len(JOINTS), width)
     )
     if (off > 1e-3).any():
         at, joint = np.argwhere(off > 1e-3)[0].tolist()
         raise _BadRowError(name, at + first, f"the numbers of {JOINTS[joint]} are not a rotation")
-    where = values[:, -3:] if moves else None
-    return Poses(numbered, seconds, rotations, where, held, warming_up)
+    where = values[:, -3:] if has_translation else None
+    return PoseSequence(numbered, seconds, rotations, where, held, warming_up)
 
 
 def _rotations(form: str, values: Array) -> tuple[Array, Array]:
@@ -206,9 +208,9 @@ def _rotations(form: str, values: Array) -> tuple[Array, Array]:
     return nearest, np.abs(matrices - nearest).max(axis=(-2, -1))
 
 
-def _concatenate(blocks: list[Poses]) -> Poses:
+def _concatenate(blocks: list[PoseSequence]) -> PoseSequence:
     translations = [block.translation for block in blocks if block.translation is not None]
-    return Poses(
+    return PoseSequence(
         np.concatenate([block.frames for block in blocks]),
         np.concatenate([block.time_s for block in blocks]),
         np.concatenate([block.rotations for block in blocks]),

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from edgepose.rotations import matrix_to_euler_zxy, matrix_to_quat, matrix_to_rotvec
 from edgepose.skeleton import JOINTS
 
-FORMS = {
+ROTATION_FORMATS = {
     "axis-angle": ("x", "y", "z"),
     "quat": ("w", "x", "y", "z"),
     "matrix": ("r00", "r01", "r02", "r10", "r11", "r12", "r20", "r21", "r22"),
@@ -19,8 +19,10 @@ FORMS = {
 
 
 def pose_columns(rotations: str, std: bool, translation: bool = False) -> list[str]:
-    """Names of all columns, in order; `rotations` is a key of `FORMS`."""
-    names = ["frame", "time_s", "status"] + [f"{joint}_{end}" for joint in JOINTS for end in FORMS[rotations]]
+    """Names of all columns, in order; `rotations` is a key of `ROTATION_FORMATS`."""
+    names = ["frame", "time_s", "status"] + [
+        f"{joint}_{end}" for joint in JOINTS for end in ROTATION_FORMATS[rotations]
+    ]
     names += [f"{joint}_std" for joint in JOINTS] if std else []
     return names + [f"trans_{axis}" for axis in "xyz"] if translation else names
 

@@ -8,15 +8,15 @@ import numpy as np
 
 from edgepose.formats.poses.base import PoseFormat, all_new
 from edgepose.formats.recordings import dip_imu
-from edgepose.pose import Poses
+from edgepose.pose import PoseSequence
 
 
-def read_dip(path: Path) -> tuple[Poses, None]:
+def read_dip(path: Path) -> tuple[PoseSequence, None]:
     """True poses of DIP-IMU or of DIP's TotalCapture."""
     rotations = dip_imu.read_true_pose(path)
     count = len(rotations)
     frames = np.arange(count)
-    return Poses(frames, frames / dip_imu.RATE, rotations, None, *all_new(count)), None
+    return PoseSequence(frames, frames / dip_imu.RATE, rotations, None, *all_new(count)), None
 
 
 # Such a file is a recording of sensors; its poses are read where poses are asked for.

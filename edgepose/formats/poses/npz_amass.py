@@ -14,7 +14,7 @@ from edgepose.errors import FileFormatError
 from edgepose.formats.joint_tree import LARGEST
 from edgepose.formats.poses.base import LARGEST_TIME, PoseFormat, all_new, is_absurd
 from edgepose.placements import PLACEMENTS
-from edgepose.pose import Poses, held_sensors
+from edgepose.pose import PoseSequence, held_sensors
 from edgepose.rotations import Z_UP_TO_T, matrix_to_rotvec, rotvec_to_matrix
 from edgepose.skeleton import JOINTS
 from edgepose.utils.safe_npz import BROKEN, check_size, member_names, open_npz
@@ -30,7 +30,7 @@ _POSE_BYTES = 8 * 9 * len(JOINTS)  # that a pose takes
 # --- reading ------------------------------------------------------------------------------------------------
 
 
-def read_npz(path: Path) -> tuple[Poses, None]:
+def read_npz(path: Path) -> tuple[PoseSequence, None]:
     """Poses of an AMASS file, in its world with Z up, or the true poses of a recording, which are in T.
 
     Frames, times and status are there if edgepose has written the file. Of SMPL-H and SMPL-X the body's 22
@@ -54,7 +54,7 @@ def read_npz(path: Path) -> tuple[Poses, None]:
         rotations[:, 0] = Z_UP_TO_T @ rotations[:, 0]
         translation = None if translation is None else translation @ Z_UP_TO_T.T
     frames, time_s = _clock(path, arrays, count)
-    return Poses(frames, time_s, rotations, translation, *_states(path, arrays, count)), None
+    return PoseSequence(frames, time_s, rotations, translation, *_states(path, arrays, count)), None
 
 
 def _load(path: Path) -> tuple[dict[str, NDArray[Any]], bool]:
@@ -136,7 +136,7 @@ def _is_recording(names: set[str]) -> bool:
 # --- writing ------------------------------------------------------------------------------------------------
 
 
-def write_npz(path: Path, blocks: Iterable[Poses], count: int, rate: float) -> None:
+def write_npz(path: Path, blocks: Iterable[PoseSequence], count: int, rate: float) -> None:
     """Write poses with little of them in memory at a time.
 
     Args:
@@ -175,14 +175,14 @@ def write_npz(path: Path, blocks: Iterable[Poses], count: int, rate: float) -> N
                 np.lib.format.write_array(member, values, allow_pickle=False)
 
 
-def _vectors(block: Poses) -> NDArray[np.float32]:
+def _vectors(block: PoseSequence) -> NDArray[np.float32]:
     """Axis-angle vectors (T, 72), the pelvis against AMASS's world with Z up."""
     rotations = block.rotations.copy()
     rotations[:, 0] = Z_UP_TO_T.T @ rotations[:, 0]
     return matrix_to_rotvec(rotations).reshape(len(rotations), 72).astype("<f4")
 
 
-def _places(block: Poses) -> NDArray[np.float32]:
+def _places(block: PoseSequence) -> NDArray[np.float32]:
     """Places of the pelvis (T, 3), metres, Z up; zeros where nothing is known."""
     if block.translation is None:
         return np.zeros((len(block.frames), 3), "<f4")

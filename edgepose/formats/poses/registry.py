@@ -11,7 +11,7 @@ from edgepose.errors import FileFormatError
 from edgepose.formats.bvh import FRAME_TIMES
 from edgepose.formats.poses.base import PoseFormat
 from edgepose.formats.registered import all_formats, built_in_format
-from edgepose.pose import Poses
+from edgepose.pose import PoseSequence
 
 READERS = {
     "csv": "edgepose.formats.poses.csv:FORMAT",
@@ -22,7 +22,7 @@ READERS = {
 """Where each `PoseFormat` is; modules are imported in this order until one fits a file."""
 
 
-def read_poses(path: str | Path) -> Poses:
+def read_poses(path: str | Path) -> PoseSequence:
     """Poses of a .npz file with the keys of AMASS, a .bvh file with SMPL's joints, a .pkl of DIP's with true
     poses, a file of an installed format, or of a CSV file, whatever its ending.
 
@@ -38,7 +38,7 @@ def read_poses(path: str | Path) -> Poses:
     return poses
 
 
-def salvage_poses(path: Path) -> tuple[Poses, str | None]:
+def salvage_poses(path: Path) -> tuple[PoseSequence, str | None]:
     """The poses before the first bad one, and one line on what is bad; see `read_poses`.
 
     Raises:
@@ -68,7 +68,7 @@ def pose_suffixes() -> tuple[str, ...]:
     return tuple(suffix for known in all_formats(PoseFormat, READERS.values()) for suffix in known.suffixes)
 
 
-def _read(path: Path) -> tuple[Poses, str | None]:
+def _read(path: Path) -> tuple[PoseSequence, str | None]:
     """The poses before the first bad one, and what is wrong with the file."""
     poses, problem = find_format(path).read(path)
     if not FRAME_TIMES[0] < poses.frame_time < FRAME_TIMES[1]:

@@ -69,13 +69,13 @@ class RecordingFormat(FileFormat):
         return path.suffix.lower() in self.suffixes
 
 
-def samples(recording: Recording) -> Iterator[ImuSample]:
+def iter_samples(recording: Recording) -> Iterator[ImuSample]:
     """All samples of a recording in time order."""
     streams = [_sensor_samples(PLACEMENTS.index(name), data) for name, data in recording.sensors.items()]
     return heapq.merge(*streams, key=attrgetter("time_s"))
 
 
-def from_samples(
+def recording_from_samples(
     rows: Iterable[ImuSample],
     metadata: Mapping[str, str] | None = None,
     *,

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TextIO
 
 from edgepose.errors import FileFormatError
-from edgepose.formats.recordings.base import ReadOptions, RecordingFormat, SampleTable, samples, shorten
+from edgepose.formats.recordings.base import ReadOptions, RecordingFormat, SampleTable, iter_samples, shorten
 from edgepose.imu import ImuSample, Recording
 from edgepose.placements import PLACEMENTS
 
@@ -23,7 +23,7 @@ _WIDTH = COLUMNS.count(",") + 1
 _MAX_LINE = 4096
 
 
-def comments(metadata: Mapping[str, str]) -> str:
+def metadata_lines(metadata: Mapping[str, str]) -> str:
     """Metadata as lines `# key: value`; control characters become blanks or "?"."""
     return "".join(f"# {_one_line(f'{key}: {value}')}\n" for key, value in metadata.items())
 
@@ -36,7 +36,7 @@ def _one_line(text: str) -> str:
 
 def csv_header(metadata: Mapping[str, str]) -> str:
     """First lines of a CSV recording, up to its column names."""
-    return comments(metadata) + COLUMNS + "\n"
+    return metadata_lines(metadata) + COLUMNS + "\n"
 
 
 def csv_row(sample: ImuSample) -> str:
@@ -51,7 +51,7 @@ def write_csv(path: Path | str, recording: Recording) -> None:
     """Write a recording as CSV, all sensors merged in time order."""
     with Path(path).open("w", encoding="utf-8", newline="") as file:
         file.write(csv_header(recording.metadata))
-        file.writelines(map(csv_row, samples(recording)))
+        file.writelines(map(csv_row, iter_samples(recording)))
 
 
 def read_csv(path: Path, options: ReadOptions) -> Recording:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from edgepose import rotations as rot
 from edgepose.errors import FileFormatError
-from edgepose.formats.recordings.base import RecordingFormat, from_samples, samples
+from edgepose.formats.recordings.base import RecordingFormat, iter_samples, recording_from_samples
 from edgepose.imu import GRAVITY, Recording, SensorData
 from edgepose.placements import PLACEMENTS
 from edgepose.utils.safe_pickle import array_of, numbers, read_pickle
@@ -107,7 +107,7 @@ def read_recording(path: Path) -> Recording:
     ]
     if bad := int((~good & ~lost).sum()):
         problems.append(f"{path}: {bad} samples left out, which are no rotation or no acceleration")
-    recording = from_samples(samples(Recording(sensors, {})), _METADATA, name=str(path))
+    recording = recording_from_samples(iter_samples(Recording(sensors, {})), _METADATA, name=str(path))
     return recording._replace(damage="; ".join(problems) or None)
 
 

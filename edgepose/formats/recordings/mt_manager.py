@@ -13,7 +13,7 @@ from math import isfinite
 from pathlib import Path
 
 from edgepose.errors import FileFormatError
-from edgepose.formats.recordings.base import RecordingFormat, from_samples
+from edgepose.formats.recordings.base import RecordingFormat, recording_from_samples
 from edgepose.formats.recordings.xio_session import by_placement
 from edgepose.imu import ImuSample, Recording
 from edgepose.placements import PLACEMENTS
@@ -75,7 +75,7 @@ def read_session(folder: Path, ids: Mapping[int, str] | None = None) -> Recordin
             rows += [sample._replace(time_s=(sample.time_s + shift) / rate) for sample in samples]
     earliest = min((row.time_s for row in rows), default=0.0)
     rows = [row._replace(time_s=row.time_s - earliest) for row in rows]
-    recording = from_samples(rows, _METADATA, name=str(folder), salvage=True)
+    recording = recording_from_samples(rows, _METADATA, name=str(folder), salvage=True)
     problems += [recording.damage] if recording.damage else []
     return recording._replace(damage="; ".join(problems) or None)
 

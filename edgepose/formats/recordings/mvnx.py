@@ -21,7 +21,7 @@ from typing import Any
 from xml.parsers import expat
 
 from edgepose.errors import EdgeposeError, FileFormatError
-from edgepose.formats.recordings.base import RecordingFormat, from_samples
+from edgepose.formats.recordings.base import RecordingFormat, recording_from_samples
 from edgepose.imu import GRAVITY, ImuSample, Recording
 from firmware_protocols.rotation import rotate_back
 from firmware_protocols.sample import unit_quaternion
@@ -56,7 +56,7 @@ def read_mvnx(path: Path) -> Recording:
     """
     frames = _Frames(path)
     problems: list[str] = []
-    recording = from_samples(_samples(path, frames, problems), name=str(path), salvage=True)
+    recording = recording_from_samples(_samples(path, frames, problems), name=str(path), salvage=True)
     problems += [recording.damage] if recording.damage else []
     metadata = {"rate": f"{frames.rate:g}", **_METADATA}
     return recording._replace(metadata=metadata, damage="; ".join(problems) or None)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from edgepose.errors import FileFormatError
-from edgepose.formats.recordings.csv import comments
+from edgepose.formats.recordings.csv import metadata_lines
 
 COLUMNS = "time_s,end"
 """Header of the times."""
@@ -39,7 +39,7 @@ def times_path(path: Path) -> Path:
 
 def times_header(metadata: Mapping[str, str]) -> str:
     """First lines of the arrival times."""
-    return comments(metadata) + COLUMNS + "\n"
+    return metadata_lines(metadata) + COLUMNS + "\n"
 
 
 def times_row(arrival_s: float, end: int) -> str:

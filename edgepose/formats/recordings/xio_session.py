@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from edgepose.errors import FileFormatError
-from edgepose.formats.recordings.base import RecordingFormat, from_samples
+from edgepose.formats.recordings.base import RecordingFormat, recording_from_samples
 from edgepose.imu import ImuSample, Recording
 from edgepose.placements import PLACEMENTS
 from firmware_protocols.sample import Sample
@@ -57,7 +57,7 @@ def read_session(folder: Path, ids: Mapping[int, str] | None = None) -> Recordin
         for name, sensor in places.items()
         for sample in _samples(PLACEMENTS.index(name), sensor, problems)
     ]
-    recording = from_samples(rows, _METADATA, name=str(folder), salvage=True)
+    recording = recording_from_samples(rows, _METADATA, name=str(folder), salvage=True)
     starts = [data.time_s[0] for data in recording.sensors.values()]
     ends = [data.time_s[-1] for data in recording.sensors.values()]
     if starts and max(starts) > min(ends):

@@ -18,8 +18,8 @@ from edgepose.inference.archive import FORMAT, METADATA_FILE
 from edgepose.placements import PLACEMENTS
 from edgepose.skeleton import JOINTS
 from edgepose.utils.durable_files import write_whole
-from edgepose_export.networks.lstm import BirnnArchive, Ends, RnnArchive
-from edgepose_export.networks.normalisation import FromFirstFrame, Inputs
+from edgepose_export.networks.lstm import BirnnArchive, NormalisationAndDecoding, RnnArchive
+from edgepose_export.networks.normalisation import FirstFrameNormaliser, Inputs
 from edgepose_export.networks.receptive_field import FeedForward, FieldArchive, WaveNet
 from edgepose_export.networks.shape import NetworkShape, PoseDecoder, PoseNetwork
 from edgepose_export.training.dataset import RATE
@@ -62,12 +62,12 @@ def build(network: Network, statistics: Statistics, std_scale: Tensor | None = N
     shape = network.shape
     decoder = PoseDecoder(shape, statistics.target_mean, statistics.target_std, std_scale)
     if isinstance(network, PoseNetwork):
-        ends = Ends(network, statistics.input_mean, statistics.input_std, decoder)
+        ends = NormalisationAndDecoding(network, statistics.input_mean, statistics.input_std, decoder)
         module: nn.Module = (BirnnArchive if shape.kind == "birnn" else RnnArchive)(network, ends)
     else:
         inputs = Inputs(shape.normalisation, shape.acceleration, statistics.input_mean, statistics.input_std)
         module = FieldArchive(network, inputs, decoder)
-    return (FromFirstFrame(module) if shape.normalisation == "sequence" else module).eval()
+    return (FirstFrameNormaliser(module) if shape.normalisation == "sequence" else module).eval()
 
 
 def script(

@@ -160,8 +160,8 @@ def _model(
     from edgepose_export.evaluation.evaluate import modes_of
     from edgepose_export.evaluation.paper_tables import TABLES
 
-    path = archive.find(name)
-    info = archive.inspect(path)
+    path = archive.find_archive(name)
+    info = archive.read_info(path)
     module = archive.load(info, trust)
     about = dict(info.metadata)
     if about["kind"] != "birnn":

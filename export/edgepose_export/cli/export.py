@@ -112,7 +112,7 @@ def export(
         check_output(beside_it, "the card", (".md",), overwrite)
     import torch
 
-    from edgepose.inference.archive import find, inspect, load
+    from edgepose.inference.archive import find_archive, load, read_info
     from edgepose.inference.quantisation import pack_weights
     from edgepose_export.archive import torchscript as archive
     from edgepose_export.archive.model_card import card
@@ -122,7 +122,7 @@ def export(
 
     others = {}
     if beside:
-        info = inspect(find(beside))
+        info = read_info(find_archive(beside))
         others = {f"`{beside}`": (load(info), info.metadata)}
     state = training.mean_of({str(path): training.read_checkpoint(path) for path in checkpoints})
     config = config_from(json.loads(state["config"]))
@@ -188,14 +188,14 @@ def _std_scale(module: torch.jit.ScriptModule, metadata: dict[str, Any], data: P
 
 def _measures(path: Path, data: Path, others: Mapping[str, Archive]) -> dict[str, Any]:
     """Measures and reliability of the archive as a run loads it, with one thread, and measures of others."""
-    from edgepose.inference.archive import inspect, load
+    from edgepose.inference.archive import load, read_info
     from edgepose_export.cli.progress import labelled
     from edgepose_export.evaluation import evaluate as evaluation
     from edgepose_export.evaluation.baselines import learn
     from edgepose_export.evaluation.uncertainty import errors_and_deviations, reliability
     from edgepose_export.training.splits import HELD_OUT
 
-    info = inspect(path)
+    info = read_info(path)
     module, modes = load(info, trust=True), evaluation.modes_of(info.metadata)
     learnt = learn(evaluation.takes_of(data, "train", labelled("learning baselines")))
     methods = evaluation.archive_methods(module, modes) | evaluation.baseline_methods(learnt)

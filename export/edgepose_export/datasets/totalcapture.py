@@ -97,7 +97,7 @@ def _shared_frames(path: Path, r_tb: Array, true: Array) -> slice:
     """
     frames = min(len(r_tb), len(true))
     choices = (slice(-frames, None), slice(frames))
-    apart = [np.median(rot.angle_between(r_tb[part], true[part]), axis=0).mean() for part in choices]
+    apart = [np.median(rot.geodesic_angle(r_tb[part], true[part]), axis=0).mean() for part in choices]
     best = int(np.argmin(apart))
     if apart[best] > np.radians(_APART):
         raise EdgeposeError(

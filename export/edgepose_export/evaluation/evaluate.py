@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from edgepose.analysis.metrics import Measure, measure, per_frame, sip_error
+from edgepose.analysis.metrics import Metric, measure, per_frame, sip_error
 from edgepose.skeleton import default_body
 from edgepose_export.datasets import read_published
 from edgepose_export.evaluation import baselines
@@ -148,7 +148,7 @@ def run_windows(
 
 # --- measures -----------------------------------------------------------------------------------------------
 
-Table = dict[str, dict[str, Measure]]
+Table = dict[str, dict[str, Metric]]
 """Row name to measures."""
 
 Columns = dict[str, dict[str, Array]]
@@ -203,7 +203,7 @@ def takes_of(data: Path, part: str, progress: Progress = iter) -> Iterator[Take]
 
 
 def _as_a_run_measures(take: Take) -> Take:
-    """The take with a frame's acceleration as the mean since the frame before, see `FrameClock`."""
+    """The take with a frame's acceleration as the mean since the frame before, see `FrameSynchronizer`."""
     acceleration = take.acceleration.copy()
     acceleration[1:] = 0.5 * (take.acceleration[1:] + take.acceleration[:-1])
     return take._replace(acceleration=acceleration)

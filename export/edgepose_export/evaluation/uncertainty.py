@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from edgepose.rotations import angle_between
+from edgepose.rotations import geodesic_angle
 from edgepose.skeleton import JOINTS, forward_kinematics
 from edgepose_export.evaluation.evaluate import Mode, groups, run_with_std
 from edgepose_export.training.dataset import Take
@@ -58,7 +58,7 @@ def errors_and_deviations(
             pair = [poses, take.pose.astype(float)]
             if metadata["targets"] != "local-matrix":
                 pair = [_seen_from_root(local) for local in pair]
-            errors.append(angle_between(pair[0][:, joints], pair[1][:, joints]))
+            errors.append(geodesic_angle(pair[0][:, joints], pair[1][:, joints]))
             deviations.append(std[:, joints])
     return np.concatenate(errors), np.concatenate(deviations)
 

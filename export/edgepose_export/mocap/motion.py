@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from edgepose.rotations import angle_between, matrix_to_quat, quat_continuous, quat_to_matrix
+from edgepose.rotations import geodesic_angle, matrix_to_quat, quat_continuous, quat_to_matrix
 
 Array = NDArray[np.float64]
 
@@ -59,7 +59,7 @@ def pieces(motion: Motion, shortest: float = 1.0) -> list[Motion]:
     or moves the pelvis, faster than a body can. In some CMU takes of dance a thigh is turned by half a turn
     for a few frames; such pieces are short and go.
     """
-    turns = angle_between(motion.rotations[1:], motion.rotations[:-1]) * motion.rate
+    turns = geodesic_angle(motion.rotations[1:], motion.rotations[:-1]) * motion.rate
     turns[:, _FEET] = 0.0
     speed = np.linalg.norm(np.diff(motion.translation, axis=0), axis=1) * motion.rate
     cuts = 1 + np.flatnonzero((turns > FASTEST_TURN).any(axis=1) | (speed > FASTEST_PELVIS))

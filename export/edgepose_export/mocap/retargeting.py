@@ -20,7 +20,13 @@ from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
 from edgepose.formats.joint_tree import JointTree, forward
-from edgepose.rotations import about_axis, matrix_to_quat, minimal_rotation, quat_to_matrix, transpose
+from edgepose.rotations import (
+    matrix_to_quat,
+    minimal_rotation,
+    quat_to_matrix,
+    rotation_about_axis,
+    transpose,
+)
 
 from .motion import Motion
 
@@ -141,7 +147,7 @@ def from_cmu_amc(recording: JointTree, path: object) -> Motion:
     for name, (axis, angle) in _CMU_T_POSE.items():
         if name not in recording.names:
             raise EdgeposeError(f"{path}: its skeleton has no {name}, so it is not CMU's")
-        local[0, recording.names.index(name)] = about_axis(axis, np.radians(angle))
+        local[0, recording.names.index(name)] = rotation_about_axis(axis, np.radians(angle))
     pose = recording._replace(rotations=local, positions=recording.offsets[None])
     t_pose, t_positions = forward(pose)
     indices = _indices(CMU_AMC, recording.names)
@@ -225,9 +231,9 @@ def bandai_t_pose(collar: float) -> Array:
         11: _BANDAI_TOES,
     }
     for joint, angle in lean.items():
-        t_pose[joint] = about_axis("x", np.radians(angle)) @ t_pose[joint]
+        t_pose[joint] = rotation_about_axis("x", np.radians(angle)) @ t_pose[joint]
     for joint, angle in ((13, collar), (14, -collar)):
-        t_pose[joint] = about_axis("y", np.radians(angle)) @ t_pose[joint]
+        t_pose[joint] = rotation_about_axis("y", np.radians(angle)) @ t_pose[joint]
     return t_pose
 
 

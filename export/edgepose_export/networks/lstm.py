@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from edgepose_export.networks.normalisation import network_inputs, tilt_of
-from edgepose_export.networks.packed_linear import Product
+from edgepose_export.networks.packed_linear import PackedLinear
 from edgepose_export.networks.shape import SIGMA_FLOOR, PoseDecoder, PoseNetwork, turned
 
 
@@ -40,10 +40,10 @@ class LstmCell(nn.Module):
         scale = torch.tensor([1.0, 1.0, 2.0, 1.0]).repeat_interleave(self.size)[:, None]
         bias = (bias_ih + bias_hh) * scale[:, 0]
         self.inputs = nn.ModuleList(
-            Product(part, bias if i == 0 else None)
+            PackedLinear(part, bias if i == 0 else None)
             for i, part in enumerate((weight_ih * scale).chunk(parts, dim=1))
         )
-        self.state = Product(weight_hh * scale)
+        self.state = PackedLinear(weight_hh * scale)
 
     def forward(self, product: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
         """New h and c (B, hidden) from the inputs' product (B, 4 hidden) and the old ones."""
@@ -91,13 +91,13 @@ class LstmCell(nn.Module):
 
     @torch.jit.export
     def pack(self, precision: str) -> None:
-        """See `Product.pack`."""
+        """See `PackedLinear.pack`."""
         for part in self.inputs:
             part.pack(precision)
         self.state.pack(precision)
 
 
-class Ends(nn.Module):
+class NormalisationAndDecoding(nn.Module):
     """What both archives share: the layers before and after the recurrent ones."""
 
     def __init__(
@@ -111,13 +111,13 @@ class Ends(nn.Module):
         self.floor = SIGMA_FLOOR
         self.smoothing = shape.smoothing
         dense = network.dense.weight.detach() / input_std
-        self.dense = Product(dense, network.dense.bias.detach() - dense @ input_mean)
+        self.dense = PackedLinear(dense, network.dense.bias.detach() - dense @ input_mean)
         # The acceleration part of the outputs serves training alone.
         size = shape.pose_outputs
         mean, deviation = network.mean, network.deviation
         weights = [mean.weight[:size] * decoder.target_std[:, None], deviation.weight[:size]]
         biases = [mean.bias[:size] * decoder.target_std + decoder.target_mean, deviation.bias[:size]]
-        self.heads = Product(torch.cat(weights), torch.cat(biases))
+        self.heads = PackedLinear(torch.cat(weights), torch.cat(biases))
 
     def forward(self, orientation: Tensor, acceleration: Tensor) -> Tensor:
         """First hidden layer (..., hidden) of calibrated frames."""
@@ -165,7 +165,7 @@ class Ends(nn.Module):
 class RnnArchive(nn.Module):
     """Unidirectional network: one step a frame, no look-ahead. Methods and shapes as in `BirnnArchive`."""
 
-    def __init__(self, network: PoseNetwork, ends: Ends) -> None:
+    def __init__(self, network: PoseNetwork, ends: NormalisationAndDecoding) -> None:
         """Takes a trained network's weights."""
         super().__init__()
         self.ends = ends
@@ -185,7 +185,7 @@ class RnnArchive(nn.Module):
 
     @torch.jit.export
     def pack(self, precision: str) -> None:
-        """Chooses how the recurrent layers keep their weights, see `Product.pack`."""
+        """Chooses how the recurrent layers keep their weights, see `PackedLinear.pack`."""
         self.cell1.pack(precision)
         self.cell2.pack(precision)
 
@@ -239,7 +239,7 @@ class BirnnArchive(nn.Module):
     the first is known for good once its frame has come, the second changes with every new frame.
     """
 
-    def __init__(self, network: PoseNetwork, ends: Ends) -> None:
+    def __init__(self, network: PoseNetwork, ends: NormalisationAndDecoding) -> None:
         """Takes a trained network's weights."""
         super().__init__()
         self.ends = ends
@@ -280,7 +280,7 @@ class BirnnArchive(nn.Module):
 
     @torch.jit.export
     def pack(self, precision: str) -> None:
-        """Chooses how the recurrent layers keep their weights, see `Product.pack`."""
+        """Chooses how the recurrent layers keep their weights, see `PackedLinear.pack`."""
         self.forward1.pack(precision)
         self.backward1.pack(precision)
         self.forward2.pack(precision)

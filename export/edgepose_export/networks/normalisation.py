@@ -54,7 +54,7 @@ def tilt_of(root: Tensor) -> Tensor:
     return torch.stack([c * x - s * z, root[..., 1, :], s * x + c * z], dim=-2)
 
 
-def seen_from(reference: Tensor, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
+def relative_to(reference: Tensor, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
     """Orientations and accelerations in the frames of reference rotations (..., 3, 3)."""
     back = reference.transpose(-1, -2).unsqueeze(-3)
     return torch.matmul(back, orientation), torch.matmul(back, acceleration.unsqueeze(-1)).squeeze(-1)
@@ -62,7 +62,7 @@ def seen_from(reference: Tensor, orientation: Tensor, acceleration: Tensor) -> t
 
 def seen_from_first(orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
     """Sequences (..., T, 6, 3, 3) and (..., T, 6, 3) in the frame of their first root."""
-    return seen_from(orientation[..., :1, -1, :, :], orientation, acceleration)
+    return relative_to(orientation[..., :1, -1, :, :], orientation, acceleration)
 
 
 def network_inputs(orientation: Tensor, acceleration: Tensor, scheme: str, with_acceleration: bool) -> Tensor:
@@ -78,7 +78,7 @@ def network_inputs(orientation: Tensor, acceleration: Tensor, scheme: str, with_
         rotations, differences = root_relative(orientation, acceleration)
     else:
         if scheme == "heading":
-            orientation, acceleration = seen_from(
+            orientation, acceleration = relative_to(
                 heading_of(orientation[..., -1, :, :]), orientation, acceleration
             )
         rotations = orientation
@@ -111,7 +111,7 @@ class Inputs(nn.Module):
         return (x - self.mean) / self.std
 
 
-class FromFirstFrame(nn.Module):
+class FirstFrameNormaliser(nn.Module):
     """An archive whose wearer is seen from the root of the first frame; methods as the archive's own.
 
     Of a window that is the window's first frame, of a stream the stream's.
@@ -158,7 +158,7 @@ class FromFirstFrame(nn.Module):
     ) -> tuple[Tensor, Tensor, list[Tensor]]:
         """Several frames (B, T, ...) on."""
         first = state[-1] if state[-1].shape[1] else orientation[:, :1, -1]
-        seen = seen_from(first, orientation, acceleration)
+        seen = relative_to(first, orientation, acceleration)
         rotations, std, rest = self.archive.stream_many(seen[0], seen[1], state[:-1])
         return _turned(rotations, first), std, rest + [first]  # noqa: RUF005
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 
-class Product(nn.Module):
+class PackedLinear(nn.Module):
     """`x W + b`, scriptable; `pack` chooses the numbers that W is kept in."""
 
     packed: Optional[torch.classes.quantized.LinearPackedParamsBase]  # noqa: UP045

@@ -70,7 +70,7 @@ def mirror(orientation: Tensor, acceleration: Tensor, relative: Tensor) -> tuple
     )
 
 
-def silenced(
+def drop_sensor(
     orientation: Tensor, acceleration: Tensor, sensor: int, first: Tensor, end: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Sequences (B, T, 6, 3, 3), (B, T, 6, 3) with a silent sensor, whose bone `pipeline.dropout` moves on.
@@ -161,7 +161,7 @@ def augment(batch: Batch, how: Augmentation, generator: torch.Generator) -> Batc
         which[torch.rand(size, generator=generator) >= how.silent] = -1
         for sensor in range(len(PLACEMENTS)):
             its = which == sensor
-            orientation[its], acceleration[its] = silenced(
+            orientation[its], acceleration[its] = drop_sensor(
                 orientation[its], acceleration[its], sensor, first[its].clamp(1, frames), end[its]
             )
     return orientation, acceleration, relative

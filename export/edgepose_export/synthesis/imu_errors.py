@@ -11,7 +11,7 @@ from edgepose.imu import SensorData
 from edgepose.rotations import Array, quat_conjugate, quat_rotate
 
 
-class Chip(NamedTuple):
+class ImuErrorModel(NamedTuple):
     """Errors of one kind of chip; biases are one standard deviation from chip to chip.
 
     Attributes:
@@ -29,7 +29,7 @@ class Chip(NamedTuple):
     mag_noise: float
 
 
-BMI270 = Chip(
+BMI270 = ImuErrorModel(
     gyr_noise=np.radians(0.007), gyr_bias=np.radians(0.5),
     acc_noise=160e-6 * GRAVITY, acc_bias=20e-3 * GRAVITY, mag_noise=0.5,
 )  # fmt: skip
@@ -41,7 +41,7 @@ FIELD_UT = (0.0, 20.0, -40.0)
 """Magnetic field in the inertial frame, about that of central Europe."""
 
 
-def raw(data: SensorData, chip: Chip, seed: int, magnetometer: bool) -> SensorData:
+def raw(data: SensorData, chip: ImuErrorModel, seed: int, magnetometer: bool) -> SensorData:
     """What a chip would have measured of an ideal sensor: the same without orientation, with its errors.
 
     Raises:
@@ -55,13 +55,13 @@ def raw(data: SensorData, chip: Chip, seed: int, magnetometer: bool) -> SensorDa
     # White noise up to half the rate of the samples.
     bandwidth = np.sqrt(0.5 / np.median(np.diff(data.time_s)))
 
-    def spoilt(rows: Array, noise: float, bias: Array | float) -> Array:
+    def add_errors(rows: Array, noise: float, bias: Array | float) -> Array:
         return rows + bias + rng.normal(0.0, noise, rows.shape)
 
-    gyr = spoilt(data.gyr, chip.gyr_noise * bandwidth, gyr_bias)
-    acc = spoilt(data.acc, chip.acc_noise * bandwidth, acc_bias)
+    gyr = add_errors(data.gyr, chip.gyr_noise * bandwidth, gyr_bias)
+    acc = add_errors(data.acc, chip.acc_noise * bandwidth, acc_bias)
     mag = None
     if magnetometer:
         ideal = data.mag if data.mag is not None else quat_rotate(quat_conjugate(data.quat), FIELD_UT)
-        mag = spoilt(ideal, chip.mag_noise, 0.0)
+        mag = add_errors(ideal, chip.mag_noise, 0.0)
     return SensorData(data.time_s, None, acc, gyr, mag)

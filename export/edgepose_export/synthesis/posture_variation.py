@@ -18,7 +18,7 @@ root (B, T, 24, 3, 3).
 """
 
 BEFORE, AFTER = 2, 1
-"""Frames that `other_postures` needs around those that it gives: accelerations are second differences, and
+"""Frames that `vary_postures` needs around those that it gives: accelerations are second differences, and
 means over two frames.
 """
 
@@ -70,7 +70,7 @@ DEVIATION, LEVERS = _deviations(), _levers()
 VARIED = tuple(torch.nonzero(DEVIATION.any(dim=-1)).flatten().tolist())
 
 
-def other_postures(batch: Batch, take: Tensor, size: float, generator: torch.Generator) -> Batch:
+def vary_postures(batch: Batch, take: Tensor, size: float, generator: torch.Generator) -> Batch:
     """Sequences whose wearers hold their joints otherwise: each joint is turned by a rotation that is mostly
     constant and sways slowly, its children go with it, and the sensors measure what they then would.
 
@@ -106,7 +106,7 @@ def other_postures(batch: Batch, take: Tensor, size: float, generator: torch.Gen
 
 def moved(batch: Batch, take: Tensor, relative: Tensor) -> Batch:
     """What sensors measure whose wearer's pelvis moves as in a batch, the other bones by other root-relative
-    rotations (B, T, 24, 3, 3); other arguments and result as in `other_postures`.
+    rotations (B, T, 24, 3, 3); other arguments and result as in `vary_postures`.
     """
     orientation, acceleration, before = batch
     root = orientation[:, :, ROOT, None]

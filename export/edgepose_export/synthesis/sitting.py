@@ -81,7 +81,7 @@ def seated(motion: Motion, body: Body, rng: np.random.Generator) -> Motion:
     course, lean = _course(frames, motion.rate, rng)
     sway = _smooth_noise(frames, motion.rate, 4, np.radians(1.2), rng)
     pelvis_pitch = course[:, 2] + lean + sway[:, 0]
-    pelvis = rot.about_axis("y", sway[:, 1]) @ rot.about_axis("x", pelvis_pitch)
+    pelvis = rot.rotation_about_axis("y", sway[:, 1]) @ rot.rotation_about_axis("x", pelvis_pitch)
     rotations = np.empty((frames, 24, 3, 3))
     rotations[:, 0] = pelvis
     local = _played(motion, frames, rng)
@@ -159,11 +159,11 @@ def _played(motion: Motion, frames: int, rng: np.random.Generator) -> Array:
 
 def _with_trunk(local: Array, bend: Array) -> Array:
     """The same with the spine bent forwards; the head keeps a part of its attitude."""
-    part = rot.about_axis("x", bend / len(_SPINE))
+    part = rot.rotation_about_axis("x", bend / len(_SPINE))
     local = local.copy()
     for joint in _SPINE:
         local[:, joint] = part @ local[:, joint]
-    local[:, 12] = rot.about_axis("x", -0.3 * bend) @ local[:, 12]
+    local[:, 12] = rot.rotation_about_axis("x", -0.3 * bend) @ local[:, 12]
     return local
 
 
@@ -172,11 +172,11 @@ def _with_lap(local: Array, share: Array, rng: np.random.Generator) -> Array:
     local = local.copy()
     for shoulder, elbow, side in ((16, 18, 1.0), (17, 19, -1.0)):
         upper, fore = np.radians([rng.uniform(10.0, 45.0), rng.uniform(55.0, 100.0)])
-        hang = rot.about_axis("z", -side * np.radians(rng.uniform(72.0, 88.0)))
-        arm = rot.about_axis("x", -upper) @ hang
-        inwards = rot.about_axis("y", -side * np.radians(rng.uniform(0.0, 35.0)))
-        twist = rot.about_axis("x", np.radians(rng.uniform(-60.0, 40.0)))
-        forearm = inwards @ rot.about_axis("x", -fore) @ hang @ twist
+        hang = rot.rotation_about_axis("z", -side * np.radians(rng.uniform(72.0, 88.0)))
+        arm = rot.rotation_about_axis("x", -upper) @ hang
+        inwards = rot.rotation_about_axis("y", -side * np.radians(rng.uniform(0.0, 35.0)))
+        twist = rot.rotation_about_axis("x", np.radians(rng.uniform(-60.0, 40.0)))
+        forearm = inwards @ rot.rotation_about_axis("x", -fore) @ hang @ twist
         for joint, target in ((shoulder, arm), (elbow, arm.T @ forearm)):
             start = rot.matrix_to_quat(local[:, joint])
             goal = np.broadcast_to(rot.matrix_to_quat(target), start.shape)

@@ -27,8 +27,8 @@ BLEND_S = 1.0
 def straight_pose() -> Array:
     """Global rotations (24, 3, 3) of the straight pose (N-pose): the zero pose with hanging arms."""
     pose = np.tile(np.eye(3), (24, 1, 1))
-    pose[[16, 18, 20, 22]] = rot.about_axis("z", -np.pi / 2)
-    pose[[17, 19, 21, 23]] = rot.about_axis("z", np.pi / 2)
+    pose[[16, 18, 20, 22]] = rot.rotation_about_axis("z", -np.pi / 2)
+    pose[[17, 19, 21, 23]] = rot.rotation_about_axis("z", np.pi / 2)
     return pose
 
 
@@ -39,7 +39,7 @@ def with_hold(motion: Motion, seconds: float) -> Motion:
     stays where the first frame has it; another `BLEND_S` seconds lead from the straight pose to that frame's.
     """
     forward = motion.rotations[0, 0, :, 2]
-    turn = rot.about_axis("y", -np.arctan2(forward[0], forward[2]))
+    turn = rot.rotation_about_axis("y", -np.arctan2(forward[0], forward[2]))
     rotations, translation = turn @ motion.rotations, motion.translation @ turn.T
     # A smooth start and end (smoothstep), so that the virtual accelerometers see no jolt.
     t = np.linspace(0.0, 1.0, round(BLEND_S * motion.rate), endpoint=False)[:, None]

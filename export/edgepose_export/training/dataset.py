@@ -72,12 +72,12 @@ def read_take(path: Path) -> Take:
     orientation = INERTIAL_FROM_BODY.T @ inertial
     local = rot.rotvec_to_matrix(poses)
     bones = forward_kinematics(local[0], np.zeros((24, 3)))[0][list(BONES)]
-    if not (rot.angle_between(orientation[0], bones) < 0.01).all():
+    if not (rot.geodesic_angle(orientation[0], bones) < 0.01).all():
         raise EdgeposeError(
             f"{path}: the sensors are not aligned with the bones; use edgepose synthesize without --mounting"
         )
     force_inertial = np.einsum("tsij,tsj->tsi", inertial, force.astype(float))
-    # A frame of a run holds the mean over the time since the frame before, see `FrameClock`.
+    # A frame of a run holds the mean over the time since the frame before, see `FrameSynchronizer`.
     force_inertial[1:] = 0.5 * (force_inertial[1:] + force_inertial[:-1])
     acceleration = (force_inertial - [0.0, 0.0, GRAVITY]) @ INERTIAL_FROM_BODY
     return Take(
@@ -122,7 +122,7 @@ def training_paths(folder: Path) -> tuple[list[Path], list[Path]]:
     return [path for i, path in enumerate(paths) if i % 10], paths[::10]
 
 
-class Tape(NamedTuple):
+class PackedTakes(NamedTuple):
     """Takes one after the other, as tensors.
 
     Attributes:
@@ -152,10 +152,10 @@ class Tape(NamedTuple):
         return [name.endswith(SEATED) for name in self.names]
 
 
-def tape(takes: list[Take]) -> Tape:
+def tape(takes: list[Take]) -> PackedTakes:
     """Joins takes; none give an empty tape."""
     lengths = [len(take.pose) for take in takes]
-    return Tape(
+    return PackedTakes(
         torch.cat([torch.zeros(0, 6, 3, 3), *(torch.from_numpy(take.orientation) for take in takes)]),
         torch.cat([torch.zeros(0, 6, 3), *(torch.from_numpy(take.acceleration) for take in takes)]),
         torch.cat(

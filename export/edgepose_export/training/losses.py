@@ -16,7 +16,7 @@ def likelihood_loss(mean: Tensor, deviation: Tensor, target: Tensor, beta: float
     return loss.mean()
 
 
-def tremble_loss(mean: Tensor, target: Tensor) -> Tensor:
+def smoothness_loss(mean: Tensor, target: Tensor) -> Tensor:
     """Mean square of the second differences in time of the error of (B, T, numbers); a scalar.
 
     Of two poses that are as wrong it prefers that whose error changes slowly, so that motion stays as smooth

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from edgepose.errors import EdgeposeError
-from edgepose_export.training.dataset import Tape, read_take, root_relative_pose
+from edgepose_export.training.dataset import PackedTakes, read_take, root_relative_pose
 
 FRAME = {"orientation": (6, 3, 3), "acceleration": (6, 3), "relative": (24, 3, 3)}
 """Shape of one frame in each file."""
@@ -28,7 +28,7 @@ _INDEX = "tape.json"
 
 def packed_tape(
     paths: list[Path], folder: Path, progress: Callable[[list[Path]], Iterable[Path]] = iter
-) -> Tape:
+) -> PackedTakes:
     """The takes of some files as a tape whose tensors are mapped from a folder.
 
     Args:
@@ -49,7 +49,7 @@ def packed_tape(
             (folder / _INDEX).write_text(json.dumps(about), encoding="utf-8")
     except OSError as error:
         raise EdgeposeError(f"{folder}: cannot pack takes there: {error.strerror or error}") from error
-    return Tape(
+    return PackedTakes(
         **{name: _mapped(folder, name, sum(about["lengths"])) for name in FRAME},
         starts=torch.tensor([0, *accumulate(about["lengths"])]),
         names=about["names"],

@@ -20,7 +20,7 @@ from edgepose_export.archive.torchscript import Statistics, new_network
 from edgepose_export.networks.normalisation import network_inputs, seen_from_first
 from edgepose_export.networks.shape import NetworkShape, smoothed
 from edgepose_export.synthesis.augmentation import augment
-from edgepose_export.synthesis.posture_variation import AFTER, BEFORE, Batch, other_postures
+from edgepose_export.synthesis.posture_variation import AFTER, BEFORE, Batch, vary_postures
 from edgepose_export.training.checkpoints import (
     CHECKPOINT,
     WEIGHTS_ONLY,
@@ -30,9 +30,9 @@ from edgepose_export.training.checkpoints import (
     shape_of,
 )
 from edgepose_export.training.config import TrainConfig, config_values
-from edgepose_export.training.dataset import Tape, describe
+from edgepose_export.training.dataset import PackedTakes, describe
 from edgepose_export.training.distributed import ALONE, Processes
-from edgepose_export.training.losses import likelihood_loss, tremble_loss
+from edgepose_export.training.losses import likelihood_loss, smoothness_loss
 
 __all__ = ["CHECKPOINT", "Trainer", "fit", "mean_of", "read_checkpoint", "save_checkpoint"]
 
@@ -51,14 +51,14 @@ def pose_targets(relative: Tensor, shape: NetworkShape) -> Tensor:
     return torch.matmul(parents, relative[..., joints, :, :]).flatten(-3)
 
 
-def inputs_of(orientation: Tensor, acceleration: Tensor, shape: NetworkShape) -> Tensor:
+def network_inputs_of(orientation: Tensor, acceleration: Tensor, shape: NetworkShape) -> Tensor:
     """Inputs (..., T, inputs) of sequences, before z-scoring."""
     if shape.normalisation == "sequence":
         orientation, acceleration = seen_from_first(orientation, acceleration)
     return network_inputs(orientation, acceleration, shape.normalisation, shape.acceleration)
 
 
-def statistics_of(tape: Tape, shape: NetworkShape, processes: Processes = ALONE) -> Statistics:
+def compute_statistics(tape: PackedTakes, shape: NetworkShape, processes: Processes = ALONE) -> Statistics:
     """Means and deviations over the training tapes of all processes (DIP 4.4).
 
     Local matrices are z-scored entry by entry as in the paper. Global rotations get one deviation for all
@@ -67,7 +67,7 @@ def statistics_of(tape: Tape, shape: NetworkShape, processes: Processes = ALONE)
     moments = torch.zeros(2, shape.inputs + shape.pose_outputs, dtype=torch.float64)
     # Take by take: a tape may be larger than the memory.
     for start, end in pairwise(tape.starts.tolist()):
-        x = inputs_of(tape.orientation[start:end], tape.acceleration[start:end], shape)
+        x = network_inputs_of(tape.orientation[start:end], tape.acceleration[start:end], shape)
         numbers = torch.cat([x, pose_targets(tape.relative[start:end], shape)], dim=-1).double()
         moments += torch.stack([numbers.sum(0), numbers.square().sum(0)])
     count = float(processes.total(tape.starts[-1]))
@@ -82,7 +82,7 @@ def statistics_of(tape: Tape, shape: NetworkShape, processes: Processes = ALONE)
 
 
 def window_starts(
-    tape: Tape, window: int, joined: bool, chosen: Callable[[int], bool] = lambda take: True
+    tape: PackedTakes, window: int, joined: bool, chosen: Callable[[int], bool] = lambda take: True
 ) -> Starts:
     """First frames of all windows that the chosen takes of a tape hold."""
     groups: tuple[list[Tensor], list[Tensor]] = ([], [])
@@ -98,7 +98,7 @@ def window_starts(
     return torch.cat([empty, *groups[0]]), torch.cat([empty, *groups[1]])
 
 
-def windows_with_sitting(tape: Tape, window: int) -> Tensor:
+def windows_with_sitting(tape: PackedTakes, window: int) -> Tensor:
     """Whether the windows from each frame (T,) of a tape on hold frames of takes with made sitting."""
     frames = torch.zeros(int(tape.starts[-1]) + 1, dtype=torch.int32)
     for i in (i for i, seated in enumerate(tape.seated) if seated):
@@ -108,7 +108,7 @@ def windows_with_sitting(tape: Tape, window: int) -> Tensor:
     return before[(first + window).clamp(max=len(before) - 1)] > before[first]
 
 
-def draw(starts: Starts, count: int, free_share: float, generator: torch.Generator) -> Tensor:
+def sample_windows(starts: Starts, count: int, free_share: float, generator: torch.Generator) -> Tensor:
     """First frames (count,) of random windows with the wanted share of CMU's."""
     other, cmu = starts
     if free_share == 0.0 or len(other) == 0 or len(cmu) == 0:
@@ -123,13 +123,13 @@ def draw(starts: Starts, count: int, free_share: float, generator: torch.Generat
     )
 
 
-def windows(tape: Tape, starts: Tensor, length: int) -> Batch:
+def windows(tape: PackedTakes, starts: Tensor, length: int) -> Batch:
     """Orientations, accelerations and true rotations of windows, each (len(starts), length, ...)."""
     index = starts[:, None] + torch.arange(length)
     return tape.orientation[index], tape.acceleration[index], tape.relative[index]
 
 
-def describe_tape(tape: Tape, processes: Processes = ALONE) -> dict[str, Any]:
+def describe_tape(tape: PackedTakes, processes: Processes = ALONE) -> dict[str, Any]:
     """What an archive's card says of the takes of all processes."""
     shares = processes.everywhere((tape.licenses, int(tape.starts[-1])))
     licenses = [text for texts, _ in shares for text in texts]
@@ -145,8 +145,8 @@ class Trainer:
     def __init__(
         self,
         config: TrainConfig,
-        train: Tape,
-        validation: Tape,
+        train: PackedTakes,
+        validation: PackedTakes,
         data: dict[str, Any],
         processes: Processes = ALONE,
     ) -> None:
@@ -176,7 +176,7 @@ class Trainer:
             raise EdgeposeError(f"{at}no training take is as long as the window of {config.window} frames")
         if not any(processes.everywhere(len(self._validation_starts()))):
             raise EdgeposeError(f"no validation take is as long as the window of {config.window} frames")
-        self.statistics = self._placed(statistics_of(train, config.network, processes))
+        self.statistics = self._placed(compute_statistics(train, config.network, processes))
         self.network = new_network(config.network).to(processes.device)
         self.averaged = new_network(config.network).to(processes.device)
         self.averaged.load_state_dict(self.network.state_dict())
@@ -206,7 +206,7 @@ class Trainer:
     ) -> Tensor:
         config, s = self.config, self.statistics
         orientation, acceleration, relative = (part.to(self.processes.device) for part in batch)
-        x = (inputs_of(orientation, acceleration, config.network) - s.input_mean) / s.input_std
+        x = (network_inputs_of(orientation, acceleration, config.network) - s.input_mean) / s.input_std
         target = (pose_targets(relative, config.network) - s.target_mean) / s.target_std
         if config.acceleration_loss:
             target = torch.cat([target, x[..., -ACCELERATIONS:]], dim=-1)
@@ -222,7 +222,7 @@ class Trainer:
             mean = torch.cat([(smooth - s.target_mean) / s.target_std, mean[..., pose:]], dim=-1)
         loss = likelihood_loss(mean, deviation[..., :numbers].float(), target, config.beta)
         if smoothness:
-            loss = loss + smoothness * tremble_loss(mean[..., :pose], target[..., :pose])
+            loss = loss + smoothness * smoothness_loss(mean[..., :pose], target[..., :pose])
         return loss
 
     def train_step(self) -> float:
@@ -237,9 +237,9 @@ class Trainer:
             group["lr"] = rate * min(1.0, (self.step + 1) / (config.warm_up + 1))
         count = config.sequences // self.processes.size
         seated = round(count * config.seated_share) if len(torch.cat(self.seated_starts)) else 0
-        starts = draw(self.starts, count - seated, config.free_share, self.generator)
+        starts = sample_windows(self.starts, count - seated, config.free_share, self.generator)
         if seated:
-            starts = torch.cat([starts, draw(self.seated_starts, seated, 0.0, self.generator)])
+            starts = torch.cat([starts, sample_windows(self.seated_starts, seated, 0.0, self.generator)])
         batch = self._batch(starts)
         loss = self._loss(self.parallel, batch, config.input_dropout, config.smoothness)
         self.optimiser.zero_grad(set_to_none=True)
@@ -274,7 +274,7 @@ class Trainer:
         take = torch.searchsorted(tape.starts, index, right=True)
         index = index.clamp(0, len(tape.relative) - 1)
         batch = tape.orientation[index], tape.acceleration[index], tape.relative[index]
-        return other_postures(batch, take, size, self.generator)
+        return vary_postures(batch, take, size, self.generator)
 
     def _validation_starts(self) -> Tensor:
         window = self.config.window

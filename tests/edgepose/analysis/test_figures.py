@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgb
 from edgepose.analysis.figures import PREDICTION, REFERENCE, project, skeleton_strip
 from edgepose.errors import EdgeposeError
 from edgepose.pose import PoseFrame
-from edgepose.rotations import about_axis
+from edgepose.rotations import rotation_about_axis
 from edgepose.sinks.csv import CsvSink
 from edgepose.skeleton import forward_kinematics
 
@@ -32,13 +32,13 @@ for left in (1, 4, 7, 10, 13, 16, 18, 20, 22):
 
 def n_pose() -> np.ndarray:
     pose = np.tile(np.eye(3), (24, 1, 1))
-    pose[16], pose[17] = about_axis("z", -1.3), about_axis("z", 1.3)
+    pose[16], pose[17] = rotation_about_axis("z", -1.3), rotation_about_axis("z", 1.3)
     return pose
 
 
 def left_arm_up() -> np.ndarray:
     pose = n_pose()
-    pose[16] = about_axis("z", 1.3)
+    pose[16] = rotation_about_axis("z", 1.3)
     return pose
 
 
@@ -74,7 +74,7 @@ def test_picture_is_not_mirrored(tmp_path):
 def test_reference_stands_below(tmp_path):
     path = tmp_path / "strip.png"
     poses = np.stack([n_pose(), left_arm_up(), np.tile(np.eye(3), (24, 1, 1))])
-    skeleton_strip(path, poses, [0.0, 0.5, 1.0], OFFSETS, reference=poses, title="Poses")
+    skeleton_strip(path, poses, [0.0, 0.5, 1.0], OFFSETS, reference=poses, title="PoseSequence")
     image = matplotlib.image.imread(path)
     rows, columns = where(image, PREDICTION["trunk"])
     reference_rows, reference_columns = where(image, REFERENCE["trunk"])

@@ -47,7 +47,7 @@ def six() -> list[Trial]:
 def test_errors_of_known_turns(six):
     trial = cut(six[0], slice(4000, 6000))
     tilt = rot.rotvec_to_quat(np.deg2rad([3.0, 4.0, 0.0]))
-    turned = rot.quat_multiply(rot.about_z(np.deg2rad(-2.0)), trial.quat)
+    turned = rot.quat_multiply(rot.quat_about_z(np.deg2rad(-2.0)), trial.quat)
     assert errors(turned, trial) == pytest.approx((2.0, 2.0, 0.0), abs=1e-5)
     assert errors(rot.quat_multiply(tilt, trial.quat), trial) == pytest.approx((5.0, 0.0, 5.0), abs=1e-5)
     assert errors(-trial.quat, trial) == pytest.approx((0.0, 0.0, 0.0), abs=1e-5)
@@ -55,7 +55,7 @@ def test_errors_of_known_turns(six):
 
 def test_what_is_not_known_or_no_movement_does_not_count(six):
     trial = cut(six[0], slice(4000, 6000))
-    off = rot.quat_multiply(rot.about_z(0.1), trial.quat)
+    off = rot.quat_multiply(rot.quat_about_z(0.1), trial.quat)
     half = np.arange(2000)[:, None] < 1000
     mixed = np.where(half, off, trial.quat)
     assert errors(mixed, trial._replace(movement=~half[:, 0])).total == pytest.approx(0.0, abs=1e-5)
@@ -66,7 +66,7 @@ def test_what_is_not_known_or_no_movement_does_not_count(six):
 
 def test_heading_from_the_start_of_the_motion(six):
     trial = six[0]
-    away = rot.quat_multiply(rot.about_z(2.5), trial.quat)
+    away = rot.quat_multiply(rot.quat_about_z(2.5), trial.quat)
     assert errors(same_heading(away, trial), trial).total == pytest.approx(0.0, abs=1e-4)
 
 

@@ -70,20 +70,20 @@ class Rig:
     def measured(self, r_tb: np.ndarray) -> np.ndarray:
         """Quaternions (..., 6, 4) that the sensors report with their bones at r_tb (..., 6, 3, 3)."""
         true = self.r_ti.T @ r_tb @ self.r_bs
-        return rot.quat_multiply(rot.about_z(-self.error), rot.matrix_to_quat(true))
+        return rot.quat_multiply(rot.quat_about_z(-self.error), rot.matrix_to_quat(true))
 
     def lying(self) -> list[cal.SensorHold]:
         """All six side by side in one orientation."""
-        return rig_at_rest(rot.quat_multiply(rot.about_z(-self.error), random_quats(self.rng)))
+        return rig_at_rest(rot.quat_multiply(rot.quat_about_z(-self.error), random_quats(self.rng)))
 
     def force(self, a_t: np.ndarray) -> np.ndarray:
         """Specific force in each sensor's own inertial frame for accelerations (..., 6, 3) in T."""
         true = a_t @ self.r_ti + np.array([0, 0, 9.81])
-        return rot.quat_rotate(rot.about_z(-self.error), true)
+        return rot.quat_rotate(rot.quat_about_z(-self.error), true)
 
     def calibration(self, pose: str = "straight", **changes: Any) -> cal.Calibration:
         summary = cal.check_hold(rig_at_rest(self.measured(cal.POSES[pose])))
-        offset = cal.heading_offsets(self.lying()).offset
+        offset = cal.headings_side_by_side(self.lying()).offset
         arguments: dict[str, Any] = {
             "body_frame": f"heading:{math.degrees(self.facing)}",
             "heading_offset": offset,
@@ -113,11 +113,11 @@ def test_bones_and_accelerations_of_any_rig_are_recovered(seed: int, pose: str) 
     bones = rot.quat_to_matrix(random_quats(rig.rng, 5, 6))
     a_t = rig.rng.normal(0.0, 5.0, (5, 6, 3))
 
-    r_tb, a = cal.apply(calibration, rig.measured(bones), rig.force(a_t))
+    r_tb, a = cal.apply_calibration(calibration, rig.measured(bones), rig.force(a_t))
 
     np.testing.assert_allclose(r_tb, bones, atol=1e-9)
     np.testing.assert_allclose(a, a_t, atol=1e-9)
-    one, a_one = cal.apply(calibration, rig.measured(bones)[2], rig.force(a_t)[2])
+    one, a_one = cal.apply_calibration(calibration, rig.measured(bones)[2], rig.force(a_t)[2])
     np.testing.assert_allclose(one, bones[2], atol=1e-9)
     np.testing.assert_allclose(a_one, a_t[2], atol=1e-9)
 
@@ -127,14 +127,16 @@ def test_the_calibration_instant_gives_the_pose_back(pose: str) -> None:
     rig = Rig(7)
     calibration = rig.calibration(pose)
     at_rest = rig.measured(cal.POSES[pose])
-    r_tb, a = cal.apply(calibration, at_rest, rig.force(np.zeros((6, 3))))
+    r_tb, a = cal.apply_calibration(calibration, at_rest, rig.force(np.zeros((6, 3))))
     np.testing.assert_allclose(r_tb, cal.POSES[pose], atol=1e-9)
     np.testing.assert_allclose(a, 0.0, atol=1e-9)
 
     # Eq. 8 as printed, R_BS R_TS, does not.
-    r_ts = rig.r_ti @ rot.quat_to_matrix(rot.quat_multiply(rot.about_z(calibration.heading_offset), at_rest))
+    r_ts = rig.r_ti @ rot.quat_to_matrix(
+        rot.quat_multiply(rot.quat_about_z(calibration.heading_offset), at_rest)
+    )
     printed = rot.quat_to_matrix(calibration.bone_from_sensor) @ r_ts
-    assert rot.angle_between(printed, cal.POSES[pose]).min() > 0.1
+    assert rot.geodesic_angle(printed, cal.POSES[pose]).min() > 0.1
 
 
 def test_apply_is_the_chain_of_its_equations() -> None:
@@ -142,10 +144,10 @@ def test_apply_is_the_chain_of_its_equations() -> None:
     calibration = rig.calibration()
     q, f = random_quats(rig.rng, 6), rig.rng.normal(0, 9, (6, 3))
     r_ti = rot.quat_to_matrix(calibration.body_from_inertial)
-    reset = rot.about_z(calibration.heading_offset)
+    reset = rot.quat_about_z(calibration.heading_offset)
     r_ts = r_ti @ rot.quat_to_matrix(rot.quat_multiply(reset, q))
 
-    r_tb, a = cal.apply(calibration, q, f)
+    r_tb, a = cal.apply_calibration(calibration, q, f)
 
     np.testing.assert_allclose(
         r_tb, r_ts @ rot.transpose(rot.quat_to_matrix(calibration.bone_from_sensor)), atol=1e-12
@@ -165,7 +167,7 @@ def test_mean_over_the_hold_beats_one_noisy_frame(seed: int) -> None:
         quat = rot.quat_multiply(s.quat[0], shake)
         noisy.append(still(s.quat[0], n)._replace(quat=np.where(rig.rng.random((n, 1)) < 0.5, quat, -quat)))
     summary = cal.check_hold(noisy)
-    assert rot.angle_between(
+    assert rot.geodesic_angle(
         rot.quat_to_matrix(summary.orientation), rot.quat_to_matrix([s.quat[0] for s in hold])
     ).max() < math.radians(0.4)
     np.testing.assert_allclose(summary.spread_deg, math.sqrt(3.0), rtol=0.2)
@@ -185,8 +187,8 @@ def test_a_named_axis_gives_forward_and_gravity_gives_up(seed: int, axis: str, p
     if along @ tilted > -0.99:
         rig.r_bs[PELVIS] = rot.minimal_rotation(along, tilted)
     else:
-        rig.r_bs[PELVIS] = rot.about_axis("y", math.pi) @ rot.minimal_rotation(
-            along, rot.about_axis("y", math.pi) @ tilted
+        rig.r_bs[PELVIS] = rot.rotation_about_axis("y", math.pi) @ rot.minimal_rotation(
+            along, rot.rotation_about_axis("y", math.pi) @ tilted
         )
     calibration = rig.calibration(body_frame=f"pelvis:{axis}", heading_offset=None)
     np.testing.assert_allclose(rot.quat_to_matrix(calibration.body_from_inertial), rig.r_ti, atol=1e-9)
@@ -222,7 +224,7 @@ def test_a_body_frame_is_a_rotation_with_y_up(seed: int, body_frame: str) -> Non
 
 def test_a_head_sensor_whose_y_is_not_up_is_refused() -> None:
     rig = Rig(3)
-    rig.r_bs[HEAD] = rot.about_axis("x", math.radians(25))
+    rig.r_bs[HEAD] = rot.rotation_about_axis("x", math.radians(25))
     with pytest.raises(EdgeposeError, match=r"head sensor's Y axis points 25 deg from up"):
         rig.calibration(body_frame="head")
 
@@ -230,7 +232,7 @@ def test_a_head_sensor_whose_y_is_not_up_is_refused() -> None:
 @pytest.mark.parametrize("axis", ["y", "-y"])
 def test_an_axis_near_the_vertical_gives_no_forward(axis: str) -> None:
     rig = Rig(3)
-    rig.r_bs[PELVIS] = rot.about_axis("x", math.radians(15))
+    rig.r_bs[PELVIS] = rot.rotation_about_axis("x", math.radians(15))
     with pytest.raises(EdgeposeError, match=rf"pelvis:{axis}: this axis is 15 deg from vertical"):
         rig.calibration(body_frame=f"pelvis:{axis}")
 
@@ -257,7 +259,7 @@ def test_an_unknown_pose_is_refused() -> None:
 @settings(max_examples=40, deadline=None)
 def test_heading_reset_finds_every_offset(seed: int) -> None:
     rig = Rig(seed)
-    reset = cal.heading_offsets(rig.lying())
+    reset = cal.headings_side_by_side(rig.lying())
     np.testing.assert_allclose(np.sin(reset.offset - rig.error), 0.0, atol=1e-9)
     np.testing.assert_allclose(np.cos(reset.offset - rig.error), 1.0, atol=1e-9)
     assert reset.offset[ROOT] == pytest.approx(0.0, abs=1e-9)
@@ -266,21 +268,21 @@ def test_heading_reset_finds_every_offset(seed: int) -> None:
 
 
 def test_heading_reset_reports_tilt_and_refuses_too_much_of_it() -> None:
-    quats = rot.quat_multiply(rot.about_z([0.3, 1, 2, -1, -3, 0.0]), np.array([1.0, 0, 0, 0]))
+    quats = rot.quat_multiply(rot.quat_about_z([0.3, 1, 2, -1, -3, 0.0]), np.array([1.0, 0, 0, 0]))
     tilt = np.radians([0, 4, 0, 0, 0, 0.0])
-    reset = cal.heading_offsets(rig_at_rest(rot.quat_multiply(quats, turns_about_x(tilt))))
+    reset = cal.headings_side_by_side(rig_at_rest(rot.quat_multiply(quats, turns_about_x(tilt))))
     np.testing.assert_allclose(reset.error_deg, np.degrees(tilt), atol=1e-6)
     tilt = np.radians([0, 0, 90, 0, 16, 0.0])
     with pytest.raises(
         EdgeposeError, match=r"pelvis sensor does: left_lower_leg \(90 deg\), head \(16 deg\); lay all six"
     ):
-        cal.heading_offsets(rig_at_rest(rot.quat_multiply(quats, turns_about_x(tilt))))
+        cal.headings_side_by_side(rig_at_rest(rot.quat_multiply(quats, turns_about_x(tilt))))
 
 
 def test_heading_reset_names_a_sensor_that_moved() -> None:
     hold = moved(rig_at_rest(np.tile([1.0, 0, 0, 0], (6, 1))), LEFT, turns_about_x(np.linspace(0, 0.5, 100)))
     with pytest.raises(cal.MovedError, match=r"left_forearm .* repeat the heading reset"):
-        cal.heading_offsets(hold)
+        cal.headings_side_by_side(hold)
 
 
 # --- checks of a hold ---------------------------------------------------------------------------------------
@@ -361,7 +363,10 @@ def test_a_quaternion_that_is_not_a_rotation(hold: list[cal.SensorHold], bad: li
 
 
 def test_two_sensors_under_one_name_are_told_from_movement(hold: list[cal.SensorHold]) -> None:
-    first, second = hold[LEFT].quat[0], rot.quat_multiply(rot.about_z(math.radians(40)), hold[LEFT].quat[0])
+    first, second = (
+        hold[LEFT].quat[0],
+        rot.quat_multiply(rot.quat_about_z(math.radians(40)), hold[LEFT].quat[0]),
+    )
     alternating = np.tile([first, second], (50, 1))
     with pytest.raises(
         EdgeposeError, match=r"two sensors report as one placement: left_forearm \(40 deg apart\)"
@@ -436,7 +441,7 @@ def test_the_first_of_the_still_windows_is_taken(hold: list[cal.SensorHold]) -> 
         long.append(cal.SensorHold(time_s, quat, np.zeros((3000, 3)), np.zeros((3000, 3))))
     start = cal.stillest_start(long, 4.0)
     assert 105.0 <= start <= 105.3
-    assert [len(s.time_s) for s in cal.cut(long, start, start + 4.0)] == [400] * 6
+    assert [len(s.time_s) for s in cal.trim(long, start, start + 4.0)] == [400] * 6
 
 
 def test_no_window_is_an_error_that_says_what_there_is(hold: list[cal.SensorHold]) -> None:
@@ -465,7 +470,11 @@ def test_a_file_gives_the_same_calibration_back(tmp_path: Path) -> None:
     for name in ("pose", "body_frame", "created", "metadata"):
         assert getattr(loaded, name) == getattr(calibration, name)
     q = random_quats(np.random.default_rng(0), 3, 6)
-    for a, b in zip(cal.apply(loaded, q, q[..., :3]), cal.apply(calibration, q, q[..., :3]), strict=True):
+    for a, b in zip(
+        cal.apply_calibration(loaded, q, q[..., :3]),
+        cal.apply_calibration(calibration, q, q[..., :3]),
+        strict=True,
+    ):
         np.testing.assert_allclose(a, b, atol=1e-12)
 
 
@@ -583,7 +592,7 @@ def test_any_value_anywhere_loads_or_is_refused(value: Any, where: str) -> None:
         loaded = cal.from_json(corrupt(**{where: value}))
     except EdgeposeError:
         return
-    r_tb, _ = cal.apply(loaded, np.tile([1.0, 0, 0, 0], (6, 1)), np.zeros((6, 3)))
+    r_tb, _ = cal.apply_calibration(loaded, np.tile([1.0, 0, 0, 0], (6, 1)), np.zeros((6, 3)))
     np.testing.assert_allclose(r_tb @ rot.transpose(r_tb), np.tile(np.eye(3), (6, 1, 1)), atol=1e-9)
 
 
@@ -597,14 +606,14 @@ def test_a_real_wearer_standing_straight() -> None:
     assert summary.spread_deg.max() < 0.5
     by_heading = cal.calibrate(summary, pose="straight", body_frame="heading:0", created=CREATED)
     by_pelvis = cal.calibrate(summary, pose="straight", body_frame="pelvis:-z", created=CREATED)
-    apart = rot.angle_between(
+    apart = rot.geodesic_angle(
         rot.quat_to_matrix(by_heading.body_from_inertial), rot.quat_to_matrix(by_pelvis.body_from_inertial)
     )
     assert math.degrees(apart) < 10.0
 
     frames = np.stack([s.quat for s in hold], axis=1)
     force = rot.quat_rotate(frames, np.stack([s.acc for s in hold], axis=1))
-    r_tb, a_t = cal.apply(by_heading, frames, force)
-    assert np.degrees(rot.angle_between(r_tb, cal.POSES["straight"])).max() < 2.0
+    r_tb, a_t = cal.apply_calibration(by_heading, frames, force)
+    assert np.degrees(rot.geodesic_angle(r_tb, cal.POSES["straight"])).max() < 2.0
     # Scale errors of the accelerometers are up to 3 %.
     assert np.linalg.norm(a_t.mean(axis=0), axis=-1).max() < 0.35

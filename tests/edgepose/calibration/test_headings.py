@@ -36,7 +36,7 @@ def wrapped_deg(angle: np.ndarray) -> np.ndarray:
 def quats(bones: np.ndarray, mounting: np.ndarray, yaw: np.ndarray) -> np.ndarray:
     """What sensors say whose inertial frames are turned by yaw (6,) against one where the wearer faces X."""
     true = rot.matrix_to_quat(INERTIAL_FROM_BODY @ bones @ mounting)
-    return rot.quat_multiply(rot.about_z(yaw), true)
+    return rot.quat_multiply(rot.quat_about_z(yaw), true)
 
 
 def hold_of(orientation: np.ndarray) -> list[cal.SensorHold]:
@@ -70,7 +70,7 @@ def measured(words: list[str], yaw: np.ndarray, slack_deg: float = 0.0, seed: in
     slack = np.random.default_rng(seed).normal(size=(6, 3))
     slack *= math.radians(slack_deg) / np.linalg.norm(slack, axis=-1, keepdims=True)
     r_ts = rot.rotvec_to_matrix(slack) @ np.stack([sits(w) for w in words])
-    return rot.quat_multiply(rot.about_z(yaw), rot.matrix_to_quat(INERTIAL_FROM_BODY @ r_ts))
+    return rot.quat_multiply(rot.quat_about_z(yaw), rot.matrix_to_quat(INERTIAL_FROM_BODY @ r_ts))
 
 
 def calibration_of(orientation: np.ndarray, offset: np.ndarray) -> cal.Calibration:
@@ -100,8 +100,12 @@ def test_an_axis_that_faces_forward_gives_every_heading(axis: str) -> None:
     # The named axis along Z of T, then anything about it, and 10 degrees of slope.
     unit = np.eye(3)["xyz".index(axis[-1])] * (-1.0 if axis[0] == "-" else 1.0)
     along = rot.minimal_rotation(unit + 1e-6, [0.0, 0.0, 1.0])
-    r_ts = rot.about_axis("x", math.radians(10)) @ rot.about_axis("z", rng.uniform(0, 6, 6)) @ along
-    orientation = rot.quat_multiply(rot.about_z(yaw), rot.matrix_to_quat(INERTIAL_FROM_BODY @ r_ts))
+    r_ts = (
+        rot.rotation_about_axis("x", math.radians(10))
+        @ rot.rotation_about_axis("z", rng.uniform(0, 6, 6))
+        @ along
+    )
+    orientation = rot.quat_multiply(rot.quat_about_z(yaw), rot.matrix_to_quat(INERTIAL_FROM_BODY @ r_ts))
     found = cal.headings_from_axis(orientation, axis)
     np.testing.assert_allclose(wrapped_deg(found.offset + yaw), 0.0, atol=1e-3)
     np.testing.assert_allclose(found.error_deg, 10.0, atol=1e-3)
@@ -170,7 +174,7 @@ def test_swapped_sensors_move_at_the_wrong_time(order: list[int], told: list[str
 
 def real_walk() -> tuple[list[cal.SensorHold], np.ndarray]:
     everything = cal.hold_from_recording(read_recording(WALK))
-    return cal.cut(everything, 99, 110), cal.check_hold(cal.cut(everything, 40, 42)).orientation
+    return cal.trim(everything, 99, 110), cal.check_hold(cal.trim(everything, 40, 42)).orientation
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -179,9 +183,10 @@ def test_a_real_walk_gives_headings_though_not_finely(seed: int) -> None:
     moving, upright = real_walk()
     yaw = np.random.default_rng(seed).uniform(-math.pi, math.pi, 6)
     turned = [
-        s._replace(quat=rot.quat_multiply(rot.about_z(y), s.quat)) for s, y in zip(moving, yaw, strict=True)
+        s._replace(quat=rot.quat_multiply(rot.quat_about_z(y), s.quat))
+        for s, y in zip(moving, yaw, strict=True)
     ]
-    found = cal.headings_from_motion(turned, rot.quat_multiply(rot.about_z(yaw), upright))
+    found = cal.headings_from_motion(turned, rot.quat_multiply(rot.quat_about_z(yaw), upright))
     error = np.abs(wrapped_deg(found.offset + yaw))
     assert (error < [14.0, 16.0, 6.0, 10.0, 9.0, 6.0]).all(), error
     # What it says of itself is of the size of what it does.
@@ -198,7 +203,7 @@ def test_motion_that_shows_no_heading_is_refused_and_names_the_sensor() -> None:
     head = BONES[PLACEMENTS.index("head")]
     t = np.arange(len(bones)) / RATE
     nodding = bones.copy()
-    nodding[:, head] = rot.about_axis("x", 0.5 * np.sin(5.0 * t)) @ straight_pose()[head]
+    nodding[:, head] = rot.rotation_about_axis("x", 0.5 * np.sin(5.0 * t)) @ straight_pose()[head]
     with pytest.raises(EdgeposeError, match="this motion: head leant forward as much as back;"):
         exercised(nodding, mounting, yaw)
     circling = bones.copy()

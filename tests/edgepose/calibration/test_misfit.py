@@ -14,7 +14,7 @@ import pytest
 from edgepose import rotations as rot
 from edgepose.calibration import POSES, load_calibration
 from edgepose.calibration.fit import fit_pose, impossible_bones
-from edgepose.calibration.misfit import Misfits
+from edgepose.calibration.misfit import MisfitDetector
 from edgepose.formats.recordings.npz import write_npz
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import ImuFrame, Recording
@@ -170,17 +170,17 @@ def test_bones_in_every_pose_of_a_body_are_possible():
     for pose in POSES.values():
         assert impossible_bones(pose) == []
     bones = POSES["straight"].copy()
-    about_x = rot.about_axis("x", np.radians(150.0))  # a heel at the buttock
+    about_x = rot.rotation_about_axis("x", np.radians(150.0))  # a heel at the buttock
     bones[PLACEMENTS.index("left_lower_leg")] = about_x
     assert impossible_bones(bones) == []
-    lying = rot.about_axis("x", np.radians(-90.0)) @ bones
+    lying = rot.rotation_about_axis("x", np.radians(-90.0)) @ bones
     assert impossible_bones(lying) == []
 
 
 def test_bones_that_no_body_has():
     bones = POSES["straight"].copy()
-    bones[PLACEMENTS.index("head")] = rot.about_axis("x", np.radians(170.0))
-    bones[PLACEMENTS.index("right_lower_leg")] = rot.about_axis("y", np.radians(180.0))
+    bones[PLACEMENTS.index("head")] = rot.rotation_about_axis("x", np.radians(170.0))
+    bones[PLACEMENTS.index("right_lower_leg")] = rot.rotation_about_axis("y", np.radians(180.0))
     assert sorted(impossible_bones(bones)) == ["head", "right_lower_leg"]
 
 
@@ -198,19 +198,19 @@ def test_who_sits_at_first_and_stands_later(calibrated):
     calibration = load_calibration(calibrated)
     sitting = POSES["straight"].copy()
     for i in (0, 1):
-        sitting[i] = rot.about_axis("x", np.radians(-50.0)) @ sitting[i]
-    misfits = Misfits(calibration)
-    lines = [line for frame in frames(calibration, sitting, 25) for line in misfits.of(frame, sitting)]
+        sitting[i] = rot.rotation_about_axis("x", np.radians(-50.0)) @ sitting[i]
+    misfits = MisfitDetector(calibration)
+    lines = [line for frame in frames(calibration, sitting, 25) for line in misfits.update(frame, sitting)]
     assert lines + misfits.at_end() == []
 
 
 def test_an_impossible_bone_is_told_once(calibrated):
     calibration = load_calibration(calibrated)
     bones = POSES["straight"].copy()
-    bones[PLACEMENTS.index("head")] = rot.about_axis("x", np.radians(170.0))
-    misfits = Misfits(calibration)
+    bones[PLACEMENTS.index("head")] = rot.rotation_about_axis("x", np.radians(170.0))
+    misfits = MisfitDetector(calibration)
     lines = [
-        line for frame in frames(calibration, POSES["straight"], 60) for line in misfits.of(frame, bones)
+        line for frame in frames(calibration, POSES["straight"], 60) for line in misfits.update(frame, bones)
     ]
     assert len(lines) == 1
     assert lines[0].startswith("warning: head: turned against the pelvis as no body can")
@@ -221,15 +221,15 @@ def test_headings_that_are_reset_do_not_tell_left_from_right(calibrated):
     calibration = load_calibration(calibrated)
     away = replace(calibration, north=False)
     quats = next(iter(frames(calibration, POSES["straight"], 1))).orientation
-    turned = rot.quat_multiply(rot.about_z(np.radians([0.0, 90.0, 0.0, 170.0, 0.0, 0.0])), quats)
+    turned = rot.quat_multiply(rot.quat_about_z(np.radians([0.0, 90.0, 0.0, 170.0, 0.0, 0.0])), quats)
     assert fit_pose(away, turned).sits_at is None
     assert fit_pose(away, turned).good
 
 
 def test_a_calm_run_keeps_few_frames(calibrated):
     calibration = load_calibration(calibrated)
-    misfits = Misfits(calibration)
+    misfits = MisfitDetector(calibration)
     for frame in frames(calibration, POSES["t-pose"], 120):
-        misfits.of(frame, POSES["t-pose"])
+        misfits.update(frame, POSES["t-pose"])
     assert isinstance(misfits._frames, deque)
     assert len(misfits._frames) < 120

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 
 from edgepose import calibration as cal
 from edgepose import rotations as rot
-from edgepose.calibration.rezero import BLEND_S, HOLD_S, START_HOLD_S, Headings
+from edgepose.calibration.rezero import BLEND_S, HOLD_S, START_HOLD_S, HeadingRezero
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuFrame
-from edgepose.pipeline.dropout_monitor import QUIET_S, SILENT_S, Silences
+from edgepose.pipeline.dropout_monitor import QUIET_S, SILENT_S, DropoutMonitor
 from edgepose.pipeline.remote_control import Control, parse
 from edgepose.placements import PLACEMENTS
 
@@ -32,7 +32,7 @@ STRAIGHT = cal.POSES["straight"]
 def worn(bones: np.ndarray, drift: np.ndarray | float = 0.0) -> np.ndarray:
     """Quaternions (6, 4) of sensors whose headings have drifted since the calibration."""
     true = rot.matrix_to_quat(R_TI.T @ bones @ R_BS)
-    return rot.quat_multiply(rot.about_z(drift - OFFSET), true)
+    return rot.quat_multiply(rot.quat_about_z(drift - OFFSET), true)
 
 
 def calibration() -> cal.Calibration:
@@ -41,13 +41,13 @@ def calibration() -> cal.Calibration:
 
 
 class Walk:
-    """Frames at 60 Hz through `Headings`, and what it says."""
+    """Frames at 60 Hz through `HeadingRezero`, and what it says."""
 
     def __init__(self, **options: object) -> None:
         self.said: list[str] = []
         self.wishes: list[float] = []
         self.index = 0
-        self.headings = Headings(calibration(), requests=self._take, tell=self.said.append, **options)
+        self.headings = HeadingRezero(calibration(), requests=self._take, notify=self.said.append, **options)
 
     def _take(self) -> list[float]:
         taken, self.wishes = self.wishes, []
@@ -62,14 +62,14 @@ class Walk:
             marks = np.array([name in held for name in PLACEMENTS])
             shaken = rot.quat_multiply(orientation, turn)
             frame = ImuFrame(self.index, self.index / 60, shaken, np.zeros((6, 3)), marks, 0.0)
-            found.append(self.headings.at(frame))
+            found.append(self.headings.calibration_for(frame))
         return found
 
 
 def apart(found: cal.Calibration, orientation: np.ndarray) -> np.ndarray:
     """Angles (6,), degrees, between measured bones and the straight pose."""
-    bones, _ = cal.apply(found, orientation, np.zeros((6, 3)))
-    return np.degrees(rot.angle_between(bones, STRAIGHT))
+    bones, _ = cal.apply_calibration(found, orientation, np.zeros((6, 3)))
+    return np.degrees(rot.geodesic_angle(bones, STRAIGHT))
 
 
 DRIFT = np.radians([20.0, -35.0, 5.0, 0.0, 170.0, -12.0])
@@ -119,7 +119,7 @@ def test_a_bad_hold_changes_nothing_and_says_why(changes, says):
     walk = Walk()
     walk.wishes = [0.0]
     bones = STRAIGHT.copy()
-    bones[0] = rot.about_axis("x", -changes.pop("lift", 0.0)) @ bones[0]
+    bones[0] = rot.rotation_about_axis("x", -changes.pop("lift", 0.0)) @ bones[0]
     found = walk.go(HOLD_S + 2.0, worn(bones, DRIFT), **changes)
     assert found[-1] is found[0]
     assert len(walk.said) == 2
@@ -198,7 +198,7 @@ def test_a_socket_hears_wishes_and_counts_the_rest():
 
 
 def test_a_sensor_that_falls_silent_is_told_once_and_when_it_is_back():
-    silences, lines = Silences(), []
+    silences, lines = DropoutMonitor(), []
     head = PLACEMENTS.index("head")
 
     def go(start_s: float, seconds: float, silent: bool) -> None:
@@ -206,7 +206,7 @@ def test_a_sensor_that_falls_silent_is_told_once_and_when_it_is_back():
             marks = np.zeros(6, bool)
             marks[head] = silent
             frame = ImuFrame(0, start_s + k / 10, np.zeros((6, 4)), np.zeros((6, 3)), marks, 0.0)
-            lines.extend(silences.of(frame))
+            lines.extend(silences.update(frame))
 
     go(0.0, 5.0, False)
     go(5.0, SILENT_S / 2, True)

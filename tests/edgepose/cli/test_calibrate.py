@@ -20,7 +20,7 @@ from edgepose import calibration as cal
 from edgepose import rotations as rot
 from edgepose.cli.commands.calibrate import calibrate
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.base import from_samples
+from edgepose.formats.recordings.base import recording_from_samples
 from edgepose.formats.recordings.csv import write_csv
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import ImuSample
@@ -36,16 +36,16 @@ FACING = math.radians(70)
 R_TI = cal.body_from_inertial(np.tile([1.0, 0, 0, 0], (6, 1)), "heading:70")
 ERRORS = np.array([0.5, -1.0, 2.0, -2.5, 0.1, 0.0])
 R_BS = rot.rotvec_to_matrix(np.random.default_rng(3).normal(0.0, 1.0, (6, 3)))
-R_BS[5] = rot.about_axis("y", math.pi)  # Z of the pelvis sensor points to the back
+R_BS[5] = rot.rotation_about_axis("y", math.pi)  # Z of the pelvis sensor points to the back
 
 
 def worn(bones: np.ndarray, errors: np.ndarray = ERRORS) -> np.ndarray:
     """Quaternions (6, 4) that the sensors send with the bones at (6, 3, 3)."""
-    return rot.quat_multiply(rot.about_z(-errors), rot.matrix_to_quat(R_TI.T @ bones @ R_BS))
+    return rot.quat_multiply(rot.quat_about_z(-errors), rot.matrix_to_quat(R_TI.T @ bones @ R_BS))
 
 
 def lying() -> np.ndarray:
-    return rot.quat_multiply(rot.about_z(-ERRORS), np.array([0.6, 0.8, 0.0, 0.0]))
+    return rot.quat_multiply(rot.quat_about_z(-ERRORS), np.array([0.6, 0.8, 0.0, 0.0]))
 
 
 def forces(quats: np.ndarray) -> np.ndarray:
@@ -58,7 +58,7 @@ def write_recording(path: Path, quats_at: Callable[[float], np.ndarray], seconds
         quats = quats_at(t)
         for i, (q, f) in enumerate(zip(quats, forces(quats), strict=True)):
             samples.append(ImuSample(i, float(t), tuple(q), tuple(f)))
-    write_csv(path, from_samples(samples))
+    write_csv(path, recording_from_samples(samples))
     return path
 
 
@@ -74,8 +74,8 @@ def error_of(result: Result) -> str:
 def assert_recovers(calibration: cal.Calibration, errors: np.ndarray, tolerance_deg: float) -> None:
     """Bones in some other posture come out right, in a body frame that faces forward."""
     bones = rot.rotvec_to_matrix(np.random.default_rng(8).normal(0.0, 0.8, (6, 3)))
-    r_tb, _ = cal.apply(calibration, worn(bones, errors), np.zeros((6, 3)))
-    assert np.degrees(rot.angle_between(r_tb, bones)).max() < tolerance_deg
+    r_tb, _ = cal.apply_calibration(calibration, worn(bones, errors), np.zeros((6, 3)))
+    assert np.degrees(rot.geodesic_angle(r_tb, bones)).max() < tolerance_deg
 
 
 # --- recordings ---------------------------------------------------------------------------------------------
@@ -135,7 +135,7 @@ def test_a_heading_reset_from_a_recording(tmp_path: Path) -> None:
 def test_a_moved_recording_says_who_and_what_to_do(tmp_path: Path) -> None:
     def waving(t: float) -> np.ndarray:
         bones = cal.POSES["straight"].copy()
-        bones[0] = rot.about_axis("x", math.sin(6 * t)) @ bones[0]
+        bones[0] = rot.rotation_about_axis("x", math.sin(6 * t)) @ bones[0]
         return worn(bones)
 
     file = write_recording(tmp_path / "wave.csv", waving)
@@ -278,7 +278,7 @@ def test_a_moved_hold_is_explained_and_repeated(
     def quats(t: float) -> np.ndarray:
         bones = cal.POSES["straight"].copy()
         if swinging:
-            bones[1] = rot.about_axis("x", math.sin(30 * t)) @ bones[1]
+            bones[1] = rot.rotation_about_axis("x", math.sin(30 * t)) @ bones[1]
         return worn(bones)
 
     def check_and_stop(hold: cal.Hold) -> cal.HoldSummary:
@@ -296,7 +296,7 @@ def test_a_moved_hold_is_explained_and_repeated(
 
 def test_after_three_repeats_it_gives_up(wearer: Wearer, tmp_path: Path) -> None:
     def quats(t: float) -> np.ndarray:
-        return worn(rot.about_axis("x", math.sin(30 * t)) @ cal.POSES["straight"])
+        return worn(rot.rotation_about_axis("x", math.sin(30 * t)) @ cal.POSES["straight"])
 
     wearer.quats_at = quats
     result = run("--port", wearer.port, "--hold", 0.4, "--countdown", 0, "--out", tmp_path / "calib.json")

@@ -100,7 +100,7 @@ def test_calibrate_does_not_import_torch(wearer, tmp_path):
 
 def test_models_lists_and_shows_archives_without_torch():
     output, modules = imported("models")
-    for path in archive.shipped():
+    for path in archive.bundled_archives():
         assert re.search(rf"^{path.stem} ", output, re.MULTILINE)
     assert "torch" not in modules
     output, modules = imported("models", "birnn")
@@ -270,14 +270,14 @@ def test_an_archive_that_is_none(fail, wearer, tmp_path):
 
 
 def test_a_truncated_archive(fail, tmp_path):
-    content = archive.find("rnn").read_bytes()
+    content = archive.find_archive("rnn").read_bytes()
     file = tmp_path / "model.pt"
     file.write_bytes(content[:-1000])
     assert f"{file}: not a model archive (no complete zip file)" in fail(model=file)
 
 
 def test_an_archive_of_unknown_sum(fail, tmp_path):
-    content = bytearray(archive.find("rnn").read_bytes())
+    content = bytearray(archive.find_archive("rnn").read_bytes())
     end = content.rindex(b"PK\x05\x06")
     content[end + 20 : end + 22] = (4).to_bytes(2, "little")  # a comment changes only the sum
     file = tmp_path / "model.pt"

@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 from edgepose.cli import cli
 from edgepose.convert import Job, convert, plan
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.base import from_samples, samples
+from edgepose.formats.recordings.base import iter_samples, recording_from_samples
 from edgepose.formats.recordings.csv import write_csv
 from edgepose.formats.recordings.npz import write_npz
 from edgepose.formats.recordings.registry import read_recording, salvage_recording
@@ -42,7 +42,7 @@ DOCS = Path(__file__).parents[3] / "docs" / "guide" / "recordings.md"
 
 
 def rows(count: int = 10) -> list[ImuSample]:
-    return list(samples(read_recording(REAL)))[: 6 * count]
+    return list(iter_samples(read_recording(REAL)))[: 6 * count]
 
 
 def same(a, b, tolerance: float = 0.0) -> None:
@@ -89,7 +89,7 @@ def test_any_recording_to_the_other_kind_and_back(tmp_path_factory, drawn, metad
         # A sample of nothing at all is none.
         quat = (0.6, 0.0, -0.8, 0.0) if oriented or not (acc or gyr or mag) else None
         drawn_rows.append(ImuSample(sensor, times[sensor] * 1e-6, quat, acc, gyr, mag))
-    recording = from_samples(drawn_rows, metadata)
+    recording = recording_from_samples(drawn_rows, metadata)
     # Text of a CSV file sets no terminal.
     write_csv(folder / "a.csv", recording)
     write_npz(folder / "a.npz", recording)
@@ -143,7 +143,7 @@ def test_a_capture_and_a_can_log(command, tmp_path):
     result = command(*("convert", tmp_path / "port.bin", tmp_path / "bus.log"), "--to", "npz", "--out", out)
     assert result.returncode == 0, result.stderr
     assert table(result) == {"port.bin": ["300", "0.5", "ok"], "bus.log": ["300", "0.5", "ok"]}
-    wanted = from_samples(rows(50))
+    wanted = recording_from_samples(rows(50))
     for name, acc in (("port", 5.1e-3), ("bus", 5.1e-3)):
         recording = read_recording(out / f"{name}.npz")
         for a, b in zip(wanted.sensors.values(), recording.sensors.values(), strict=True):
@@ -184,7 +184,9 @@ def xio_session(folder: Path, names: list[str]) -> list[ImuSample]:
 
 def check_xio(file: Path, written: list[ImuSample], left_out: int = 0) -> None:
     recording = read_recording(file)
-    for a, b in zip(from_samples(written).sensors.values(), recording.sensors.values(), strict=True):
+    for a, b in zip(
+        recording_from_samples(written).sensors.values(), recording.sensors.values(), strict=True
+    ):
         kept = np.isin(np.round(a.time_s, 6), np.round(b.time_s, 6))
         assert kept.sum() == len(b.time_s) >= len(a.time_s) - left_out
         np.testing.assert_allclose(a.acc[kept], b.acc, atol=2e-5)
@@ -230,7 +232,7 @@ def test_a_damaged_xio_session(tmp_path):
     assert result.problem == f"{session / 'head'}: 2 bad rows left out"
     recording = salvage_recording(tmp_path / "walk.csv")
     assert np.isnan(recording.sensors["head"].acc).any(axis=1).sum() == 2
-    assert len(list(samples(recording))) == len(written)
+    assert len(list(iter_samples(recording))) == len(written)
     (session / "head" / "Quaternion.csv").write_text("W,X\n")
     assert (
         "starts with 'W,X' and not with 'Timestamp (us)'" in convert(Job(session, tmp_path / "a.csv")).problem
@@ -261,7 +263,7 @@ def test_placements_in_names_of_folders(name, placement):
 
 
 def test_fifty_files_one_of_them_broken_by_two_processes(command, tmp_path):
-    recording = from_samples(rows(), {"rate": "100"})
+    recording = recording_from_samples(rows(), {"rate": "100"})
     folder, out = tmp_path / "in", tmp_path / "out"
     (folder / "deeper").mkdir(parents=True)
     for i in range(25):
@@ -290,7 +292,7 @@ def test_fifty_files_one_of_them_broken_by_two_processes(command, tmp_path):
     written = sorted(path for path in out.rglob("*") if path.is_file())
     assert len(written) == 49
     for path in written:
-        assert len(list(samples(read_recording(path)))) == (59 if path == out / "7.npz" else 60)
+        assert len(list(iter_samples(read_recording(path)))) == (59 if path == out / "7.npz" else 60)
     # Again, for what is missing.
     os.utime(out / "3.npz", (1, 1))
     result = command("convert", folder, "--to", "npz", "--out", out, "--jobs", 2, "--skip-existing")
@@ -420,7 +422,7 @@ def test_a_folder_leaves_no_recording_out(command, tmp_path):
     assert {name: row[0] for name, row in table(result).items()} == {
         "mix": "600", "a.npz": "1800", "b.npz": "1800", "bus.log.gz": "300"
     }  # fmt: skip
-    assert len(list(samples(read_recording(tmp_path / "out" / "mix.csv")))) == len(written)
+    assert len(list(iter_samples(read_recording(tmp_path / "out" / "mix.csv")))) == len(written)
 
 
 def test_a_named_pipe_is_refused(command, tmp_path):

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from edgepose.errors import EdgeposeError, FileFormatError
-from edgepose.formats.recordings.base import samples
+from edgepose.formats.recordings.base import iter_samples
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.utils.safe_pickle import read_pickle
 from firmware_protocols import native_can
@@ -125,8 +125,8 @@ def can_log(path: Path, wearer, **options) -> int:
     count = 0
     seq = dict.fromkeys(range(6), 0)
     with can.Logger(path, **options) as log:
-        for sample in samples(read_recording(wearer.short)):
-            if sample.time_s > 0.5 + next(iter(samples(read_recording(wearer.short)))).time_s:
+        for sample in iter_samples(read_recording(wearer.short)):
+            if sample.time_s > 0.5 + next(iter(iter_samples(read_recording(wearer.short)))).time_s:
                 break
             packet = Packet(
                 sample.sensor, seq[sample.sensor], int(sample.time_s * 1e6), sample.quat, sample.acc

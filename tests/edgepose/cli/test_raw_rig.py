@@ -164,7 +164,7 @@ def test_magnetometers_give_a_north_and_make_a_reset_needless(command, tmp_path)
     calibration = load_calibration(out)
     assert calibration.north
     # Along the bones they were strapped on.
-    angles = rot.angle_between(rot.quat_to_matrix(calibration.bone_from_sensor), np.eye(3))
+    angles = rot.geodesic_angle(rot.quat_to_matrix(calibration.bone_from_sensor), np.eye(3))
     assert np.degrees(angles).max() < 8.0
     result = calibrated(*held, "--no-mag", "--out", tmp_path / "other.json")
     assert "headings are arbitrary" in str(result.exception)

@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.base import from_samples, samples
+from edgepose.formats.recordings.base import iter_samples, recording_from_samples
 from edgepose.formats.recordings.raw_capture import read_capture, times_path
 from edgepose.formats.recordings.registry import read_recording, salvage_recording
 from edgepose.imu import ImuSample
-from edgepose.pipeline.frame_synchronizer import FrameClock
+from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.record import CAN_LOGS, Output, open_output, record
 from edgepose.sources import open_source
 from firmware_protocols import native_can
@@ -41,7 +41,7 @@ class Rig(Sender):
         super().__init__(*ports)
         self.port = self.line.name
         self.silent: set[int] = set()
-        self._rows = list(samples(read_recording(REAL)))
+        self._rows = list(iter_samples(read_recording(REAL)))
 
     def send(self, k: int) -> None:
         at = 6 * k % len(self._rows)
@@ -62,7 +62,7 @@ def until(process: subprocess.Popen[str], file: Path, size: int) -> None:
 
 def good(recording) -> int:
     """Number of samples, after checks that every recording must pass."""
-    rows = list(samples(recording))
+    rows = list(iter_samples(recording))
     assert {row.sensor for row in rows} == set(range(6))
     for data in recording.sensors.values():
         assert (np.diff(data.time_s) > 0).all()
@@ -126,7 +126,7 @@ def test_a_stop_leaves_a_whole_file(tmp_path, name, number):
         code, errors = end(process)
     assert code == 0, errors
     rows = everything(file=file)
-    assert good(from_samples(rows)) == len(rows)
+    assert good(recording_from_samples(rows)) == len(rows)
     assert f"samples  {len(rows)} in " in errors
     assert {path.name for path in tmp_path.iterdir()} == {name} | (
         {f"{name}.times"} if "bin" in name else set()
@@ -199,12 +199,12 @@ def test_a_capture_decoded_again_equals_the_samples(tmp_path, protocol, seconds)
     again = everything(file=tmp_path / "walk.bin", protocol=protocol)
     assert good(written) == sum(summary.samples) == len(live)
     # What a stream holds back at the end comes out of a file only.
-    same(from_samples(again[: len(live)]), from_samples(live), 0.0)
-    same(from_samples(live), written)
+    same(recording_from_samples(again[: len(live)]), recording_from_samples(live), 0.0)
+    same(recording_from_samples(live), written)
     # Frames are those of the live samples, too.
     frames = []
-    for rows in (live, samples(written), again[: len(live)]):
-        clock = FrameClock()
+    for rows in (live, iter_samples(written), again[: len(live)]):
+        clock = FrameSynchronizer()
         clock.push(rows, 0.0)
         frames.append(clock.flush())
     assert len(frames[0]) == len(frames[1]) == len(frames[2]) > 20
@@ -237,7 +237,7 @@ def test_can_logs(tmp_path, ending, fd):
     channel = f"{ending}-{fd}".strip(".")
     packets = [
         Packet(row.sensor, i // 6, int(row.time_s * 1e6), row.quat, row.acc, row.gyr)
-        for i, row in enumerate(list(samples(read_recording(REAL)))[:300])
+        for i, row in enumerate(list(iter_samples(read_recording(REAL)))[:300])
     ]
     live: list[ImuSample] = []
     file = tmp_path / f"walk{ending}"
@@ -299,7 +299,7 @@ def test_kill_in_the_middle(command, tmp_path, name):
             assert good(read_recording(file)) > 20
             return
     rows = everything(file=file)
-    assert good(from_samples(rows)) == len(rows) > 20
+    assert good(recording_from_samples(rows)) == len(rows) > 20
 
 
 def test_a_port_that_is_unplugged(tmp_path):

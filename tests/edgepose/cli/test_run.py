@@ -21,13 +21,13 @@ import numpy as np
 import pytest
 
 from edgepose import rotations as rot
-from edgepose.calibration import apply, load_calibration
+from edgepose.calibration import apply_calibration, load_calibration
 from edgepose.formats.poses.registry import read_poses
-from edgepose.formats.recordings.base import samples
+from edgepose.formats.recordings.base import iter_samples
 from edgepose.formats.recordings.csv import write_csv
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.inference import archive
-from edgepose.pipeline.frame_synchronizer import FrameClock
+from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.placements import PLACEMENTS
 from edgepose.sinks.udp import decode_binary
 from edgepose.skeleton import JOINTS, PARENTS
@@ -69,10 +69,10 @@ def global_rotations(local: np.ndarray) -> np.ndarray:
 def calibrated(wearer, file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Times (T,) and measured bones (T, 6, 3, 3) of a recording."""
     calibration = load_calibration(wearer.calibration)
-    clock = FrameClock()
-    clock.push(samples(read_recording(file)), 0.0)
+    clock = FrameSynchronizer()
+    clock.push(iter_samples(read_recording(file)), 0.0)
     frames = clock.flush()
-    bones = [apply(calibration, f.orientation, f.force)[0] for f in frames]
+    bones = [apply_calibration(calibration, f.orientation, f.force)[0] for f in frames]
     return np.array([f.time_s for f in frames]), np.array(bones)
 
 
@@ -94,7 +94,7 @@ def test_a_recording_with_the_default_model(command, wearer, tmp_path):
     assert result.returncode == 0, result.stderr
     frames, time_s, status, rotations = whole(file)
     assert len(frames) == 720
-    past = archive.inspect(archive.find("birnn")).metadata["past"]
+    past = archive.read_info(archive.find_archive("birnn")).metadata["past"]
     assert status == ["filling window"] * past + ["ok"] * (720 - past)
     assert "poses    720 in " in result.stderr
     assert f"{past} while the window was filling" in result.stderr
@@ -106,11 +106,11 @@ def test_a_recording_with_the_default_model(command, wearer, tmp_path):
     # Bones with sensors are measured, not guessed.
     times, bones = calibrated(wearer, wearer.recording)
     np.testing.assert_allclose(time_s, times, atol=1e-6)
-    angles = rot.angle_between(global_rotations(rotations)[:, BONES], bones)
+    angles = rot.geodesic_angle(global_rotations(rotations)[:, BONES], bones)
     assert np.degrees(angles).max() < 0.01
     # The network is sure of what is measured or at rest and unsure of the rest.
     std = np.array([row[-24:] for row in rows[1:]], float)
-    joints = archive.inspect(archive.find("birnn")).metadata["joints"]
+    joints = archive.read_info(archive.find_archive("birnn")).metadata["joints"]
     predicted = [JOINTS.index(name) for name in joints]
     assert (std[:, predicted] > 0).all()
     assert (np.delete(std, predicted, axis=1) == 0).all()
@@ -164,7 +164,7 @@ def test_a_bidirectional_model_with_its_state_carried_on(command, wearer, tmp_pa
     assert len(frames) == 180
     assert status == ["filling window"] * 7 + ["ok"] * 173
     _, bones = calibrated(wearer, wearer.short)
-    assert np.degrees(rot.angle_between(global_rotations(rotations)[:, BONES], bones)).max() < 0.01
+    assert np.degrees(rot.geodesic_angle(global_rotations(rotations)[:, BONES], bones)).max() < 0.01
 
 
 def test_standard_output_without_past_and_future(command, wearer, tmp_path):
@@ -339,7 +339,7 @@ def test_an_archive_that_torch_cannot_load(command, wearer, broken_archive, tmp_
 def broken_archive(tmp_path):
     """An archive with nothing in it but its description."""
     file = tmp_path / "model.pt"
-    info = archive.inspect(archive.find("rnn"))
+    info = archive.read_info(archive.find_archive("rnn"))
     with zipfile.ZipFile(file, "w") as content:
         content.writestr(f"model/extra/{archive.METADATA_FILE}", json.dumps(info.metadata))
     return file

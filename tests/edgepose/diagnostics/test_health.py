@@ -12,9 +12,9 @@ import pytest
 
 from edgepose import rotations as rot
 from edgepose.calibration import GRAVITY, load_calibration
-from edgepose.diagnostics.rules import Finding, judge
-from edgepose.diagnostics.sensor_health import Health, SensorHealth
-from edgepose.formats.recordings.base import samples
+from edgepose.diagnostics.rules import Diagnosis, diagnose
+from edgepose.diagnostics.sensor_health import SensorHealth, SensorHealthMonitor
+from edgepose.formats.recordings.base import iter_samples
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import ImuSample, SensorData
 from edgepose.placements import PLACEMENTS
@@ -28,21 +28,21 @@ Fault = Callable[[SensorData], SensorData]
 
 def report(rows: list[ImuSample], late_s: float = 0.0, **options: object) -> list[SensorHealth]:
     """Health after samples that came in order, a hundredth of a second at a time."""
-    health = Health(**options)
+    health = SensorHealthMonitor(**options)
     for sample in rows:
         health.add([sample], sample.time_s)
     return health.report(max(sample.time_s for sample in rows) + late_s)
 
 
-def findings(rows: list[ImuSample], **options: object) -> list[Finding]:
-    return [judge(sensor) for sensor in report(rows, **options)]
+def findings(rows: list[ImuSample], **options: object) -> list[Diagnosis]:
+    return [diagnose(sensor) for sensor in report(rows, **options)]
 
 
 def only(sensor: int, fault: Fault, recording) -> list[ImuSample]:
     """A recording's samples, those of one sensor with a fault."""
     name = PLACEMENTS[sensor]
     return list(
-        samples(recording._replace(sensors=recording.sensors | {name: fault(recording.sensors[name])}))
+        iter_samples(recording._replace(sensors=recording.sensors | {name: fault(recording.sensors[name])}))
     )
 
 
@@ -75,8 +75,8 @@ def with_noise(recording, seed: int = 3):
 
 
 def test_real_sensors_are_fine_and_their_numbers_right(still):
-    for sensor, data in zip(report(list(samples(still))), still.sensors.values(), strict=True):
-        assert judge(sensor) == Finding("ok")
+    for sensor, data in zip(report(list(iter_samples(still))), still.sensors.values(), strict=True):
+        assert diagnose(sensor) == Diagnosis("ok")
         force = rot.quat_rotate(data.quat, data.acc)
         assert sensor.samples == 300
         assert sensor.rate_hz == pytest.approx(100.0, rel=1e-3)
@@ -93,15 +93,15 @@ def test_real_sensors_are_fine_and_their_numbers_right(still):
 
 @pytest.mark.parametrize("noise", [False, True])
 def test_a_wearer_who_stands_and_walks_is_fine(moving, noise):
-    rows = list(samples(with_noise(moving) if noise else moving))
-    assert findings(rows) == [Finding("ok")] * 6
+    rows = list(iter_samples(with_noise(moving) if noise else moving))
+    assert findings(rows) == [Diagnosis("ok")] * 6
     for sensor in report(rows):
         assert sensor.gyro_ratio == pytest.approx(1.0, abs=0.05)
         assert sensor.gyro_agreement > 0.95
 
 
 def test_nothing_is_said_of_rest_while_all_moves(moving):
-    rows = [s for s in samples(with_noise(moving)) if s.time_s > 9.5 and s.sensor != HEAD]
+    rows = [s for s in iter_samples(with_noise(moving)) if s.time_s > 9.5 and s.sensor != HEAD]
     found = findings(rows)
     assert found[0].name == "ok, moving"
     assert not found[0].problem
@@ -109,7 +109,7 @@ def test_nothing_is_said_of_rest_while_all_moves(moving):
 
 
 def test_raw_sensors_are_told_how_to_go_on(still):
-    (found,) = set(findings([s._replace(quat=None) for s in samples(still)]))
+    (found,) = set(findings([s._replace(quat=None) for s in iter_samples(still)]))
     assert found.name == "ok, raw"
     assert "--filter" in found.advice
     assert not found.problem
@@ -192,23 +192,25 @@ def test_a_fault_at_rest_gives_its_advice(still, name, fault, says):
     assert found[HEAD].name == name, found[HEAD]
     assert says in found[HEAD].advice
     assert found[HEAD].problem
-    assert found[:HEAD] + found[HEAD + 1 :] == [Finding("ok")] * 5
+    assert found[:HEAD] + found[HEAD + 1 :] == [Diagnosis("ok")] * 5
 
 
 def test_earth_field_is_fine(still):
     field = rot.quat_rotate(rot.quat_conjugate(still.sensors["head"].quat), np.array([0.0, 20.0, -40.0]))
     sensor = report(only(HEAD, lambda d: d._replace(mag=field), still))[HEAD]
-    assert judge(sensor) == Finding("ok")
+    assert diagnose(sensor) == Diagnosis("ok")
     assert sensor.field_ut == pytest.approx(math.hypot(20, 40))
 
 
 def test_no_sample_at_all():
-    health = Health()
-    assert {judge(sensor).name for sensor in health.report(5.0)} == {"no packets"}
+    health = SensorHealthMonitor()
+    assert {diagnose(sensor).name for sensor in health.report(5.0)} == {"no packets"}
 
 
 def test_a_sensor_that_falls_silent(still):
-    rows = [s for s in samples(still) if s.sensor != HEAD or s.time_s < still.sensors["head"].time_s[150]]
+    rows = [
+        s for s in iter_samples(still) if s.sensor != HEAD or s.time_s < still.sensors["head"].time_s[150]
+    ]
     found = findings(rows)
     assert found[HEAD].name == "silent"
     assert "nothing for 1.5 s" in found[HEAD].advice
@@ -242,10 +244,10 @@ def test_a_sensor_that_hangs(still):
 
 
 def test_packets_in_bursts(moving):
-    health = Health()
-    for sample in samples(moving):
+    health = SensorHealthMonitor()
+    for sample in iter_samples(moving):
         health.add([sample], math.ceil(sample.time_s / 0.06) * 0.06)
-    found = [judge(sensor) for sensor in health.report(12.0)]
+    found = [diagnose(sensor) for sensor in health.report(12.0)]
     assert {f.name for f in found} == {"late"}
     assert "latency timer" in found[0].advice
 
@@ -293,7 +295,7 @@ def test_a_fault_in_motion_gives_its_advice(moving, name, fault, says):
     found = findings(only(arm, fault, with_noise(moving)))
     assert found[arm].name == name, found[arm]
     assert says in found[arm].advice
-    assert found[:arm] + found[arm + 1 :] == [Finding("ok")] * 5
+    assert found[:arm] + found[arm + 1 :] == [Diagnosis("ok")] * 5
 
 
 # --- headings and placements --------------------------------------------------------------------------------
@@ -304,7 +306,7 @@ def lying(headings_deg: list[float], noise: float = 0.01) -> list[ImuSample]:
     rng = np.random.default_rng(5)
     data = {}
     for name, heading in zip(PLACEMENTS, headings_deg, strict=True):
-        quat = rot.quat_multiply(rot.about_z(math.radians(heading)), rot.rotvec_to_quat([0.02, 0.01, 0]))
+        quat = rot.quat_multiply(rot.quat_about_z(math.radians(heading)), rot.rotvec_to_quat([0.02, 0.01, 0]))
         up = rot.quat_rotate(rot.quat_conjugate(quat), [0.0, 0.0, GRAVITY])
         n = 300
         data[name] = SensorData(
@@ -314,29 +316,29 @@ def lying(headings_deg: list[float], noise: float = 0.01) -> list[ImuSample]:
             rng.normal(scale=0.001, size=(n, 3)),
         )
     recording = read_recording(REAL)
-    return list(samples(recording._replace(sensors=data)))
+    return list(iter_samples(recording._replace(sensors=data)))
 
 
 def test_headings_on_a_table():
     rows = report(lying([90, 93, 88, 90, 150, 91]))
     assert [row.heading_on for row in rows] == ["table"] * 6
     assert rows[HEAD].heading_deg == pytest.approx(60, abs=0.5)
-    assert [judge(row).name for row in rows] == ["ok"] * 4 + ["heading", "ok"]
-    assert "+60 deg" in judge(rows[HEAD]).advice
-    assert "--heading-reset" in judge(rows[HEAD]).advice
+    assert [diagnose(row).name for row in rows] == ["ok"] * 4 + ["heading", "ok"]
+    assert "+60 deg" in diagnose(rows[HEAD]).advice
+    assert "--heading-reset" in diagnose(rows[HEAD]).advice
 
 
 def test_headings_across_the_turn():
     rows = report(lying([179, -179, 178, -178, 180, 177]))
     assert max(abs(row.heading_deg) for row in rows) < 4
-    assert {judge(row).name for row in rows} == {"ok"}
+    assert {diagnose(row).name for row in rows} == {"ok"}
 
 
 def test_a_wearer_who_stands_in_the_pose_again(moving, wearer):
     calibration = load_calibration(wearer.calibration)
-    standing = [s for s in samples(moving) if s.time_s < 4.0]
+    standing = [s for s in iter_samples(moving) if s.time_s < 4.0]
     for turn, sensor, name in ((0.0, HEAD, "ok"), (50.0, HEAD, "heading"), (-50.0, 2, "heading")):
-        wrong = rot.about_z(math.radians(turn))
+        wrong = rot.quat_about_z(math.radians(turn))
         rows = [
             s._replace(quat=tuple(rot.quat_multiply(wrong, s.quat))) if s.sensor == sensor else s
             for s in standing
@@ -344,15 +346,17 @@ def test_a_wearer_who_stands_in_the_pose_again(moving, wearer):
         found = report(rows, calibration=calibration)
         assert found[sensor].heading_on == "body"
         assert found[sensor].heading_deg == pytest.approx(turn, abs=1.0)
-        assert judge(found[sensor]).name == name
-        assert {judge(own).name for i, own in enumerate(found) if i != sensor} == {"ok"}
+        assert diagnose(found[sensor]).name == name
+        assert {diagnose(own).name for i, own in enumerate(found) if i != sensor} == {"ok"}
 
 
 def test_two_sensors_that_were_swapped(moving, wearer):
     calibration = load_calibration(wearer.calibration)
     a, b = PLACEMENTS.index("left_forearm"), PLACEMENTS.index("pelvis")
     exchange = {a: b, b: a}
-    rows = [s._replace(sensor=exchange.get(s.sensor, s.sensor)) for s in samples(moving) if s.time_s < 4.0]
+    rows = [
+        s._replace(sensor=exchange.get(s.sensor, s.sensor)) for s in iter_samples(moving) if s.time_s < 4.0
+    ]
     found = findings(rows, calibration=calibration)
     assert [f.name for f in found] == ["placement", *["ok"] * 4, "placement"]
     assert "where pelvis was calibrated" in found[a].advice
@@ -371,10 +375,10 @@ def test_a_clock_that_drifts(ppm, name):
     measured, error = clock.drift_ppm()
     assert measured == pytest.approx(ppm, abs=20.0)
     assert error < 20.0
-    health = Health()
+    health = SensorHealthMonitor()
     health.add(lying([0.0] * 6))
     own = health.report(3.0, {HEAD: clock})[HEAD]
-    assert judge(own).name == name
+    assert diagnose(own).name == name
 
 
 def test_a_clock_that_began_anew():
@@ -382,9 +386,9 @@ def test_a_clock_that_began_anew():
     for count in range(100):
         clock.host_time(count % 50 * 10_000, count * 0.01)
     assert math.isnan(clock.drift_ppm()[0])
-    health = Health()
+    health = SensorHealthMonitor()
     health.add(lying([0.0] * 6))
-    found = judge(health.report(3.0, {HEAD: clock})[HEAD])
+    found = diagnose(health.report(3.0, {HEAD: clock})[HEAD])
     assert found.name == "restarts"
     assert "1 times" in found.advice
 
@@ -394,7 +398,7 @@ def test_a_clock_that_began_anew():
 
 def test_rubbish_raises_nothing():
     rng = np.random.default_rng(7)
-    health = Health()
+    health = SensorHealthMonitor()
     values = [0.0, 1.0, -1.0, math.nan, math.inf, -math.inf, 1e300, 1e-300]
     for count in range(3000):
         pick = [tuple(rng.choice(values, n)) if rng.random() > 0.2 else None for n in (4, 3, 3, 3)]
@@ -402,13 +406,13 @@ def test_rubbish_raises_nothing():
         with np.errstate(all="ignore"):
             health.add([ImuSample(int(rng.integers(6)), time_s, *pick)], time_s)
     with np.errstate(all="ignore"):
-        found = [judge(sensor) for sensor in health.report(30.0)]
+        found = [diagnose(sensor) for sensor in health.report(30.0)]
     assert all(f.problem for f in found)
 
 
 def test_the_same_however_the_samples_come(moving):
-    rows = list(samples(with_noise(moving)))
-    one, other = Health(), Health()
+    rows = list(iter_samples(with_noise(moving)))
+    one, other = SensorHealthMonitor(), SensorHealthMonitor()
     one.add(rows)
     for sample in rows:
         other.add([sample])

@@ -35,7 +35,7 @@ from edgepose.formats.recordings.totalcapture import NAMES
 from edgepose.formats.registered import plugin_formats
 from edgepose.imu import Recording, SensorData
 from edgepose.placements import PLACEMENTS
-from edgepose.rotations import Z_UP_TO_T, angle_between, quat_rotate, quat_to_matrix
+from edgepose.rotations import Z_UP_TO_T, geodesic_angle, quat_rotate, quat_to_matrix
 from firmware_protocols import sample
 
 FRAMES, RATE = 90, 60
@@ -182,7 +182,7 @@ def test_what_is_read(name, files, original):
     for found, wanted in zip(recording.sensors.values(), original.sensors.values(), strict=True):
         np.testing.assert_allclose(found.time_s, wanted.time_s, atol=1e-6)
         np.testing.assert_allclose(found.acc, wanted.acc, atol=1e-4)
-        turns = angle_between(quat_to_matrix(found.quat), quat_to_matrix(wanted.quat))
+        turns = geodesic_angle(quat_to_matrix(found.quat), quat_to_matrix(wanted.quat))
         assert turns.max() < 1e-5
 
 
@@ -199,7 +199,7 @@ def test_calibrate(name, files, tmp_path):
         )
         found.append(load_calibration(out))
     assert found[0].metadata["source"] == str(files[name])
-    turns = angle_between(*(quat_to_matrix(calibration.bone_from_sensor) for calibration in found))
+    turns = geodesic_angle(*(quat_to_matrix(calibration.bone_from_sensor) for calibration in found))
     assert turns.max() < 1e-4
 
 
@@ -221,7 +221,7 @@ def same_poses(found: np.ndarray, wanted: np.ndarray) -> None:
     # Times are rounded to a microsecond, which costs the last frame where it is that of the last sample.
     assert {len(found), len(wanted)} <= {FRAMES, FRAMES - 1}
     count = min(len(found), len(wanted))
-    assert angle_between(found[:count], wanted[:count]).max() < 2e-3
+    assert geodesic_angle(found[:count], wanted[:count]).max() < 2e-3
 
 
 @every_format

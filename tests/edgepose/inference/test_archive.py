@@ -45,7 +45,7 @@ def metadata_of(path):
 
 def fails(path, message):
     with pytest.raises(EdgeposeError, match=message) as caught:
-        archive.inspect(path)
+        archive.read_info(path)
     assert "\n" not in str(caught.value)
     assert str(path) in str(caught.value)
 
@@ -54,7 +54,7 @@ def fails(path, message):
 
 
 def test_inspect(made):
-    info = archive.inspect(made)
+    info = archive.read_info(made)
     assert info.path == made
     assert info.sha256 == hashlib.sha256(made.read_bytes()).hexdigest()
     assert not info.trusted
@@ -93,8 +93,8 @@ def test_one_byte_changed_is_another_sum(tmp_path, made):
     content[len(content) // 2] ^= 1
     path = tmp_path / "changed.pt"
     path.write_bytes(content)
-    info = archive.inspect(path)
-    assert archive.inspect(made).trusted
+    info = archive.read_info(path)
+    assert archive.read_info(made).trusted
     assert not info.trusted
     with pytest.raises(EdgeposeError, match=r"is not known.*--trust"):
         archive.load(info)
@@ -140,21 +140,21 @@ def test_endless_metadata_is_not_unpacked(tmp_path):
 
 
 def test_find(tmp_path, made, monkeypatch):
-    assert archive.find(str(made)) == made
+    assert archive.find_archive(str(made)) == made
     monkeypatch.chdir(made.parent)
-    assert archive.find("small.pt") == Path("small.pt")
+    assert archive.find_archive("small.pt") == Path("small.pt")
     with pytest.raises(EdgeposeError, match="no such model; shipped are"):
-        archive.find(str(tmp_path / "none.pt"))
-    for path in archive.shipped():
-        assert archive.find(path.stem) == path
-        assert archive.inspect(path).trusted
+        archive.find_archive(str(tmp_path / "none.pt"))
+    for path in archive.bundled_archives():
+        assert archive.find_archive(path.stem) == path
+        assert archive.read_info(path).trusted
 
 
 # --- trust --------------------------------------------------------------------------------------------------
 
 
 def test_unknown_archive_is_not_loaded_unless_vouched_for(made):
-    info = archive.inspect(made)
+    info = archive.read_info(made)
     with pytest.raises(EdgeposeError, match="loading a model archive runs its code") as caught:
         archive.load(info)
     assert info.sha256[:16] in str(caught.value)
@@ -170,10 +170,10 @@ def test_trusted_list_is_the_users_own(tmp_path, made):
     assert archive.trust_file() == listed
     assert not listed.exists()
     assert archive.trust(made).trusted
-    assert listed.read_text().split() == [archive.inspect(made).sha256, "small.pt"]
+    assert listed.read_text().split() == [archive.read_info(made).sha256, "small.pt"]
     archive.trust(made)
     assert len(listed.read_text().split()) == 2  # once is enough
-    assert archive.load(archive.inspect(made)) is not None
+    assert archive.load(archive.read_info(made)) is not None
 
 
 def test_list_without_a_last_line_break_and_with_other_text(tmp_path, made):
@@ -181,7 +181,7 @@ def test_list_without_a_last_line_break_and_with_other_text(tmp_path, made):
     listed.parent.mkdir(parents=True)
     listed.write_bytes(b"# mine\n\xff\n\n" + b"0" * 64 + b"  other.pt")
     archive.trust(made)
-    assert archive.inspect(made).trusted
+    assert archive.read_info(made).trusted
     assert "0" * 64 in listed.read_text(errors="replace").split()
 
 
@@ -202,7 +202,7 @@ def test_list_that_cannot_be_written(tmp_path, made):
 def test_archive_that_changes_after_its_inspection(tmp_path, made):
     path = tmp_path / "small.pt"
     path.write_bytes(made.read_bytes())
-    info = archive.inspect(path)
+    info = archive.read_info(path)
     path.write_bytes(made.read_bytes() + b" ")
     with pytest.raises(EdgeposeError, match="changed while"):
         archive.load(info, trust=True)
@@ -213,7 +213,7 @@ def test_trusted_archive_that_torch_cannot_load(tmp_path, made):
     with zipfile.ZipFile(path, "w") as file:
         file.writestr("empty/extra/edgepose.json", json.dumps(metadata_of(made)))
     with pytest.raises(EdgeposeError, match="torch cannot load the archive") as caught:
-        archive.load(archive.inspect(path), trust=True)
+        archive.load(archive.read_info(path), trust=True)
     assert "\n" not in str(caught.value)
 
 
@@ -246,7 +246,7 @@ def test_code_of_a_stranger_is_not_run(tmp_path, made):
     module = torch.jit.script(Writer(str(target)))
     torch.jit.save(module, str(path), _extra_files={archive.METADATA_FILE: json.dumps(metadata_of(made))})
     target.unlink(missing_ok=True)
-    info = archive.inspect(path)
+    info = archive.read_info(path)
     with pytest.raises(EdgeposeError, match="is not known"):
         archive.load(info)
     shown = CliRunner().invoke(cli, ["models", str(path)])

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from edgepose.inference.engine import BatchEngine, Body, EngineOutput, StreamEngine, WindowEngine
+from edgepose.inference.engine import EngineInput, EngineOutput, MultiWearerEngine, StreamEngine, WindowEngine
 from edgepose_export.networks.shape import NetworkShape
 
 BIRNN = NetworkShape("birnn", 8, "global-6d", "passed")
@@ -24,10 +24,10 @@ def run(engine, orientation, acceleration):
 
 def check_frames(result, frames, future, past):
     outputs, counts, last = result
-    assert [output.tag for output in outputs] == list(range(frames))
+    assert [output.frame for output in outputs] == list(range(frames))
     assert counts == [int(t >= future) for t in range(frames)]
     assert last == min(future, frames)
-    assert [output.filling for output in outputs] == [t < past for t in range(frames)]
+    assert [output.warming_up for output in outputs] == [t < past for t in range(frames)]
     for output in outputs:
         assert isinstance(output, EngineOutput)
         assert output.rotations.shape == (24, 3, 3)
@@ -109,9 +109,9 @@ def test_frames_together_give_what_they_give_one_by_one(tiny, wearers, shape, fr
     alone, _, _ = run(StreamEngine(tiny(shape), 3, future), orientation, acceleration)
     together, counts, _ = run(StreamEngine(tiny(shape), 3, future, 4), orientation, acceleration)
     assert counts == [(4 if t > 3 else 4 - future) if t % 4 == 3 else 0 for t in range(frames)]
-    assert [output.tag for output in together] == list(range(frames))
+    assert [output.frame for output in together] == list(range(frames))
     for a, b in zip(alone, together, strict=True):
-        assert a.filling == b.filling
+        assert a.warming_up == b.warming_up
         np.testing.assert_allclose(a.rotations, b.rotations, atol=2e-5)
         np.testing.assert_allclose(a.std, b.std, atol=2e-5)
 
@@ -133,7 +133,9 @@ def together(engine, spans, orientation, acceleration):
         for wearer, own in enumerate(spans):
             if any(start <= step < stop for start, stop in own):
                 t = seen[wearer]
-                bodies[wearer] = Body(t, orientation[wearer, t].numpy(), acceleration[wearer, t].numpy())
+                bodies[wearer] = EngineInput(
+                    t, orientation[wearer, t].numpy(), acceleration[wearer, t].numpy()
+                )
                 seen[wearer] += 1
         for wearer, due in engine.push(bodies).items():
             outputs[wearer] += due
@@ -158,7 +160,7 @@ def test_wearers_together_get_the_poses_that_each_gets_alone(tiny, wearers, shap
     orientation, acceleration = wearers(len(spans), 14)
     future = 0 if shape.kind == "rnn" else 3
     module = tiny(shape)
-    engine = BatchEngine(module, 4, future, len(spans), apart)
+    engine = MultiWearerEngine(module, 4, future, len(spans), apart)
     outputs, seen = together(engine, spans, orientation, acceleration)
     assert seen == [14, 7, 8, 2, 1]
     for wearer, own in enumerate(outputs):
@@ -166,8 +168,8 @@ def test_wearers_together_get_the_poses_that_each_gets_alone(tiny, wearers, shap
         alone, _, _ = run(
             StreamEngine(module, 4, future), orientation[wearer, frames], acceleration[wearer, frames]
         )
-        assert [output.tag for output in own] == list(range(seen[wearer]))
-        assert [output.filling for output in own] == [output.filling for output in alone]
+        assert [output.frame for output in own] == list(range(seen[wearer]))
+        assert [output.warming_up for output in own] == [output.warming_up for output in alone]
         for a, b in zip(own, alone, strict=True):
             np.testing.assert_allclose(a.rotations, b.rotations, atol=1e-5)
             np.testing.assert_allclose(a.std, b.std, atol=1e-5)
@@ -188,7 +190,7 @@ def test_a_step_is_one_pass_of_the_network_for_all(tiny, wearers):
             return getattr(self.module, name)
 
     module = Counting(tiny(BIRNN))
-    engine = BatchEngine(module, 0, 2, 3)
+    engine = MultiWearerEngine(module, 0, 2, 3)
     module.rows.clear()
     together(engine, [[(0, 6)], [(1, 6)], [(1, 6)]], *wearers(3, 6))
     assert module.rows == [1, 1, 2, 1, 2, 3, 3, 3]

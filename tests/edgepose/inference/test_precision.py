@@ -16,7 +16,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.registry import read_poses
 from edgepose.inference import archive
 from edgepose.inference.engine import StreamEngine
-from edgepose.inference.quantisation import pack, pack_weights
+from edgepose.inference.quantisation import pack_weights, quantise_weights
 from edgepose.skeleton import UNOBSERVED
 from edgepose_export.archive.torchscript import save, script
 from edgepose_export.evaluation.evaluate import Mode, run_archive, takes_of
@@ -78,25 +78,25 @@ def test_packed_archive(tmp_path, parts, wearers, write_archive):
     small, large = tmp_path / "small.pt", write_archive(tmp_path / "large.pt", BIRNN)
     module = script(*parts(BIRNN))
     pack_weights(module, "int8")
-    save(module, small, archive.inspect(large).metadata | {"precision": "int8"})
+    save(module, small, archive.read_info(large).metadata | {"precision": "int8"})
     assert small.stat().st_size < 0.8 * large.stat().st_size
-    info = archive.inspect(small)
+    info = archive.read_info(small)
     loaded = archive.load(info, trust=True)
     with torch.no_grad():
         for a, b in zip(loaded(*wearers(1, 6)), module(*wearers(1, 6)), strict=True):
             torch.testing.assert_close(a, b, rtol=0, atol=0)
-    assert pack(loaded, info) == pack(loaded, info, "int8") == "int8"
+    assert quantise_weights(loaded, info) == quantise_weights(loaded, info, "int8") == "int8"
     with pytest.raises(EdgeposeError, match="its weights are int8; export it again for fp16"):
-        pack(loaded, info, "fp16")
+        quantise_weights(loaded, info, "fp16")
 
 
 def test_choice_of_a_run(tmp_path, write_archive):
-    info = archive.inspect(write_archive(tmp_path / "small.pt", RNN))
+    info = archive.read_info(write_archive(tmp_path / "small.pt", RNN))
     said = []
-    assert pack(archive.load(info, trust=True), info, "f32", said.append) == "f32"
-    assert pack(archive.load(info, trust=True), info, "int8", said.append) == "int8"
+    assert quantise_weights(archive.load(info, trust=True), info, "f32", said.append) == "f32"
+    assert quantise_weights(archive.load(info, trust=True), info, "int8", said.append) == "int8"
     module = archive.load(info, trust=True)
-    chosen = pack(module, info, "auto", said.append)
+    chosen = quantise_weights(module, info, "auto", said.append)
     # fp16 products are FBGEMM's; where torch has none, the run says so and goes on.
     has_fp16 = "fbgemm" in torch.backends.quantized.supported_engines
     assert chosen == ("fp16" if has_fp16 else "f32")
@@ -106,15 +106,15 @@ def test_choice_of_a_run(tmp_path, write_archive):
 
 
 def test_networks_that_have_f32_only(tmp_path, write_archive):
-    info = archive.inspect(
+    info = archive.read_info(
         write_archive(tmp_path / "field.pt", NetworkShape("feed-forward", 8, "global-6d", "passed"))
     )
     said = []
-    assert pack(archive.load(info, trust=True), info, "auto", said.append) == "f32"
+    assert quantise_weights(archive.load(info, trust=True), info, "auto", said.append) == "f32"
     assert len(said) == 1
     assert "without recurrence" in said[0]
     with pytest.raises(EdgeposeError, match="use --precision f32"):
-        pack(archive.load(info, trust=True), info, "int8")
+        quantise_weights(archive.load(info, trust=True), info, "int8")
 
 
 def test_comparison_of_precisions(tmp_path, parts, make_takes):
@@ -202,19 +202,19 @@ def raspberry(monkeypatch):
 
 
 def test_without_products_of_fp16_auto_is_f32(tmp_path, write_archive, raspberry):
-    info = archive.inspect(write_archive(tmp_path / "a.pt", RNN))
+    info = archive.read_info(write_archive(tmp_path / "a.pt", RNN))
     told = []
-    assert pack(archive.load(info, trust=True), info, "auto", told.append) == "f32"
+    assert quantise_weights(archive.load(info, trust=True), info, "auto", told.append) == "f32"
     assert told == []
     with pytest.raises(
         EdgeposeError, match=r"a\.pt: this processor has no products of fp16 .*--precision f32"
     ):
-        pack(archive.load(info, trust=True), info, "fp16", told.append)
-    assert pack(archive.load(info, trust=True), info, "int8", told.append) == "int8"
+        quantise_weights(archive.load(info, trust=True), info, "fp16", told.append)
+    assert quantise_weights(archive.load(info, trust=True), info, "int8", told.append) == "int8"
     assert told == ["warning: int8 is many times slower than f32 on aarch64; use --precision f32"]
 
 
 def test_without_products_of_fp16_an_archive_of_them_is_refused(tmp_path, write_archive, raspberry):
-    info = archive.inspect(write_archive(tmp_path / "a.pt", RNN, precision="fp16"))
+    info = archive.read_info(write_archive(tmp_path / "a.pt", RNN, precision="fp16"))
     with pytest.raises(EdgeposeError, match=r"no products of fp16 numbers.*export it again in f32"):
-        pack(archive.load(info, trust=True), info)
+        quantise_weights(archive.load(info, trust=True), info)

@@ -52,7 +52,7 @@ def simulate(times, seed=0, turn=2.0, speed=0.3, still=(), bias=0.5, push=None, 
     steps = turn * waves((grid[1:] + grid[:-1]) / 2, slice(0, 3)) * np.diff(grid)[:, None]
     quats = [tuple(rot.rotvec_to_quat([0.4, -0.8, 0.0]).tolist())]
     for step in steps.tolist():
-        quats.append(rot.turn(quats[-1], *step))
+        quats.append(rot.integrate_rotvec(quats[-1], *step))
     quat = np.array(quats)[::parts]
     velocity = speed * waves(times, slice(3, 6))
     if push:

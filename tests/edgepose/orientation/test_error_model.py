@@ -16,7 +16,7 @@ def integrate(state, gyr, acc):
     quat, bias, velocity, acc_bias, scale = state
     middles = []
     for dt, rate, force in zip(DT, gyr, acc, strict=True):
-        turned = np.array(rot.turn(tuple(quat), *(((1 - scale) * rate - bias) * dt).tolist()))
+        turned = np.array(rot.integrate_rotvec(tuple(quat), *(((1 - scale) * rate - bias) * dt).tolist()))
         middle = (quat + turned) / np.linalg.norm(quat + turned)
         velocity = velocity + (rot.quat_rotate(middle, force - acc_bias) - [0, 0, STANDARD_G]) * dt
         quat = turned
@@ -78,4 +78,4 @@ def test_turn_is_the_product_with_a_rotation_vector():
         quat /= np.linalg.norm(quat)
         vector = size * rng.normal(size=3)
         expected = rot.quat_multiply(quat, rot.rotvec_to_quat(vector))
-        np.testing.assert_allclose(rot.turn(tuple(quat), *vector.tolist()), expected, atol=1e-12)
+        np.testing.assert_allclose(rot.integrate_rotvec(tuple(quat), *vector.tolist()), expected, atol=1e-12)

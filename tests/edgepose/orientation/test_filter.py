@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edgepose import rotations as rot
-from edgepose.orientation import Event, FilterSettings, OrientationFilter, Oriented
+from edgepose.orientation import Event, FilterSettings, OrientationFilter, OrientationResult
 from edgepose.orientation.vqf_filter import VqfFilter
 
 FILTERS = [OrientationFilter, VqfFilter]
@@ -21,7 +21,7 @@ def in_chunks(make, columns, sizes):
     for size in sizes:
         parts.append(own.update(*(None if c is None else c[start : start + size] for c in columns)))
         start += size
-    return Oriented(*map(np.concatenate, zip(*parts, strict=True)))
+    return OrientationResult(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 # --- accuracy -----------------------------------------------------------------------------------------------
@@ -76,9 +76,11 @@ def test_it_knows_how_wrong_it_is(simulate):
 def test_without_a_magnetometer_heading_starts_at_zero(simulate, angles):
     data = simulate(np.arange(0, 20, 0.01), seed=4, still=[(0, 4)])
     result = OrientationFilter().update(*data.measured[:3])
-    assert rot.heading(result.quat[0]) == pytest.approx(0.0, abs=1e-9)
+    assert rot.yaw_of_quat(result.quat[0]) == pytest.approx(0.0, abs=1e-9)
     assert rms(angles(result.quat, data.quat)[1][data.time_s > 4]) < 0.6
-    drift = np.rad2deg(np.unwrap(rot.heading(rot.quat_multiply(result.quat, rot.quat_conjugate(data.quat)))))
+    drift = np.rad2deg(
+        np.unwrap(rot.yaw_of_quat(rot.quat_multiply(result.quat, rot.quat_conjugate(data.quat))))
+    )
     assert abs(drift[-1] - drift[400]) < 2.0
     assert not result.disturbed.any()
 
@@ -92,7 +94,7 @@ def test_axes_are_east_north_up():
     np.testing.assert_allclose(np.abs(flat.quat[[0, -1], 0]), 1.0, atol=1e-6)
     # Its X to the north: turned by 90 degrees from there.
     north = OrientationFilter().update(np.arange(count) / 100, still, up, np.tile([20.0, 0, -40], (count, 1)))
-    np.testing.assert_allclose(rot.heading(north.quat[[0, -1]]), np.pi / 2, atol=1e-6)
+    np.testing.assert_allclose(rot.yaw_of_quat(north.quat[[0, -1]]), np.pi / 2, atol=1e-6)
 
 
 @pytest.mark.parametrize("force", [(0, 0, -9.81), (0, 0, 0), (9.81, 0, 0)], ids=str)
@@ -224,7 +226,7 @@ def test_steady_turning_is_no_rest_once_the_bias_is_known():
     result = OrientationFilter().update(np.arange(count) / 100, gyr, np.tile([0, 0, 9.81], (count, 1)))
     assert result.rest[700]
     assert not result.rest[850:].any()
-    assert np.rad2deg(rot.heading(result.quat[-1])) == pytest.approx(72.0, abs=3.0)
+    assert np.rad2deg(rot.yaw_of_quat(result.quat[-1])) == pytest.approx(72.0, abs=3.0)
 
 
 @pytest.mark.parametrize(("acceleration", "seconds"), [(3.0, 3.0), (10.0, 1.0)])
@@ -280,7 +282,7 @@ def test_a_new_field_is_accepted_in_the_end(simulate):
     result = OrientationFilter().update(*data.measured[:3], np.where(later[:, None], field, data.mag))
     assert result.disturbed[(data.time_s > 21) & (data.time_s < 35)].all()
     assert not result.disturbed[data.time_s > 70].any()
-    error = rot.heading(rot.quat_multiply(result.quat[-500:], rot.quat_conjugate(data.quat[-500:])))
+    error = rot.yaw_of_quat(rot.quat_multiply(result.quat[-500:], rot.quat_conjugate(data.quat[-500:])))
     # North is where the new field points: 36.9 degrees east of the old one.
     assert np.rad2deg(error).mean() == pytest.approx(36.9, abs=10.0)
 
@@ -304,7 +306,7 @@ def test_magnetometer_that_comes_later(simulate, angles):
     data = simulate(np.arange(0, 30, 0.01), seed=6, still=[(0, 4)])
     mag = np.where(data.time_s[:, None] < 10, np.nan, data.mag)
     result = OrientationFilter().update(*data.measured[:3], mag)
-    assert rot.heading(result.quat[0]) == pytest.approx(0.0, abs=1e-9)
+    assert rot.yaw_of_quat(result.quat[0]) == pytest.approx(0.0, abs=1e-9)
     assert rms(angles(result.quat, data.quat)[0][data.time_s > 15]) < 2.0
     assert not result.flagged.any()
 
@@ -347,6 +349,6 @@ def test_vqf_keeps_its_heading_over_a_gap_while_it_learns_the_rate(gap_at):
     time_s = np.arange(200) * 0.01
     time_s[gap_at:] += 2.0
     gyr, acc = np.tile([0.0, 0.0, turning], (200, 1)), np.tile([0.0, 0.0, 9.81], (200, 1))
-    headings = np.unwrap(rot.heading(VqfFilter().update(time_s, gyr, acc).quat))
+    headings = np.unwrap(rot.yaw_of_quat(VqfFilter().update(time_s, gyr, acc).quat))
     # Nobody knows how far it turned in the gap; after it, each sample turns by a degree.
     assert np.abs(np.diff(headings[gap_at:]) - 0.01 * turning).max() < np.deg2rad(1.5)

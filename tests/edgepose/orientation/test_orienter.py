@@ -11,10 +11,10 @@ from edgepose import rotations as rot
 from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings import xio_session as xio
-from edgepose.formats.recordings.base import samples
+from edgepose.formats.recordings.base import iter_samples
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import ImuSample, Recording, SensorData
-from edgepose.orientation import Event, OrientationFilter, Orienter, smooth
+from edgepose.orientation import Event, OrientationEstimator, OrientationFilter, smooth
 from edgepose.orientation.offline import orient_recording
 from edgepose.orientation.vqf_filter import VqfFilter
 
@@ -42,7 +42,7 @@ def samples_of(sensor, data, count, mag=True):
 def test_each_sensor_has_its_own_filter(worn, kind, make, size):
     both = [samples_of(4, worn, 500), samples_of(1, worn.rows(slice(1000, 1500)), 500, mag=False)]
     mixed = [sample for pair in zip(*both, strict=True) for sample in pair]
-    orienter = Orienter(kind)
+    orienter = OrientationEstimator(kind)
     result = [s for start in range(0, 1000, size) for s in orienter.orient(mixed[start : start + size])]
     assert [s[:2] + s[3:] for s in result] == [s[:2] + s[3:] for s in mixed]
     first = make().update(*worn.rows(slice(0, 500)).measured)
@@ -62,21 +62,21 @@ def test_samples_without_a_rate_keep_what_they_have(worn):
         # A magnetometer with messages of its own, before those of the rest.
         parts += [ImuSample(0, sample.time_s, mag=sample.mag), sample._replace(mag=None)]
     parts.insert(100, ImuSample(0, 1.0, DEVICE, acc=(0.0, 0.0, 9.8)))
-    result = Orienter().orient(parts)
+    result = OrientationEstimator().orient(parts)
     assert result[100] == parts[100]
-    expected = Orienter().orient(whole)
+    expected = OrientationEstimator().orient(whole)
     oriented = [sample for sample in result if sample.gyr is not None]
     np.testing.assert_allclose([s.quat for s in oriented], [s.quat for s in expected], atol=1e-9)
 
 
 def test_magnetometers_can_be_left_out(worn):
-    result = Orienter(magnetometer=False).orient(samples_of(2, worn, 300))
+    result = OrientationEstimator(magnetometer=False).orient(samples_of(2, worn, 300))
     expected = OrientationFilter().update(*worn.rows(slice(0, 300)).measured[:3])
     np.testing.assert_allclose([s.quat for s in result], expected.quat, atol=1e-12)
 
 
 def test_status_counts_events(worn):
-    orienter = Orienter()
+    orienter = OrientationEstimator()
     batch = samples_of(3, worn, 300)
     del batch[150:160], batch[200:230]
     orienter.orient(batch[:180])
@@ -87,8 +87,9 @@ def test_status_counts_events(worn):
 
 def test_filters_come_only_when_asked_for():
     code = (
-        "import sys; from edgepose.orientation import Orienter; assert 'filterpy' not in sys.modules;"
-        "Orienter(); assert 'filterpy' in sys.modules and 'vqf' not in sys.modules"
+        "import sys; from edgepose.orientation import OrientationEstimator;"
+        "assert 'filterpy' not in sys.modules;"
+        "OrientationEstimator(); assert 'filterpy' in sys.modules and 'vqf' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 
@@ -140,7 +141,7 @@ def test_a_device_with_a_filter_of_its_own(sensor, kind):
     device = xio.read_session(XIO)
     assert device.damage is None
     ours = orient_recording(device, kind).sensors[sensor].quat
-    truth = rot.quat_multiply(rot.about_z(np.pi / 2), device.sensors[sensor].quat)
+    truth = rot.quat_multiply(rot.quat_about_z(np.pi / 2), device.sensors[sensor].quat)
     error = rot.quat_to_rotvec(rot.quat_multiply(ours[100:], rot.quat_conjugate(truth[100:])))
     assert np.rad2deg(np.linalg.norm(error, axis=1)).mean() < 4.5
     assert inclination(ours[100:], truth[100:]).mean() < 2.5
@@ -168,6 +169,6 @@ def test_convert_with_a_filter(tmp_path):
     arguments = ["convert", str(REAL), "--to", "npz", "--out", str(tmp_path), "--filter", "kalman"]
     cli.main(arguments, standalone_mode=False)
     written = read_recording(tmp_path / REAL.name)
-    oriented = Orienter().orient(list(samples(read_recording(REAL))))
-    for sample, expected in zip(samples(written), oriented, strict=True):
+    oriented = OrientationEstimator().orient(list(iter_samples(read_recording(REAL))))
+    for sample, expected in zip(iter_samples(written), oriented, strict=True):
         np.testing.assert_allclose(sample.quat, expected.quat, atol=1e-6)

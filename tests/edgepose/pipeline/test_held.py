@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from edgepose import rotations as rot
-from edgepose.pipeline.dropout import carried
+from edgepose.pipeline.dropout import extrapolate_dropouts
 from edgepose.placements import PLACEMENTS, ROOT
 
 
@@ -11,14 +11,14 @@ def walk():
     """A body (30, 6, 3, 3) that turns as one, and accelerations (30, 6, 3)."""
     random = np.random.default_rng(3)
     bones = rot.rotvec_to_matrix(random.normal(size=(6, 3)))
-    turns = rot.about_axis("y", np.linspace(0.0, 2.0, 30))[:, None]
+    turns = rot.rotation_about_axis("y", np.linspace(0.0, 2.0, 30))[:, None]
     return turns @ bones, random.normal(size=(30, 6, 3))
 
 
 def through(orientation, acceleration, held):
     result, before = [], None
     for frame in zip(orientation, acceleration, held, strict=True):
-        before, a = carried(*frame, before)
+        before, a = extrapolate_dropouts(*frame, before)
         result.append((before, a))
     return [np.stack(column) for column in zip(*result, strict=True)]
 
@@ -39,8 +39,8 @@ def test_a_silent_bone_turns_with_the_pelvis(walk):
 
 def test_a_silent_lower_leg_stays_upright_when_the_wearer_bends(walk):
     _, acceleration = walk
-    bend = rot.about_axis("x", np.interp(np.arange(30), [10, 20], [0.0, 1.5]))
-    turn = rot.about_axis("y", np.interp(np.arange(30), [20, 29], [0.0, 2.0]))
+    bend = rot.rotation_about_axis("x", np.interp(np.arange(30), [10, 20], [0.0, 1.5]))
+    turn = rot.rotation_about_axis("y", np.interp(np.arange(30), [20, 29], [0.0, 2.0]))
     measured = np.repeat((turn @ bend)[:, None], 6, axis=1)
     leg, arm = PLACEMENTS.index("right_lower_leg"), PLACEMENTS.index("right_forearm")
     held = np.zeros((30, 6), bool)
@@ -68,7 +68,7 @@ def test_what_measures_again_counts_at_once(walk):
     held = np.zeros((30, 6), bool)
     held[5:15, 0] = True
     measured = true.copy()
-    measured[15:, 0] = measured[15:, 0] @ rot.about_axis("x", 1.0)  # it bent meanwhile
+    measured[15:, 0] = measured[15:, 0] @ rot.rotation_about_axis("x", 1.0)  # it bent meanwhile
     orientation, _ = through(measured, acceleration, held)
     np.testing.assert_array_equal(orientation[15:], measured[15:])
 

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from edgepose.calibration import load_calibration
-from edgepose.calibration.rezero import Headings
+from edgepose.calibration.rezero import HeadingRezero
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.registry import read_poses
 from edgepose.imu import ImuFrame
 from edgepose.inference import archive
 from edgepose.inference.engine import EngineOutput, StreamEngine
-from edgepose.pipeline.frame_synchronizer import FrameClock
-from edgepose.pipeline.run import LATENCIES, RunSummary, Walk, pose_frame, run
+from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
+from edgepose.pipeline.run import run
+from edgepose.pipeline.wearer_pipeline import LATENCIES, RunSummary, WearerPipeline, pose_frame
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import parse_status
 from edgepose.sinks.base import Sink
@@ -42,7 +43,7 @@ class Shelf(Sink):
 
 @pytest.fixture(scope="module")
 def module():
-    return archive.load(archive.inspect(archive.find("birnn")))
+    return archive.load(archive.read_info(archive.find_archive("birnn")))
 
 
 @pytest.fixture
@@ -58,8 +59,8 @@ def walk(wearer, module):
         **options,
     ):
         engine = StreamEngine(module, past, future)
-        headings = Headings(load_calibration(wearer.calibration))
-        walk = Walk(FrameClock(), headings, list(sinks), on_pose=on_pose)
+        headings = HeadingRezero(load_calibration(wearer.calibration))
+        walk = WearerPipeline(FrameSynchronizer(), headings, list(sinks), on_pose=on_pose)
         with open_source(file=wearer.short) as source:
             return run(walk, change(source), engine, **options)
 
@@ -78,7 +79,7 @@ def imu_frame(*held):
 
 def test_what_waited_to_be_taken_counts_as_latency(walk):
     summary = walk(lambda batches: (batch._replace(backlog_s=2.5) for batch in batches))
-    assert summary.behind_s == 2.5
+    assert summary.backlog_s == 2.5
     assert min(summary.latencies_s) >= 2.5
     assert max(walk().latencies_s) < 2.5
 
@@ -106,7 +107,7 @@ def test_every_frame_comes_out_once_and_in_order(walk):
     assert indices(shelf) == list(range(180))
     assert seen == list(range(1, 181))
     assert [pose.status for pose in shelf.poses] == ["filling window"] * 4 + ["ok"] * 176
-    assert (summary.poses, summary.filling, summary.held) == (180, 4, 0)
+    assert (summary.poses, summary.warming_up, summary.held) == (180, 4, 0)
     assert len(summary.latencies_s) == 180
     assert min(summary.latencies_s) > 0
     assert summary.seconds > 0
@@ -214,5 +215,5 @@ def test_latencies_do_not_fill_the_memory():
     tracemalloc.stop()
     assert len(summary.latencies_s) == LATENCIES
     assert (min(summary.latencies_s), max(summary.latencies_s)) == (10.0, LATENCIES + 9.0)
-    assert (summary.poses, summary.late_s) == (LATENCIES + 10, LATENCIES + 9.0)
+    assert (summary.poses, summary.latency_s) == (LATENCIES + 10, LATENCIES + 9.0)
     assert taken < 2_000_000

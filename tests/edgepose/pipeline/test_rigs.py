@@ -16,15 +16,16 @@ import numpy as np
 import pytest
 
 from edgepose.calibration import load_calibration
-from edgepose.calibration.rezero import Headings
+from edgepose.calibration.rezero import HeadingRezero
 from edgepose.cli.options.wearer import read_rigs
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.registry import read_poses
 from edgepose.formats.recordings.csv import write_csv
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.inference.engine import StreamEngine
-from edgepose.pipeline.frame_synchronizer import FrameClock
-from edgepose.pipeline.run import Walk, run
+from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
+from edgepose.pipeline.run import run
+from edgepose.pipeline.wearer_pipeline import WearerPipeline
 from edgepose.placements import PLACEMENTS
 from edgepose.sinks.csv import CsvSink
 from edgepose.sources import open_source
@@ -278,9 +279,13 @@ def test_wearers_get_the_poses_that_each_gets_alone(
     assert f"running 3 wearers with {model} ({kind}, stream) in f32" in result.stderr
     lengths = []
     for name, file in files.items():
-        headings = Headings(load_calibration(wearer.calibration))
+        headings = HeadingRezero(load_calibration(wearer.calibration))
         with open_source(file=file) as source, CsvSink(tmp_path / "alone.csv", "matrix") as sink:
-            run(Walk(FrameClock(), headings, [sink]), source, StreamEngine(tiny(shape), *window))
+            run(
+                WearerPipeline(FrameSynchronizer(), headings, [sink]),
+                source,
+                StreamEngine(tiny(shape), *window),
+            )
         ours, theirs = (read_poses(tmp_path / f"{each}.csv") for each in (name, "alone"))
         np.testing.assert_array_equal(ours.frames, theirs.frames)
         np.testing.assert_array_equal(ours.time_s, theirs.time_s)

@@ -8,15 +8,15 @@ from collections.abc import Callable
 import pytest
 
 from edgepose.calibration import load_calibration
-from edgepose.calibration.rezero import Headings
-from edgepose.inference.engine import BatchEngine
-from edgepose.pipeline.frame_synchronizer import FrameClock
+from edgepose.calibration.rezero import HeadingRezero
+from edgepose.inference.engine import MultiWearerEngine
+from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.multi_wearer import Wearer, run_together
-from edgepose.pipeline.run import Walk
+from edgepose.pipeline.wearer_pipeline import WearerPipeline
 from edgepose.pose import PoseFrame
 from edgepose.sinks.base import Sink
 from edgepose.sources import Source, open_source
-from edgepose.sources.live import Link, LiveSource
+from edgepose.sources.live import LineSpec, LiveSource
 from edgepose_export.networks.shape import NetworkShape
 from firmware_protocols.registry import PROTOCOLS
 
@@ -54,15 +54,15 @@ def join(wearer):
     """Makes a wearer of a source that has been entered, and of a sink."""
 
     def make(source: Source, sink: Sink, tell: Callable[[str], None] = lambda text: None) -> Wearer:
-        headings = Headings(load_calibration(wearer.calibration))
-        return Wearer(source, Walk(FrameClock(), headings, [sink]), tell)
+        headings = HeadingRezero(load_calibration(wearer.calibration))
+        return Wearer(source, WearerPipeline(FrameSynchronizer(), headings, [sink]), tell)
 
     return make
 
 
 @pytest.fixture
 def engine(tiny):
-    return BatchEngine(tiny(NetworkShape("rnn", 8, "global-6d", "passed")), 0, 0, 2, False)
+    return MultiWearerEngine(tiny(NetworkShape("rnn", 8, "global-6d", "passed")), 0, 0, 2, False)
 
 
 def bus(maker: Maker) -> LiveSource:
@@ -70,7 +70,7 @@ def bus(maker: Maker) -> LiveSource:
         return {i: i for i in range(6)}
 
     return LiveSource(
-        [Link("pcan:1", lambda: maker, [PROTOCOLS["native"]], nowhere, "bytes", ("", ""))], waits=False
+        [LineSpec("pcan:1", lambda: maker, [PROTOCOLS["native"]], nowhere, "bytes", ("", ""))], blocking=False
     )
 
 
@@ -79,10 +79,10 @@ def test_what_nobody_has_foreseen_in_a_library_ends_only_its_wearer(wearer, join
         raise TypeError("an integer is required")
 
     told: list[str] = []
-    with bus(Maker(read)) as broken, open_source(file=wearer.short, waits=False) as whole:
+    with bus(Maker(read)) as broken, open_source(file=wearer.short, blocking=False) as whole:
         both = [join(broken, Shelf(), told.append), join(whole, Shelf())]
         run_together(both, engine, 0.0)
-    first, second = (each.walk.summary for each in both)
+    first, second = (each.pipeline.summary for each in both)
     assert (second.poses, second.error) == (180, None)
     assert told == [f"ended: {first.error}"]
     assert str(first.error).startswith("pcan:1: reading it failed (TypeError: an integer is required)")
@@ -101,7 +101,7 @@ def test_the_end_of_a_wearer_waits_for_no_line(join):
     maker = Maker(read)
     with bus(maker) as source:
         one = join(source, Shelf())
-        one.look()
+        one.poll()
         assert reading.wait(5.0)
         one.end()
         assert not maker.closed
@@ -115,8 +115,8 @@ def test_outputs_are_closed_when_their_wearer_ends(wearer, join, engine, tmp_pat
     short = Shelf()
     long = Shelf(short.closed.is_set)
     with (
-        open_source(file=tmp_path / "empty.bin", waits=False) as empty,
-        open_source(file=wearer.short, waits=False) as whole,
+        open_source(file=tmp_path / "empty.bin", blocking=False) as empty,
+        open_source(file=wearer.short, blocking=False) as whole,
     ):
         run_together([join(empty, short), join(whole, long)], engine, 0.0)
     assert len(long.notes) == 180
@@ -146,13 +146,15 @@ class Broken(Shelf):
 def test_what_nobody_has_foreseen_in_an_output_ends_only_its_wearer(wearer, join, engine, where):
     told: list[str] = []
     good, bad = Shelf(), Broken(where)
-    sources = [open_source(file=wearer.short, waits=False) for _ in range(2)]
+    sources = [open_source(file=wearer.short, blocking=False) for _ in range(2)]
     with sources[0] as one, sources[1] as other:
         wearers = [join(one, good), join(other, bad, told.append)]
         run_together(wearers, engine, 0.0)
     assert len(good.notes) == 180
-    assert wearers[0].walk.summary.error is None
-    assert "an unexpected fault (KeyError: 'a fault'); please report it" in str(wearers[1].walk.summary.error)
+    assert wearers[0].pipeline.summary.error is None
+    assert "an unexpected fault (KeyError: 'a fault'); please report it" in str(
+        wearers[1].pipeline.summary.error
+    )
     assert bad.closed.is_set()
     if where == "write":
         assert len(bad.notes) == 20
@@ -167,20 +169,20 @@ def test_what_nobody_has_foreseen_on_the_way_ends_only_its_wearer(wearer, join, 
         raise ZeroDivisionError("a fault")
 
     with (
-        open_source(file=wearer.short, waits=False) as one,
-        open_source(file=wearer.short, waits=False) as other,
+        open_source(file=wearer.short, blocking=False) as one,
+        open_source(file=wearer.short, blocking=False) as other,
     ):
         wearers = [join(one, good), join(other, bad)]
-        walk = wearers[1].walk
+        pipeline = wearers[1].pipeline
         if place == "clock":
-            monkeypatch.setattr(walk.clock, "push", fail)
+            monkeypatch.setattr(pipeline.clock, "push", fail)
         elif place == "headings":
-            monkeypatch.setattr(walk._headings, "at", fail)
+            monkeypatch.setattr(pipeline._headings, "at", fail)
         else:
-            monkeypatch.setattr(walk, "_orient", fail)
+            monkeypatch.setattr(pipeline, "_orient", fail)
         run_together(wearers, engine, 0.0)
     assert len(good.notes) == 180
-    assert isinstance(walk.summary.error.__cause__, ZeroDivisionError)
+    assert isinstance(pipeline.summary.error.__cause__, ZeroDivisionError)
 
 
 def test_the_line_of_a_wearer_who_has_ended_is_free(wearer, join, engine):
@@ -189,7 +191,7 @@ def test_the_line_of_a_wearer_who_has_ended_is_free(wearer, join, engine):
     free: list[bool] = []
     others = Shelf(lambda: free.append(maker.closed) or maker.closed)
     ending = bus(maker)
-    with ending as one, open_source(file=wearer.short, realtime=True, waits=False) as other:
+    with ending as one, open_source(file=wearer.short, realtime=True, blocking=False) as other:
         ended = join(one, Shelf())
         going = join(other, others)
         ended.end()

@@ -13,16 +13,16 @@ from edgepose.formats.recordings.registry import read_recording, read_sensors
 from edgepose.imu import Recording, SensorData
 from edgepose.placements import SITES
 from edgepose.sip import inputs as reading
-from edgepose.sip.measurements import Mount, measure, mounts_from_hold
+from edgepose.sip.measurements import SensorMount, measure, mounts_from_hold
 
 NAMES = ("left_forearm", "head", "pelvis")
-PLAIN = {name: Mount(np.eye(3), np.eye(3)) for name in NAMES}
+PLAIN = {name: SensorMount(np.eye(3), np.eye(3)) for name in NAMES}
 
 
 def swinging(rate, seconds=4.0, start=0.0):
     """A sensor that swings about Z and moves on a path whose acceleration is known."""
     t = start + np.arange(round(seconds * rate)) / rate
-    quat = rot.about_z(np.sin(t))
+    quat = rot.quat_about_z(np.sin(t))
     inertial = np.stack([np.sin(5.0 * t), 0.3 * t, np.cos(3.0 * t) + 9.81], axis=1)
     return SensorData(t, quat, rot.quat_rotate(rot.quat_conjugate(quat), inertial))
 
@@ -46,7 +46,7 @@ def test_acceleration_is_the_second_difference_of_the_path():
     error = np.abs(result.acceleration - differences[:, None])[inside]
     assert error[:, 0].max() < 6e-4  # 100 Hz, linear between samples
     assert error[:, 1].max() < 6e-5  # 400 Hz
-    np.testing.assert_allclose(result.orientation[:, 0], rot.about_axis("z", np.sin(t)), atol=2e-5)
+    np.testing.assert_allclose(result.orientation[:, 0], rot.rotation_about_axis("z", np.sin(t)), atol=2e-5)
     assert result.names == NAMES
     assert result.bones.tolist() == [18, 15, 0]
 
@@ -66,7 +66,7 @@ def test_a_gap_is_bridged_and_told():
     assert result.valid[1:-3, 0].all()
     # along the shorter arc between the samples on both sides
     ends = np.sin([gap.time_s[gap.time_s < 1.0][-1], gap.time_s[gap.time_s > 1.5][0]])
-    angles = rot.heading(rot.matrix_to_quat(result.orientation[inside, 1]))
+    angles = rot.yaw_of_quat(rot.matrix_to_quat(result.orientation[inside, 1]))
     assert ((angles >= ends.min()) & (angles <= ends.max())).all()
 
 
@@ -76,7 +76,9 @@ def test_a_sensor_that_ends_early_is_held_to_the_end():
     late = result.time_s > 2.0
     assert result.held[late, 1].all()
     assert not result.valid[late, 1].any()
-    np.testing.assert_allclose(result.orientation[-1, 1], rot.about_axis("z", np.sin(1.99)), atol=1e-9)
+    np.testing.assert_allclose(
+        result.orientation[-1, 1], rot.rotation_about_axis("z", np.sin(1.99)), atol=1e-9
+    )
 
 
 def test_frames_begin_where_the_last_sensor_begins():
@@ -156,7 +158,7 @@ def test_further_sensors_are_mounted_by_the_hold(wearer, with_thigh):
     shank, thigh = (
         result.orientation[:, result.names.index(n)] for n in ("left_lower_leg", "left_upper_leg")
     )
-    assert np.degrees(rot.angle_between(shank, thigh)).max() < 0.1
+    assert np.degrees(rot.geodesic_angle(shank, thigh)).max() < 0.1
     shank, thigh = (
         result.acceleration[:, result.names.index(n)] for n in ("left_lower_leg", "left_upper_leg")
     )

@@ -64,7 +64,7 @@ def settings(names=PLACEMENTS, method="sip", hinges=False, weights=None, evaluat
 
 def solved(measurements, **words):
     how = settings(measurements.names, **words)
-    return report.joined(list(solve(measurements, how)))
+    return report.concatenate(list(solve(measurements, how)))
 
 
 def test_dense_sensors_without_noise_give_the_poses_back(motion):
@@ -74,9 +74,9 @@ def test_dense_sensors_without_noise_give_the_poses_back(motion):
     # Spine joints between two sensors share one turn as the prior likes; all bones with a sensor are found.
     estimate, truth = (forward_kinematics(r, BODY.offsets)[0] for r in (solution.rotations, local))
     bones = list(SITES.values())
-    assert np.degrees(rot.angle_between(estimate[:, bones], truth[:, bones])).max() < 0.1
+    assert np.degrees(rot.geodesic_angle(estimate[:, bones], truth[:, bones])).max() < 0.1
     limbs = [1, 2, 4, 5, 13, 14, 16, 17, 18, 19]
-    assert np.degrees(rot.angle_between(solution.rotations[:, limbs], local[:, limbs])).max() < 0.1
+    assert np.degrees(rot.geodesic_angle(solution.rotations[:, limbs], local[:, limbs])).max() < 0.1
 
 
 @pytest.fixture(scope="module")
@@ -156,7 +156,7 @@ def test_no_acceleration_at_all_is_what_orientation_says(motion):
     measurements = measured(motion, noise=1.0)
     blind = measurements._replace(valid=np.zeros_like(measurements.valid))
     sip, sop = solved(blind), solved(measurements, method="sop")
-    assert np.degrees(rot.angle_between(sip.rotations, sop.rotations)).max() < 0.5
+    assert np.degrees(rot.geodesic_angle(sip.rotations, sop.rotations)).max() < 0.5
     assert np.isnan(sip.acceleration).all()
     assert np.isfinite(pelvis_path(sip, BODY.offsets, 60.0)).all()
 
@@ -184,7 +184,7 @@ def test_any_sensors_and_any_number_of_frames(motion, names, frames):
     solution = solved(measurements._replace(valid=valid))
     assert solution.rotations.shape == (frames, 24, 3, 3)
     estimate = forward_kinematics(solution.rotations, BODY.offsets)[0][:, measurements.bones]
-    angles = np.degrees(rot.angle_between(estimate, measurements.orientation))
+    angles = np.degrees(rot.geodesic_angle(estimate, measurements.orientation))
     assert angles.max() < 25.0
     assert pelvis_path(solution, BODY.offsets, 60.0).shape == (frames, 3)
 
@@ -198,14 +198,14 @@ def test_no_frame_is_an_error(motion):
 
 def test_headings_do_not_matter(motion):
     """Exponential coordinates of the pelvis are singular at a full turn; no heading comes near."""
-    turns = rot.about_axis("y", np.linspace(0.0, 4.0 * np.pi, len(motion[0])))
+    turns = rot.rotation_about_axis("y", np.linspace(0.0, 4.0 * np.pi, len(motion[0])))
     orientation = measured(motion).orientation
     measurements = measured(motion)._replace(orientation=turns[:, None] @ orientation)
     measurements = measurements._replace(valid=np.zeros_like(measurements.valid))
     spun = solved(measurements)
     plain = solved(measured(motion)._replace(valid=measurements.valid))
-    assert np.degrees(rot.angle_between(spun.rotations[:, 1:], plain.rotations[:, 1:])).max() < 0.5
-    assert np.degrees(rot.angle_between(spun.rotations[:, 0], turns @ plain.rotations[:, 0])).max() < 0.5
+    assert np.degrees(rot.geodesic_angle(spun.rotations[:, 1:], plain.rotations[:, 1:])).max() < 0.5
+    assert np.degrees(rot.geodesic_angle(spun.rotations[:, 0], turns @ plain.rotations[:, 0])).max() < 0.5
 
 
 # --- chunks -------------------------------------------------------------------------------------------------
@@ -227,16 +227,16 @@ def test_chunks_and_processes_give_the_poses_of_the_whole(motion, noisy, monkeyp
     seen = []
     parts = list(solve(measurements, settings(), 1, lambda *args: seen.append(args)))
     assert len(parts) == 3
-    together = report.joined(parts)
+    together = report.concatenate(parts)
     assert together.rotations.shape == (240, 24, 3, 3)
-    angles = np.degrees(rot.angle_between(together.rotations, noisy["sip"].rotations))
+    angles = np.degrees(rot.geodesic_angle(together.rotations, noisy["sip"].rotations))
     assert angles.mean() < 1.0
-    steps = np.degrees(rot.angle_between(together.rotations[1:], together.rotations[:-1]))
-    whole = np.degrees(rot.angle_between(noisy["sip"].rotations[1:], noisy["sip"].rotations[:-1]))
+    steps = np.degrees(rot.geodesic_angle(together.rotations[1:], together.rotations[:-1]))
+    whole = np.degrees(rot.geodesic_angle(noisy["sip"].rotations[1:], noisy["sip"].rotations[:-1]))
     assert steps.max() < whole.max() + 1.0  # no jump where chunks meet
     assert {args[0] for args in seen} == {1, 2, 3}
     assert {args[1] for args in seen} == {3}
-    others = report.joined(list(solve(measurements, settings(), jobs=2)))
+    others = report.concatenate(list(solve(measurements, settings(), jobs=2)))
     np.testing.assert_allclose(others.rotations, together.rotations, atol=1e-9)
 
 

@@ -64,18 +64,20 @@ def relative_error(analytic, reference):
 def test_orientation_residuals_change_as_their_jacobian_says(hinges):
     this, at = problem(hinges=hinges)
     here = terms.evaluate(this, at)
-    turns = rot.inverse_left_jacobian(here.turn) @ orientation_jacobian(here.posed, this.body).reshape(
-        FRAMES, -1, 3, 72
-    )
+    turns = rot.inverse_left_jacobian(here.orientation_residual) @ orientation_jacobian(
+        here.states, this.body
+    ).reshape(FRAMES, -1, 3, 72)
     analytic = block_diagonal((turns @ this.rig.basis).reshape(FRAMES, -1, at.shape[1]))
-    assert relative_error(analytic, numerical(lambda x: terms.evaluate(this, x).turn, at)) < 1e-6
+    assert (
+        relative_error(analytic, numerical(lambda x: terms.evaluate(this, x).orientation_residual, at)) < 1e-6
+    )
 
 
 @pytest.mark.parametrize("hinges", [False, True])
 def test_sensors_move_as_their_jacobian_says(hinges):
     this, at = problem(hinges=hinges)
     analytic = block_diagonal(terms.sensor_movement(this, terms.evaluate(this, at)))
-    reference = numerical(lambda x: terms.evaluate(this, x).posed.position, at)
+    reference = numerical(lambda x: terms.evaluate(this, x).states.position, at)
     assert relative_error(analytic, reference) < 1e-6
 
 
@@ -87,7 +89,7 @@ def test_the_gradient_is_that_of_the_cost():
     _, gradient = terms.frame_system(this, here)
     movement = terms.sensor_movement(this, here)
     weight = this.weights.acc / len(PLACEMENTS)
-    pull = here.pull.copy()
+    pull = here.acceleration_residual.copy()
     pull[[0, -1]] = 0.0
     padded = np.pad(pull.reshape(FRAMES, -1), ((1, 1), (0, 0)))
     force = (padded[2:] - 2.0 * padded[1:-1] + padded[:-2]) * 3600.0
@@ -102,10 +104,10 @@ def test_the_banded_step_is_that_of_the_dense_normal_equations(names):
     here = terms.evaluate(this, at)
     matrix, gradient = terms.frame_system(this, here)
     movement = terms.sensor_movement(this, here)
-    pulls = numerical(lambda x: terms.evaluate(this, x).pull, at)
+    pulls = numerical(lambda x: terms.evaluate(this, x).acceleration_residual, at)
     weight = this.weights.acc / len(names)
     dense = block_diagonal(matrix) + weight * pulls.T @ pulls + 1e-3 * np.eye(at.size)
-    right = gradient.ravel() + weight * pulls.T @ here.pull.ravel()
+    right = gradient.ravel() + weight * pulls.T @ here.acceleration_residual.ravel()
     step = minimise._joint_step(this, here, matrix, gradient, movement, 1e-3)
     assert relative_error(step.ravel(), -np.linalg.solve(dense, right)) < 1e-5
 
@@ -113,10 +115,14 @@ def test_the_banded_step_is_that_of_the_dense_normal_equations(names):
 def test_the_translation_takes_a_common_acceleration_away():
     this, at = problem()
     pushed = this._replace(acceleration=this.acceleration + np.array([3.0, -2.0, 5.0]))
-    np.testing.assert_allclose(terms.evaluate(this, at).pull, terms.evaluate(pushed, at).pull, atol=1e-12)
+    np.testing.assert_allclose(
+        terms.evaluate(this, at).acceleration_residual,
+        terms.evaluate(pushed, at).acceleration_residual,
+        atol=1e-12,
+    )
     one = this._replace(acceleration=this.acceleration.copy())
     one.acceleration[2, 0] += 6.0
-    change = terms.evaluate(this, at).pull - terms.evaluate(one, at).pull
+    change = terms.evaluate(this, at).acceleration_residual - terms.evaluate(one, at).acceleration_residual
     np.testing.assert_allclose(change[2, 0], 5.0)  # five sixths, the rest is the translation's
     np.testing.assert_allclose(change[2, 1:], -1.0)
 

@@ -9,7 +9,7 @@ import can
 import pytest
 
 from edgepose.errors import EdgeposeError
-from edgepose.pipeline.frame_synchronizer import FrameClock
+from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import open_source
 from firmware_protocols import native_can
@@ -81,7 +81,7 @@ def test_a_live_bus_of_any_protocol(bus, protocol):
     frames = []
     with open_source(can=name) as source, Devices(sender.send, protocol):
         got = []
-        clock = FrameClock()
+        clock = FrameSynchronizer()
         for now_s, samples, *_ in source:
             got += samples
             clock.push(samples, now_s)
@@ -242,7 +242,7 @@ def test_logs(tmp_path, suffix):
     assert len(got) == source.counters.packets == 600
     times = [sample.time_s for sample in got if sample.sensor == 3]
     assert times[-1] - times[0] == pytest.approx(0.99, abs=0.01)
-    clock = FrameClock()
+    clock = FrameSynchronizer()
     clock.push(got, 0.0)
     assert 58 <= len(clock.flush()) <= 60
 

@@ -11,7 +11,7 @@ from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import open_source
-from edgepose.sources.line_config import links
+from edgepose.sources.line_config import line_specs
 from edgepose.sources.sensor_map import default_places, read_map
 from firmware_protocols.native import encode
 from firmware_protocols.native_packet import Packet
@@ -35,7 +35,7 @@ def test_a_sensor_a_port(read):
     rig = read(PORTS + '\n[ports."/dev/ttyUSB2"]\nprotocol = "witmotion"\nbaud = 115200\n')
     assert rig.lines("port") == [f"/dev/ttyUSB{i}" for i in range(6)]
     assert rig.places("/dev/ttyUSB4") == {None: 4}
-    found = links(None, 921600, None, None, False, "xsens", rig)
+    found = line_specs(None, 921600, None, None, False, "xsens", rig)
     assert [link.name for link in found] == rig.lines("port")
     assert [link.protocols[0].name for link in found] == ["xsens"] * 2 + ["witmotion"] + ["xsens"] * 3
     assert ["now 115200" in link.check[1] for link in found] == [i == 2 for i in range(6)]
@@ -63,7 +63,7 @@ def test_two_hubs_and_a_bus(read):
     assert rig.places("a") == {0: 0, 1: 1}
     assert rig.places("b") == {0: 2, 1: 3}
     assert rig.places("virtual:x") == rig.places("x") == {0: 4, 1: 5}
-    found = links("a,b", None, "virtual:x", None, False, "auto", rig)
+    found = line_specs("a,b", None, "virtual:x", None, False, "auto", rig)
     assert [(link.name, link.unit) for link in found] == [
         ("a", "bytes"),
         ("b", "bytes"),
@@ -72,7 +72,7 @@ def test_two_hubs_and_a_bus(read):
     assert "--bitrate (now 1000000)" in found[2].check[0]
     assert [protocol.name for protocol in found[2].protocols] == ["native-can"]
     with pytest.raises(EdgeposeError, match=r"left_lower_leg: b is none of a, virtual:x"):
-        links("a", None, "virtual:x", None, False, "auto", rig)
+        line_specs("a", None, "virtual:x", None, False, "auto", rig)
 
 
 @pytest.mark.parametrize(
@@ -121,13 +121,13 @@ def test_a_missing_file(tmp_path):
 def test_settings_of_a_line_that_is_not_there(read):
     rig = read(PORTS + "\n[ports.COM9]\nbaud = 9600\n")
     with pytest.raises(EdgeposeError, match=r"rig\.toml: ports\.COM9: no such line, only /dev/ttyUSB0"):
-        links(None, None, None, None, False, "auto", rig)
+        line_specs(None, None, None, None, False, "auto", rig)
 
 
 def test_an_unknown_protocol_of_a_port(read):
     rig = read(PORTS + '\n[ports."/dev/ttyUSB2"]\nprotocol = "nonsense"\n')
     with pytest.raises(EdgeposeError, match="unknown protocol 'nonsense'"):
-        links(None, None, None, None, False, "auto", rig)
+        line_specs(None, None, None, None, False, "auto", rig)
 
 
 # --- the page about it --------------------------------------------------------------------------------------
@@ -156,7 +156,7 @@ def test_examples_of_commands_are_commands(line):
 def test_every_protocol_is_on_the_page():
     for name, protocol in PROTOCOLS.items():
         row = next(row for row in PAGE.splitlines() if row.startswith("|") and f"`{name}`" in row)
-        assert str(protocol.speed) in row
+        assert str(protocol.default_bitrate) in row
 
 
 # --- without a map ------------------------------------------------------------------------------------------

@@ -12,11 +12,11 @@ import pytest
 import serial
 
 from edgepose.errors import DeviceError, EdgeposeError
-from edgepose.formats.recordings.base import samples
+from edgepose.formats.recordings.base import iter_samples
 from edgepose.formats.recordings.csv import csv_header, csv_row, write_csv
 from edgepose.formats.recordings.raw_capture import times_header, times_path, times_row
 from edgepose.formats.recordings.registry import read_recording
-from edgepose.pipeline.frame_synchronizer import FrameClock
+from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import open_source
 from edgepose.sources.protocol_detection import protocol_named
@@ -77,7 +77,7 @@ def test_live_packets_become_samples_and_frames(port):
     name = port.name
     got, frames = [], []
     with open_source(port=name) as source, Device(port, chunks(200, start_us=(1 << 32) - 500_000)):
-        clock = FrameClock()
+        clock = FrameSynchronizer()
         for now_s, batch, *_ in source:
             assert abs(now_s - time.time()) < 1.0
             got += batch
@@ -119,7 +119,7 @@ def test_a_source_that_does_not_wait(port, caplog):
             got.extend(batch)
             time.sleep(0.004)
 
-    with open_source(port=name, waits=False) as source:
+    with open_source(port=name, blocking=False) as source:
         batches = iter(source)
         assert [next(batches)[1] for _ in range(100)] == [[]] * 100
         with Device(port, chunks(300)):
@@ -139,7 +139,7 @@ def test_what_waits_behind_a_full_buffer_is_not_said_to_be_delivered(port):
     data = b"".join(map(encode, packets(51)[6:]))
     assert 8192 < len(data) < 12_000
     got = []
-    with open_source(port=name, protocol="native", waits=False) as source:
+    with open_source(port=name, protocol="native", blocking=False) as source:
         batches = iter(source)
         while not got:
             time.sleep(0.02)
@@ -162,7 +162,7 @@ def test_what_waits_behind_a_full_buffer_is_not_said_to_be_delivered(port):
 
 
 def test_a_line_that_is_never_empty_does_not_stop_the_time(port, monkeypatch):
-    monkeypatch.setattr("edgepose.sources.live.FULL_LOOKS", 3)
+    monkeypatch.setattr("edgepose.sources.live.FULL_POLLS", 3)
     name = port.name
     os.set_blocking(port.master, False)
 
@@ -171,7 +171,7 @@ def test_a_line_that_is_never_empty_does_not_stop_the_time(port, monkeypatch):
             while True:
                 os.write(port.master, bytes(4096))
 
-    with open_source(port=name, protocol="native", waits=False) as source:
+    with open_source(port=name, protocol="native", blocking=False) as source:
         start_s = now_s = next(iter(batches := iter(source)))[0]
         for _ in range(200):
             if now_s > start_s + 1.0:
@@ -185,7 +185,7 @@ def test_a_line_that_is_never_empty_does_not_stop_the_time(port, monkeypatch):
 
 def test_the_time_until_a_look_counts_as_waiting(port):
     name = port.name
-    with open_source(port=name, protocol="native", waits=False) as source:
+    with open_source(port=name, protocol="native", blocking=False) as source:
         batches, got = iter(source), []
         while not got:
             time.sleep(0.02)
@@ -200,10 +200,10 @@ def test_the_time_until_a_look_counts_as_waiting(port):
 
 
 def test_sources_share_a_clock_that_nobody_sets(port, monkeypatch):
-    with open_source(port=port.name, waits=False) as source:
+    with open_source(port=port.name, blocking=False) as source:
         first_s, *_ = next(iter(source))
     monkeypatch.setattr(time, "time", lambda: 0.0)
-    with open_source(port=port.name, waits=False) as source:
+    with open_source(port=port.name, blocking=False) as source:
         second_s, *_ = next(iter(source))
     assert first_s < second_s < first_s + 60.0
 
@@ -355,7 +355,7 @@ class Rig(Sender):
 
     def __init__(self, name, lines=None, ids=None):
         self.protocol = PROTOCOLS[name]
-        self.alone = self.protocol.alone and lines != 1
+        self.alone = self.protocol.single_device and lines != 1
         super().__init__(*(Port() for _ in range(6 if self.alone else 1)))
         self.ids = [0] * 6 if self.alone else list(ids or self.protocol.ids)
         self.names = ",".join(port.name for port in self.ports)
@@ -387,7 +387,7 @@ class Rig(Sender):
 
 def listen(n, **options):
     """Source, samples, so many of each sensor, and frames."""
-    got, frames, clock = [], [], FrameClock()
+    got, frames, clock = [], [], FrameSynchronizer()
     missing = Counter(dict.fromkeys(range(6), n))
     with open_source(**options) as source:
         for now_s, batch, *_ in source:
@@ -582,7 +582,7 @@ def test_recording(tmp_path, kind):
 
 
 def test_cut_recording_gives_what_is_good(tmp_path):
-    rows = list(samples(read_recording(REAL)))[:60]
+    rows = list(iter_samples(read_recording(REAL)))[:60]
     (tmp_path / "a.csv").write_text((csv_header({}) + "".join(map(csv_row, rows)))[:-20])
     source, _, got = everything(file=tmp_path / "a.csv")
     assert len(got) == 59
@@ -600,7 +600,7 @@ def test_capture_with_wrap_noise_and_loss(tmp_path):
     assert source.counters.bad >= 1
     first = [s.time_s for s in got if s.sensor == 1]
     assert first[-1] - first[0] == pytest.approx(0.99, abs=1e-3)
-    clock = FrameClock()
+    clock = FrameSynchronizer()
     clock.push(got, 0.0)
     assert 58 <= len(clock.flush()) <= 60
 
@@ -622,7 +622,7 @@ def test_missing_file(tmp_path, name):
 
 def test_realtime_without_waiting_gives_the_same_and_empty_batches_between(tmp_path):
     (tmp_path / "a.bin").write_bytes(b"".join(chunks(20)))
-    with open_source(file=tmp_path / "a.bin", realtime=True, waits=False) as source:
+    with open_source(file=tmp_path / "a.bin", realtime=True, blocking=False) as source:
         batches = list(source)
     _, _, alone = everything(file=tmp_path / "a.bin")
     assert [sample for _, batch, *_ in batches for sample in batch] == alone

@@ -35,7 +35,7 @@ from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.udp import UdpSink, decode, encode_binary, encode_json
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics
 from edgepose.viewer.body_mesh import TIPS, build, ground
-from edgepose.viewer.viewer import Stream, Viewer, plain, sensor_table
+from edgepose.viewer.viewer import UdpPoseStream, Viewer, plain, sensor_table
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "chrome"))), None)
 needs_browser = pytest.mark.skipif(
@@ -129,14 +129,14 @@ def line() -> Iterator[tuple[UdpSink, socket.socket]]:
             yield sink, receiver
 
 
-def take(stream: Stream, receiver: socket.socket, now: float) -> PoseFrame | None:
+def take(stream: UdpPoseStream, receiver: socket.socket, now: float) -> PoseFrame | None:
     select.select([receiver], [], [], 5)
     return stream.take(receiver, now)
 
 
 def test_only_the_newest_pose_is_shown_and_losses_are_counted(line):
     sink, receiver = line
-    stream = Stream()
+    stream = UdpPoseStream()
     assert stream.take(receiver, 0.0) is None
     assert stream.text(0.0) == "waiting for poses"
     for i in (0, 1, 2, 5, 4, 5):
@@ -155,7 +155,7 @@ def test_only_the_newest_pose_is_shown_and_losses_are_counted(line):
 
 def test_what_is_no_pose_is_counted_and_left_out(line):
     sink, receiver = line
-    stream = Stream()
+    stream = UdpPoseStream()
     whole = json.loads(encode_json(standing()))
     bad = [
         b"",

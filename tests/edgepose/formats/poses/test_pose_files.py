@@ -21,7 +21,7 @@ from edgepose.formats.poses.csv import BLOCK, read_blocks
 from edgepose.formats.poses.registry import is_poses, read_poses, salvage_poses
 from edgepose.formats.recordings.csv import write_csv
 from edgepose.formats.recordings.registry import read_recording
-from edgepose.pose import PoseFrame, Poses, parse_status
+from edgepose.pose import PoseFrame, PoseSequence, parse_status
 from edgepose.sinks.bvh import BvhSink, depth_first
 from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.npz import NpzSink
@@ -56,7 +56,7 @@ def written(sink, poses: list[PoseFrame]) -> None:
             sink.write(pose)
 
 
-def same(poses: Poses, wanted: list[PoseFrame], tolerance: float = 2e-6) -> None:
+def same(poses: PoseSequence, wanted: list[PoseFrame], tolerance: float = 2e-6) -> None:
     assert poses.frames.tolist() == [pose.index for pose in wanted]
     assert poses.status == [pose.status for pose in wanted]
     np.testing.assert_allclose(poses.time_s, [pose.time_s for pose in wanted], atol=1e-6)
@@ -121,7 +121,7 @@ def test_npz_comes_back(tmp_path, moves):
     back = read_poses(tmp_path / "a.npz")
     same(back, poses)
     assert back.rate == 60.0
-    same(Poses(*back), list(back.pose_frames()))
+    same(PoseSequence(*back), list(back.pose_frames()))
 
 
 def test_npz_has_the_keys_of_amass_in_a_world_with_z_up(tmp_path):

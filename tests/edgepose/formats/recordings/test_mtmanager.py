@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.base import from_samples, samples
+from edgepose.formats.recordings.base import iter_samples, recording_from_samples
 from edgepose.formats.recordings.mt_manager import is_session, read_session
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import ImuSample
@@ -40,7 +40,7 @@ COLUMNS = [
 
 def session(folder: Path, names: list[str], start: int = 23_593, separator: str = "\t") -> list[ImuSample]:
     """One second of a real recording as MT Manager exports it."""
-    written = list(samples(read_recording(REAL)))[:600]
+    written = list(iter_samples(read_recording(REAL)))[:600]
     folder.mkdir(exist_ok=True)
     for sensor, name in enumerate(names):
         lines = [separator.join(COLUMNS)]
@@ -53,7 +53,9 @@ def session(folder: Path, names: list[str], start: int = 23_593, separator: str 
 
 
 def same(recording, written: list[ImuSample]) -> None:
-    for a, b in zip(from_samples(written).sensors.values(), recording.sensors.values(), strict=True):
+    for a, b in zip(
+        recording_from_samples(written).sensors.values(), recording.sensors.values(), strict=True
+    ):
         np.testing.assert_allclose(b.time_s, a.time_s - a.time_s[0], atol=1e-6)
         np.testing.assert_allclose(b.acc, a.acc, atol=1e-6)
         np.testing.assert_allclose(b.gyr, a.gyr, atol=1e-6)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.base import from_samples, samples
+from edgepose.formats.recordings.base import iter_samples, recording_from_samples
 from edgepose.formats.recordings.csv import COLUMNS, csv_header, csv_row, write_csv
 from edgepose.formats.recordings.npz import write_npz
 from edgepose.formats.recordings.registry import missing_sensors, read_recording, salvage_recording
@@ -60,7 +60,7 @@ def test_real_recording():
     assert pelvis.quat.shape == (300, 4)
     assert pelvis.mag is None
     assert recording.damage is None
-    rows = list(samples(recording))
+    rows = list(iter_samples(recording))
     assert len(rows) == 1800
     assert [r.sensor for r in rows[:6]] == list(range(6))
     assert all(a.time_s <= b.time_s for a, b in pairwise(rows))
@@ -97,13 +97,14 @@ def test_any_samples_round_trip(tmp_path_factory, drawn):
                 sensor, times[sensor] * 1e-3, (0.6, 0.0, -0.8, 0.0) if oriented else None, acc, None, mag
             )
         )
-    recording = from_samples(rows, {"rate": "50"})
+    recording = recording_from_samples(rows, {"rate": "50"})
     write_csv(path / "a.csv", recording)
     write_npz(path / "a.npz", recording)
     for again in (read_recording(path / "a.csv"), read_recording(path / "a.npz")):
         same(recording, again, 1e-6)
         kept = [
-            (s.sensor, s.quat is None, s.acc is None, s.gyr is None, s.mag is None) for s in samples(again)
+            (s.sensor, s.quat is None, s.acc is None, s.gyr is None, s.mag is None)
+            for s in iter_samples(again)
         ]
         wanted = [(s.sensor, s.quat is None, s.acc is None, s.gyr is None, s.mag is None) for s in rows]
         assert sorted(kept) == sorted(wanted)
@@ -115,10 +116,10 @@ def test_sensors_at_different_rates(tmp_path):
         for s in range(6)
         for i in range(20)
     ]
-    recording = from_samples(rows)
+    recording = recording_from_samples(rows)
     write_npz(tmp_path / "a.npz", recording)
     same(recording, read_recording(tmp_path / "a.npz"), 1e-6)
-    merged = list(samples(recording))
+    merged = list(iter_samples(recording))
     assert len(merged) == 120
     assert all(a.time_s <= b.time_s for a, b in pairwise(merged))
 
@@ -134,7 +135,7 @@ def test_metadata_line_ends_and_quotes(tmp_path):
 
 def test_stdin(monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.StringIO(text(rig())))
-    assert len(list(samples(read_recording("-")))) == 18
+    assert len(list(iter_samples(read_recording("-")))) == 18
 
 
 def test_quaternions_are_normalised(tmp_path):
@@ -150,7 +151,7 @@ def test_csv_cut_anywhere_in_its_last_row_keeps_the_rest(tmp_path):
     last = whole[:-1].rindex("\n") + 1
     for end in range(last + 1, len(whole)):
         recording = read_recording(write(tmp_path / "a.csv", whole[:end]))
-        assert len(list(samples(recording))) == 17
+        assert len(list(iter_samples(recording))) == 17
         assert f"{tmp_path / 'a.csv'}: row 19 is cut off" in recording.damage
         assert "\n" not in recording.damage
     assert read_recording(write(tmp_path / "a.csv", whole[:last])).damage is None
@@ -159,7 +160,7 @@ def test_csv_cut_anywhere_in_its_last_row_keeps_the_rest(tmp_path):
 def test_a_missing_line_end_alone_is_no_damage(tmp_path):
     recording = read_recording(write(tmp_path / "a.csv", text(rig())[:-1]))
     assert recording.damage is None
-    assert len(list(samples(recording))) == 18
+    assert len(list(iter_samples(recording))) == 18
 
 
 def test_truncated_npz(tmp_path):
@@ -199,7 +200,7 @@ def test_damaged_npz_is_an_error_or_still_a_recording(tmp_path_factory, place, c
 )
 def test_a_bad_row_alone_is_left_out(tmp_path, old, new, problem):
     recording = salvage_recording(write(tmp_path / "a.csv", text(rig()).replace(old, new, 1)))
-    assert len(list(samples(recording))) == 17
+    assert len(list(iter_samples(recording))) == 17
     assert f"{tmp_path / 'a.csv'}: " in recording.damage
     assert " bad rows left out, the first: " + problem in recording.damage
     assert "\n" not in recording.damage
@@ -207,7 +208,7 @@ def test_a_bad_row_alone_is_left_out(tmp_path, old, new, problem):
 
 def test_zeros_at_the_end_after_a_power_cut(tmp_path):
     recording = salvage_recording(write(tmp_path / "a.csv", text(rig()) + "\0" * 10_000))
-    assert len(list(samples(recording))) == 18
+    assert len(list(iter_samples(recording))) == 18
     assert "row 20" in recording.damage
 
 
@@ -228,20 +229,20 @@ def test_salvage_of_samples_and_arrays(tmp_path):
     rows = rig()
     rows[7] = rows[7]._replace(acc=(0.0, 0.0, 1e30))
     with pytest.raises(EdgeposeError, match="absurd"):
-        from_samples(rows)
-    recording = from_samples(rows, name="port", salvage=True)
-    assert len(list(samples(recording))) == 17
+        recording_from_samples(rows)
+    recording = recording_from_samples(rows, name="port", salvage=True)
+    assert len(list(iter_samples(recording))) == 17
     assert recording.damage.startswith("port: 1 bad rows left out, the first: row 8: right_forearm")
     with np.load(REAL) as file:
         values = file["head_acc"].copy()
     values[3] = np.nan
     recording = salvage_recording(npz(tmp_path / "a.npz", head_acc=values))
-    assert len(list(samples(recording))) == 1799
+    assert len(list(iter_samples(recording))) == 1799
     assert "row 3: head" in recording.damage
 
 
 def test_metadata_cannot_start_a_row(tmp_path):
-    recording = from_samples(rig(), {"note": "a\n0,head", "x\r": "b"})
+    recording = recording_from_samples(rig(), {"note": "a\n0,head", "x\r": "b"})
     write_csv(tmp_path / "a.csv", recording)
     assert read_recording(tmp_path / "a.csv").metadata == {"note": "a 0,head", "x": "b"}
 

@@ -1,0 +1,98 @@
+"""The main job from Python: samples of a source in, poses out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from edgepose.calibration import Calibration
+from edgepose.calibration.rezero import HeadingRezero
+from edgepose.errors import EdgeposeError
+from edgepose.imu import ImuSample
+from edgepose.orientation.stage import OrientationStage
+from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
+from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
+from edgepose.pose import PoseFrame
+from edgepose.sinks.base import Sink
+from edgepose.sources import Batch
+
+if TYPE_CHECKING:
+    from edgepose.inference.model import Model
+
+
+class _Latest(Sink):
+    """Keeps the poses until they are taken."""
+
+    def __init__(self) -> None:
+        self._poses: list[PoseFrame] = []
+
+    def write(self, pose: PoseFrame) -> None:
+        self._poses.append(pose)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def take(self) -> list[PoseFrame]:
+        poses, self._poses = self._poses, []
+        return poses
+
+
+class Pipeline:
+    """Turns the samples of one wearer into poses.
+
+    Attributes:
+        summary: counts of what has been done so far.
+    """
+
+    def __init__(
+        self, calibration: Calibration, model: str | Path | Model = "birnn", *, trust: bool = False
+    ) -> None:
+        """Load the model.
+
+        Args:
+            calibration: of the wearer; it says which orientation filter runs.
+            model: name of a bundled model, path of an archive, or a loaded one.
+            trust: load an archive although its checksum is not known.
+
+        Raises:
+            ModelError: the archive cannot be loaded.
+        """
+        from edgepose.inference.model import Model
+
+        self._calibration = calibration
+        self._model = model if isinstance(model, Model) else Model(model, trust=trust)
+        self.summary = RunSummary()
+
+    def poses(self, source: Iterable[Batch | tuple[float, list[ImuSample]]]) -> Iterator[PoseFrame]:
+        """Poses as they become ready, to the end of the source.
+
+        Args:
+            source: batches as `edgepose.open_source` gives them once it is entered, or pairs (time in
+                seconds up to which everything has been delivered, samples).
+
+        Raises:
+            EdgeposeError: the source ended in an error; all poses before it have been given.
+        """
+        latest, engine = _Latest(), self._model.engine()
+        calibration = self._calibration
+        orient = OrientationStage(calibration.filter, magnetometer=calibration.north)
+        pipeline = WearerPipeline(
+            FrameSynchronizer(self._model.rate_hz), HeadingRezero(calibration), [latest], orient
+        )
+        self.summary = pipeline.summary
+        failure: EdgeposeError | None = None
+        try:
+            for batch in source:
+                for body in pipeline.process(Batch(*batch)):
+                    pipeline.emit(engine.push(*body), pipeline.arrived)
+                yield from latest.take()
+        except EdgeposeError as error:
+            failure = error  # raised once the poses of what came before it are given
+        for body in pipeline.flush():
+            pipeline.emit(engine.push(*body), pipeline.arrived)
+        pipeline.emit(engine.finish(), pipeline.arrived)
+        pipeline.end(failure)
+        yield from latest.take()
+        if failure is not None:
+            raise failure
