@@ -325,7 +325,7 @@ import json, sys, time
 started = time.perf_counter()
 from edgepose.benchmarks import speed
 imported = time.perf_counter()
-engine = speed.load_engine(speed.archive.inspect(speed.Path(sys.argv[1])), True, "auto")
+engine = speed.load_engine(speed.archive.read_info(speed.Path(sys.argv[1])), True, "auto")
 print(json.dumps([imported - started, time.perf_counter() - imported, speed.memory_mb()]))
 """
 

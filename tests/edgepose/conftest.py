@@ -12,6 +12,7 @@ import pytest
 
 from edgepose.formats.recordings.npz import write_npz
 from edgepose.formats.recordings.registry import read_recording
+from tests.support import processes
 from tests.support.recordings import part
 
 CLIP = Path(__file__).parents[2] / "tools" / "data" / "09_12.bvh"
@@ -27,7 +28,7 @@ class Wearer(NamedTuple):
 
 def edgepose(*words: object, **options: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "edgepose", *map(str, words)]
-    return subprocess.run(command, text=True, capture_output=True, timeout=120, check=False, **options)
+    return processes.run(command, text=True, capture_output=True, timeout=120, check=False, **options)
 
 
 @pytest.fixture(scope="session")

@@ -14,6 +14,7 @@ import pytest
 
 import edgepose
 from edgepose.formats.poses.registry import read_poses
+from tests.support import processes
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
@@ -47,7 +48,7 @@ def test_errors_are_one_family():
 
 def run_example(name: str, *words: object) -> str:
     command = [sys.executable, str(EXAMPLES / name), *map(str, words)]
-    done = subprocess.run(command, text=True, capture_output=True, check=False)
+    done = processes.run(command, text=True, capture_output=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

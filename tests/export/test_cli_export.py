@@ -1,6 +1,5 @@
 import json
 import shutil
-import subprocess
 import sys
 import zipfile
 from pathlib import Path
@@ -20,6 +19,7 @@ from edgepose_export.archive.torchscript import Statistics, new_network, script
 from edgepose_export.training.config import config_from
 from edgepose_export.training.dataset import read_take
 from edgepose_export.training.trainer import mean_of, read_checkpoint
+from tests.support import processes
 
 DATA = Path(__file__).parents[1] / "data" / "mocap"
 WALK = DATA / "dataset-2_walk_normal_001.bvh"
@@ -384,7 +384,7 @@ def test_errors_are_one_line(made, tmp_path):
     _, _, train = made
     (tmp_path / "bad.toml").write_text("steps = 'many'\n")
     arguments = [*map(str, train), "--out", str(tmp_path / "run"), "--config", str(tmp_path / "bad.toml")]
-    done = subprocess.run(
+    done = processes.run(
         [sys.executable, "-m", "edgepose", *arguments], capture_output=True, text=True, check=False
     )
     assert done.returncode == 1

@@ -1,7 +1,6 @@
 """The DBC files say the same as the decoders."""
 
 import random
-import subprocess
 import sys
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import firmware_protocols
 from firmware_protocols.native_can import NativeCanDecoder, encode, encode_sync
 from firmware_protocols.native_packet import Packet
 from firmware_protocols.sample import unit_quaternion
+from tests.support import processes
 
 FOLDER = Path(firmware_protocols.__file__).parent / "dbc"
 SCRIPT = Path(__file__).parents[2] / "tools" / "make_dbc.py"
@@ -28,7 +28,7 @@ def mti600():
 
 
 def test_files_are_in_step_with_the_script(tmp_path):
-    subprocess.run([sys.executable, str(SCRIPT), str(tmp_path)], check=True)
+    processes.run([sys.executable, str(SCRIPT), str(tmp_path)], check=True)
     assert sorted(p.name for p in FOLDER.iterdir()) == ["mti600.dbc", "native.dbc"]
     for path in FOLDER.iterdir():
         assert path.read_bytes() == (tmp_path / path.name).read_bytes(), f"run tools/make_dbc.py: {path.name}"

@@ -2,19 +2,134 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
+import ctypes
+import inspect
+import json
+import os
+import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
+from typing import Any
 
-SIMULATOR = Path(__file__).parents[2] / "tools" / "simulate.py"
+ROOT = Path(__file__).parents[2]
+SIMULATOR = ROOT / "tools" / "simulate.py"
+
+_PR_SET_CHILD_SUBREAPER = 36
+_OWN_PYTHON = ("LANG", "LC_", "LD_", "MKL_", "OMP_", "PYTHON")
+"""Variables that a Python reads when it starts, or the libraries when they are imported."""
+
+
+class Popen(subprocess.Popen):
+    """`subprocess.Popen`, but modules and scripts are forked from a Python that has imported PyTorch.
+
+    Started as always: `-c` and `-X`, other variables of the interpreter, functions between fork and exec.
+    """
+
+    def _execute_child(self, *arguments: Any) -> None:
+        given = dict(zip(_PARAMETERS, arguments, strict=True))
+        words = [os.fspath(word) for word in given["args"]] if isinstance(given["args"], list | tuple) else []
+        environment = dict(os.environ if given["env"] is None else given["env"])
+        if not _can_be_forked(words, given, environment):
+            super()._execute_child(*arguments)
+            return
+        streams = (given["p2cread"], given["c2pwrite"], given["errwrite"])
+        self.pid = _fork(
+            {
+                "words": words[1:],
+                "folder": str(Path(given["cwd"] or ".").absolute()),
+                "environment": environment,
+                "session": given["start_new_session"],
+            },
+            [name if stream == -1 else stream for name, stream in enumerate(streams)],
+        )
+        self._child_created = True
+        self._close_pipe_fds(*(given[name] for name in _PIPES))
+
+
+_PARAMETERS = list(inspect.signature(subprocess.Popen._execute_child).parameters)[1:]
+_PIPES = ("p2cread", "p2cwrite", "c2pread", "c2pwrite", "errread", "errwrite")
+_forking = threading.Lock()
+
+
+def _can_be_forked(words: list[str], given: Mapping[str, Any], environment: Mapping[str, str]) -> bool:
+    def own(variables: Mapping[str, str]) -> dict[str, str]:
+        return {name: text for name, text in variables.items() if name.startswith(_OWN_PYTHON)}
+
+    return (
+        sys.platform == "linux"
+        and words[:1] == [sys.executable]
+        and (words[1:2] == ["-m"] or words[1].endswith(".py"))
+        and own(environment) == own(os.environ)
+        and given["preexec_fn"] is None
+        and not given["pass_fds"]
+    )
+
+
+@cache
+def _warm_python() -> socket.socket:
+    """The line to the Python that forks; it ends with this process."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    command = [sys.executable, "-m", "tests.support.warm_python", str(theirs.fileno())]
+    process = subprocess.Popen(command, pass_fds=[theirs.fileno()], cwd=ROOT, stdin=subprocess.DEVNULL)
+    theirs.close()
+
+    @atexit.register
+    def end() -> None:
+        ours.close()
+        process.wait()
+
+    return ours
+
+
+def _fork(request: Mapping[str, Any], streams: list[int]) -> int:
+    """Id of a new process, which is a child of this one."""
+    with _forking:
+        channel = _warm_python()
+        reaper = ctypes.CDLL(None).prctl
+        reaper(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+        try:
+            socket.send_fds(channel, [json.dumps(request).encode()], streams)
+            return int(channel.recv(100))
+        finally:
+            reaper(_PR_SET_CHILD_SUBREAPER, 0, 0, 0, 0)
+
+
+def run(
+    command: list[object],
+    *,
+    input: str | bytes | None = None,
+    capture_output: bool = False,
+    timeout: float = 120.0,
+    check: bool = False,
+    **options: Any,
+) -> subprocess.CompletedProcess[Any]:
+    """As `subprocess.run`, with the `Popen` of this module."""
+    if capture_output:
+        options |= {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    if input is not None:
+        options["stdin"] = subprocess.PIPE
+    with Popen(list(map(str, command)), **options) as process:
+        try:
+            out, errors = process.communicate(input, timeout)
+        except BaseException:
+            process.kill()
+            raise
+    done = subprocess.CompletedProcess(command, process.returncode, out, errors)
+    if check:
+        done.check_returncode()
+    return done
 
 
 def start(*words: object, **options: object) -> subprocess.Popen[str]:
     """The command line with these words; its messages can be read."""
     command = [sys.executable, "-m", "edgepose", *map(str, words)]
-    return subprocess.Popen(command, text=True, **{"stderr": subprocess.PIPE} | options)
+    return Popen(command, text=True, **{"stderr": subprocess.PIPE} | options)
 
 
 def end(process: subprocess.Popen[str]) -> tuple[int, str]:
@@ -31,7 +146,7 @@ def end(process: subprocess.Popen[str]) -> tuple[int, str]:
 def simulated(recording: Path, *flags: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """Simulated sensors, and their port or bus; killing them unplugs it."""
     command = [sys.executable, str(SIMULATOR), str(recording), *map(str, flags)]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    process = Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     with process:
         try:
             yield process, process.stdout.readline().split()[1]

@@ -9,6 +9,8 @@ import pty
 import subprocess
 import termios
 
+from tests.support import processes
+
 
 def own_terminal() -> None:
     """In a new process: the terminal on its standard input becomes its own, as a shell's is."""
@@ -29,7 +31,7 @@ def on_a_terminal(command: list[object], **options: object) -> tuple[int, bytes]
     """Runs a command whose output and messages go to a terminal: exit code, and all that came there."""
     master, slave = pty.openpty()
     options = {"stdin": subprocess.DEVNULL, "stdout": slave, "stderr": slave} | options
-    process = subprocess.Popen(list(map(str, command)), **options)
+    process = processes.Popen(list(map(str, command)), **options)
     os.close(slave)
     try:
         text = rest_of(master)

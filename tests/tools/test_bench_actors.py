@@ -1,6 +1,5 @@
 import re
 import runpy
-import subprocess
 import sys
 from pathlib import Path
 
@@ -9,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from edgepose.placements import BONES
 from edgepose.skeleton import UNOBSERVED, forward_kinematics, local_from_global
+from tests.support import processes
 
 ROOT = Path(__file__).parents[2]
 TOOL = ROOT / "tools" / "bench_actors.py"
@@ -48,7 +48,7 @@ def test_table_of_a_take(tmp_path):
         ("-m", "edgepose", "synthesize", walk, "--out", tmp_path),
         (TOOL, "--data", tmp_path, "--model", "rnn", "--part", "cmu-walk-run"),
     ):
-        done = subprocess.run(
+        done = processes.run(
             [sys.executable, *map(str, words)], text=True, capture_output=True, timeout=120, check=False
         )
         assert done.returncode == 0, done.stderr

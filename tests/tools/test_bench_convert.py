@@ -1,16 +1,17 @@
 """The benchmark of `edgepose convert`, with few files."""
 
 import re
-import subprocess
 import sys
 from pathlib import Path
+
+from tests.support import processes
 
 TOOL = Path(__file__).parents[2] / "tools" / "bench_convert.py"
 
 
 def test_the_broken_file_is_told_and_the_others_are_whole():
     words = ["--files", "4", "--seconds", "2", "--jobs", "2"]
-    result = subprocess.run(
+    result = processes.run(
         [sys.executable, str(TOOL), *words], text=True, capture_output=True, timeout=120, check=False
     )
     assert result.returncode == 0, result.stderr

@@ -1,7 +1,6 @@
 """The measures of `edgepose solve` that docs/guide/solve.md has, on one short take."""
 
 import pickle
-import subprocess
 import sys
 from pathlib import Path
 
@@ -10,13 +9,14 @@ import numpy as np
 from edgepose.placements import BONES
 from edgepose.rotations import rotvec_to_matrix
 from edgepose.skeleton import forward_kinematics
+from tests.support import processes
 
 ROOT = Path(__file__).parents[2]
 TOOL = ROOT / "tools" / "bench_solve.py"
 
 
 def run(*words):
-    result = subprocess.run(
+    result = processes.run(
         [sys.executable, *map(str, words)], text=True, capture_output=True, timeout=120, check=False
     )
     assert result.returncode == 0, result.stderr

@@ -1,10 +1,11 @@
 """The benchmark of many wearers, on two of them for a second."""
 
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from tests.support import processes
 
 TOOL = Path(__file__).parents[2] / "tools" / "bench_wearers.py"
 
@@ -14,7 +15,7 @@ def rows(tmp_path_factory):
     """The cells of the table's rows, and the picture."""
     picture = tmp_path_factory.mktemp("wearers") / "wearers.png"
     words = ["--model", "rnn", "--seconds", "1", "--draw", picture, "2"]
-    result = subprocess.run(
+    result = processes.run(
         [sys.executable, TOOL, *words], text=True, capture_output=True, timeout=120, check=False
     )
     assert result.returncode == 0, result.stderr

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import struct
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from tests.support import processes
 
 pytest.importorskip("matplotlib")
 
@@ -19,7 +20,7 @@ def pictures(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pictures") / "new"
     words = [sys.executable, str(ROOT / "tools" / "draw_readme.py"), "--out", str(folder)]
     words += ["--only", "places", "--only", "calibration-poses"]
-    done = subprocess.run(words, capture_output=True, text=True, cwd=ROOT, check=False)
+    done = processes.run(words, capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 0, done.stderr
     return folder
 

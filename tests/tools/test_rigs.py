@@ -27,6 +27,7 @@ from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import Recording, SensorData
 from edgepose.skeleton import JOINTS, default_body
 from edgepose.sources.can_bus import Buffered
+from tests.support import processes
 
 TOOLS = Path(__file__).parents[2] / "tools"
 RIGS = ("native", "xsens", "witmotion", "hipnuc-canopen", "native-can")
@@ -44,7 +45,7 @@ def clip(tmp_path_factory):
     """1 s of standing and 4.5 s of motion, and the true poses."""
     folder = tmp_path_factory.mktemp("rigs")
     words = ("synthesize", demo.CLIP, "--out", folder / "whole", "--hold", 6, "--mounting", 7, "--rate", 100)
-    subprocess.run(edgepose(*words), check=True, capture_output=True)
+    processes.run(edgepose(*words), check=True, capture_output=True)
     whole = read_recording(folder / "whole" / "09_12.npz")
 
     def cut(data: SensorData) -> SensorData:
@@ -71,9 +72,9 @@ def follow(recording: Path, protocol: str, out: Path) -> tuple[float, float, Pat
         source += ["--protocol", protocol]
         hold = ("--body-frame", "heading:0", "--hold", 2, "--countdown", 0)
         words = edgepose("calibrate", *source, *hold, "--out", calibration)
-        subprocess.run(words, check=True, capture_output=True)
+        processes.run(words, check=True, capture_output=True)
         words = ["--calibration", calibration, "--csv", poses, "--udp", f"127.0.0.1:{heard.getsockname()[1]}"]
-        with subprocess.Popen(edgepose("run", *source, *words), stderr=subprocess.PIPE, text=True) as run:
+        with processes.Popen(edgepose("run", *source, *words), stderr=subprocess.PIPE, text=True) as run:
             try:
                 heard.recv(65536)
                 process.stdin.write("go\n")

@@ -29,6 +29,7 @@ from firmware_protocols.native import cobs_decode
 from firmware_protocols.native_packet import decode_body
 from firmware_protocols.registry import PROTOCOLS
 from firmware_protocols.rotation import rotate
+from tests.support import processes
 
 SIMULATOR = Path(__file__).parents[2] / "tools" / "simulate.py"
 CLIP = SIMULATOR.parent / "data" / "09_12.bvh"
@@ -55,7 +56,7 @@ def recording(tmp_path_factory):
 
 
 def start(*words, stdin=subprocess.PIPE):
-    return subprocess.Popen(
+    return processes.Popen(
         [sys.executable, str(SIMULATOR), *map(str, words)],
         stdin=stdin,
         stdout=subprocess.PIPE,

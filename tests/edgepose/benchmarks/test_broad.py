@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from edgepose import rotations as rot
 from edgepose.benchmarks.broad import Trial, errors, find_trials, read_trial, same_heading, trials
 from edgepose.errors import EdgeposeError
 from edgepose.orientation import OrientationFilter, smooth
+from tests.support import processes
 
 DATA = Path(__file__).parents[2] / "data" / "broad"
 
@@ -144,13 +144,13 @@ def test_the_command(six, tmp_path):
     for trial in (six[0], six[4]):
         np.savez(tmp_path / f"{trial.name}.npz", **as_arrays(cut(trial, slice(4000, 5500))))
     command = [sys.executable, "-m", "edgepose", "bench", "orientation", "--data", tmp_path]
-    shown = subprocess.run(command, capture_output=True, text=True, check=True)
+    shown = processes.run(command, capture_output=True, text=True, check=True)
     assert len(shown.stderr.splitlines()) == 2
     rows = [line.split() for line in shown.stdout.splitlines()]
     names = [row[0] for row in rows if len(row) > 6]
     assert names.count("edgepose") == 4  # filter and smoother, with and without magnetometer
     assert names.count("vqf") == names.count("offlineVQF") == names.count("imufusion") == 2
-    told = json.loads(subprocess.run([*command, "--json"], capture_output=True, check=True).stdout)
+    told = json.loads(processes.run([*command, "--json"], capture_output=True, check=True).stdout)
     assert told["us_a_sample_at_286_hz"] > 0.0
     scores = told["scores"]
     assert len(scores) == 2 * 2 * len({score["filter"] for score in scores})
@@ -159,6 +159,6 @@ def test_the_command(six, tmp_path):
 
 def test_the_command_without_data(tmp_path):
     command = [sys.executable, "-m", "edgepose", "bench", "orientation", "--data", tmp_path]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    result = processes.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 1
     assert result.stderr.startswith(f"edgepose: {tmp_path}: no trials of BROAD")

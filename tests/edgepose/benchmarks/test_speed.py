@@ -1,19 +1,19 @@
 """`edgepose bench`: the speed of every step, with models of a few units."""
 
 import json
-import subprocess
 import sys
 
 import pytest
 
 from edgepose_export.networks.shape import NetworkShape
+from tests.support import processes
 
 RNN = NetworkShape("rnn", 8, "global-6d", "passed", "tilt")
 
 
 def bench(*words):
     command = [sys.executable, "-m", "edgepose", "bench", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    return processes.run(command, capture_output=True, text=True, timeout=120, check=False)
 
 
 def test_every_step_and_way_is_measured(tmp_path, write_archive):

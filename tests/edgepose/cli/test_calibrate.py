@@ -27,6 +27,7 @@ from edgepose.imu import ImuSample
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose_export.synthesis.heading_routine import ASIDE_DEG, exercises
 from firmware_protocols import native, native_packet
+from tests.support import processes
 from tests.support.ports import Port, Sender
 
 REAL = Path(__file__).parents[2] / "data" / "imu" / "six-sites-3s.npz"
@@ -403,7 +404,7 @@ def test_a_whole_session_on_a_terminal(wearer: Wearer, tmp_path: Path) -> None:
     wearer.quats_at = lambda t: lying()
     terminal, inside = pty.openpty()
     out = tmp_path / "calib.json"
-    process = subprocess.Popen(
+    process = processes.Popen(
         [sys.executable, "-m", "edgepose", "calibrate", "--port", wearer.port, "--heading-reset", "live",
          "--hold", "0.4", "--countdown", "0", "--out", str(out)],
         stdin=inside, stdout=inside, stderr=inside,

@@ -10,7 +10,6 @@ import pty
 import re
 import signal
 import struct
-import subprocess
 import sys
 import termios
 from collections.abc import Iterator
@@ -23,6 +22,7 @@ from edgepose.formats.recordings.npz import write_npz
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import open_source
+from tests.support import processes
 from tests.support.ports import Port
 from tests.support.processes import simulated
 from tests.support.terminals import rest_of
@@ -179,7 +179,7 @@ class Terminal:
         self.master, slave = pty.openpty()
         fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 30, columns, 0, 0))
         self._read = b""
-        self.process = subprocess.Popen(
+        self.process = processes.Popen(
             [sys.executable, "-m", "edgepose", "check", *map(str, words)],
             stdin=slave,
             stdout=slave,

@@ -35,6 +35,7 @@ from firmware_protocols import native_can
 from firmware_protocols.native import encode
 from firmware_protocols.native_packet import Packet
 from firmware_protocols.sample import STANDARD_G
+from tests.support import processes
 from tests.support.terminals import on_a_terminal
 
 REAL = Path(__file__).parents[2] / "data" / "imu" / "six-sites-3s.npz"
@@ -122,7 +123,7 @@ def test_standard_input(tmp_path):
     write_csv(tmp_path / "a.csv", read_recording(REAL))
     with (tmp_path / "a.csv").open() as file:
         command = [sys.executable, "-m", "edgepose", "convert", "-", "--to", "npz", "--out", str(tmp_path)]
-        subprocess.run(command, check=True, capture_output=True, stdin=file)
+        processes.run(command, check=True, capture_output=True, stdin=file)
     same(read_recording(REAL), read_recording(tmp_path / "stdin.npz"), 1e-6)
 
 
@@ -305,7 +306,7 @@ def test_ctrl_c_leaves_whole_files(tmp_path):
     recording = read_recording(REAL)
     for i in range(40):
         write_npz(tmp_path / f"{i}.npz", recording)
-    process = subprocess.Popen(
+    process = processes.Popen(
         [sys.executable, "-m", "edgepose", "convert", ".", "--to", "csv", "--jobs", "2", "--out", "out"],
         cwd=tmp_path,
         text=True,
@@ -326,7 +327,7 @@ def test_ctrl_c_leaves_whole_files(tmp_path):
 
 
 def test_a_disk_that_fills_up(tmp_path):
-    process = subprocess.run(
+    process = processes.run(
         [sys.executable, "-m", "edgepose", "convert", str(REAL), "--to", "csv", "--out", str(tmp_path)],
         text=True,
         capture_output=True,
@@ -458,7 +459,7 @@ def test_no_place_to_write_and_no_standard_input(command, tmp_path):
     assert re.search(rf"failed: cannot make the folder {folder}: .*; choose another --out\n", result.stdout)
     words = [sys.executable, "-m", "edgepose", "convert", "-", "--to", "csv", "--out", str(tmp_path / "o")]
     closed = ["sh", "-c", 'exec "$@" <&-', "sh", *words]
-    result = subprocess.run(closed, text=True, capture_output=True, check=False)
+    result = processes.run(closed, text=True, capture_output=True, check=False)
     assert result.returncode == 1
     assert result.stderr == "edgepose: -: there is no standard input; name a file\n"
 

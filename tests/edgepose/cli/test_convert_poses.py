@@ -22,6 +22,7 @@ from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.npz import NpzSink
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics
+from tests.support import processes
 
 REAL = Path(__file__).parents[2] / "data" / "imu" / "six-sites-3s.npz"
 
@@ -162,7 +163,7 @@ def test_poses_on_standard_input(tmp_path):
     out = tmp_path / "out"
     for words in (["--to", "bvh"], ["--to", "npz", str(tmp_path / "a.csv"), "--jobs", "2"]):
         command = [*edgepose, "-", *words, "--out", str(out)]
-        result = subprocess.run(command, input=text, text=True, capture_output=True, check=False)
+        result = processes.run(command, input=text, text=True, capture_output=True, check=False)
         assert result.returncode == 0, result.stdout + result.stderr
         check(out / f"stdin.{words[1]}", 20, True)
 

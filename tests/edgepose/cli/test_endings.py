@@ -16,6 +16,7 @@ import time
 import pytest
 
 from edgepose.formats.poses.registry import read_poses
+from tests.support import processes
 
 RUN = [sys.executable, "-m", "edgepose", "run", "--model", "rnn"]
 LIMIT_S = 60.0
@@ -34,7 +35,7 @@ def started(wearer, *words: object, short: bool = False, **options) -> subproces
     """A run on 12 s, or 3 s, of a recording."""
     file = wearer.short if short else wearer.recording
     command = [*RUN, "--file", file, "--calibration", wearer.calibration, *words]
-    return subprocess.Popen(list(map(str, command)), **options)
+    return processes.Popen(list(map(str, command)), **options)
 
 
 def ended(process: subprocess.Popen) -> tuple[int, str]:
@@ -103,7 +104,7 @@ def test_standard_error_that_nobody_reads(wearer, tmp_path, how):
 
 
 def test_every_command_works_without_standard_error():
-    done = subprocess.run(
+    done = processes.run(
         [sys.executable, "-m", "edgepose", "models"], stdout=subprocess.PIPE, preexec_fn=lambda: os.close(2)
     )
     assert done.returncode == 0
@@ -159,7 +160,7 @@ def test_nohup_goes_on(wearer, tmp_path):
 
 
 def test_a_recording_to_a_pipe_that_nobody_reads(wearer):
-    process = subprocess.Popen(
+    process = processes.Popen(
         [sys.executable, "-m", "edgepose", "record", "-", "--file", str(wearer.recording)],
         text=True,
         stdout=subprocess.PIPE,
@@ -190,7 +191,7 @@ def test_a_pipe_is_waited_for_until_the_run_is_to_end(wearer, tmp_path):
 def test_a_user_without_a_home(tmp_path):
     """As in a container that runs under any number."""
     environment = {k: v for k, v in os.environ.items() if k not in ("HOME", "XDG_CONFIG_HOME")}
-    done = subprocess.run(
+    done = processes.run(
         [sys.executable, "-m", "edgepose", "models"],
         text=True,
         capture_output=True,

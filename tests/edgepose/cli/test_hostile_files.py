@@ -8,7 +8,6 @@ import re
 import resource
 import sqlite3
 import struct
-import subprocess
 import sys
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from edgepose.formats.recordings.registry import read_recording
 from edgepose.utils.safe_pickle import read_pickle
 from firmware_protocols import native_can
 from firmware_protocols.native_packet import Packet
+from tests.support import processes
 
 RUN = [sys.executable, "-m", "edgepose", "run", "--model", "rnn"]
 LIMIT_S = 60.0
@@ -78,7 +78,7 @@ def test_pickles_that_ask_for_everything(tmp_path, name):
     )
     command = [sys.executable, "-c", code, str(path)]
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
-    done = subprocess.run(
+    done = processes.run(
         command, text=True, capture_output=True, timeout=LIMIT_S, check=False, env=environment
     )
     expected = "read\n" if name == "memory" else "FileFormatError "
@@ -258,7 +258,7 @@ def test_a_device_without_an_end_as_a_text_file(wearer, flag):
     if flag == "--rig":
         given = {"--rig": "/dev/zero"}
     words = [str(word) for pair in given.items() for word in pair]
-    done = subprocess.run(
+    done = processes.run(
         [*RUN, *words],
         text=True,
         capture_output=True,

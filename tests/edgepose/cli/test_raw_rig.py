@@ -29,6 +29,7 @@ from edgepose.placements import PLACEMENTS
 from edgepose.skeleton import local_from_global
 from edgepose_export.mocap import read_motion, resample
 from edgepose_export.synthesis.heading_routine import with_exercises
+from tests.support import processes
 from tests.support.datagrams import free_address
 from tests.support.recordings import write_part
 from tests.support.terminals import own_terminal
@@ -47,7 +48,7 @@ class Rig(NamedTuple):
 
 
 def simulate(*words: object) -> None:
-    subprocess.run([sys.executable, str(SIMULATOR), str(CLIP), *map(str, words)], check=True, timeout=120)
+    processes.run([sys.executable, str(SIMULATOR), str(CLIP), *map(str, words)], check=True, timeout=120)
 
 
 def calibrated(*words: object) -> Result:
@@ -211,12 +212,12 @@ def test_a_live_run_begins_with_the_pose_and_re_zeroes_on_request(rig, tmp_path)
     poses, terminal = tmp_path / "poses.csv", Terminal()
     address = free_address(socket.SOCK_DGRAM)
     control = ("127.0.0.1", int(address.rpartition(":")[2]))
-    simulator = subprocess.Popen(
+    simulator = processes.Popen(
         [sys.executable, str(SIMULATOR), str(clip), "--stand"],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     before = terminal.modes()
-    run = subprocess.Popen(
+    run = processes.Popen(
         [sys.executable, "-m", "edgepose", "run", "--port", said(simulator, "port"), "--filter", "kalman",
          "--calibration", str(rig.calibration), "--model", "rnn", "--csv", str(poses),
          "--control", address],

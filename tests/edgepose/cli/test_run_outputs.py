@@ -19,6 +19,7 @@ from edgepose.formats.joint_tree import forward
 from edgepose.formats.poses.registry import read_poses
 from edgepose.skeleton import default_body, forward_kinematics
 from edgepose_export.mocap import read_motion
+from tests.support import processes
 from tests.support.datagrams import Listener, free_address
 
 
@@ -59,7 +60,7 @@ def test_an_interrupted_run_leaves_whole_files(wearer, tmp_path, number):
     command = [sys.executable, "-m", "edgepose", "run", "--file", wearer.recording, "--realtime"]
     command += ["--calibration", wearer.calibration, "--model", "rnn", "--tcp", address]
     command += ["--csv", tmp_path / "a.csv", "--npz", tmp_path / "a.npz", "--bvh", tmp_path / "a.bvh"]
-    process = subprocess.Popen(list(map(str, command)), text=True, stderr=subprocess.PIPE)
+    process = processes.Popen(list(map(str, command)), text=True, stderr=subprocess.PIPE)
     host, _, port = address.partition(":")
     while True:
         try:

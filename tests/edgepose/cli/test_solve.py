@@ -4,7 +4,6 @@ import os
 import pickle
 import re
 import signal
-import subprocess
 import sys
 import time
 
@@ -19,6 +18,7 @@ from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import Recording, SensorData
 from edgepose.rotations import rotvec_to_matrix
 from edgepose.skeleton import default_body, forward_kinematics
+from tests.support import processes
 
 PLAIN = ("--evaluations", 12)
 
@@ -209,7 +209,7 @@ def test_ctrl_c_keeps_what_is_done(wearer, tmp_path, jobs):
     words = [sys.executable, "-u", "-m", "edgepose", "solve", path, "--calibration", wearer.calibration]
     words += ["--csv", out, "--jobs", jobs, "--evaluations", 6]
     master, slave = os.openpty()  # a terminal, on which progress shows
-    process = subprocess.Popen([str(word) for word in words], stderr=slave, start_new_session=True)
+    process = processes.Popen([str(word) for word in words], stderr=slave, start_new_session=True)
     os.close(slave)
     seen = b""
     until = time.monotonic() + 100.0

@@ -30,6 +30,7 @@ from edgepose.placements import PLACEMENTS
 from edgepose.sinks.csv import CsvSink
 from edgepose.sources import open_source
 from edgepose_export.networks.shape import NetworkShape
+from tests.support import processes
 from tests.support.datagrams import Listener
 from tests.support.processes import simulated
 from tests.support.recordings import write_part
@@ -217,7 +218,7 @@ def test_several_wearers_write_to_nothing_that_can_stop_them(command, rig, tmp_p
     # Where standard output is a file, there is no reader.
     rigs = map(str, words(rig(), rig("ben", csv="-")))
     with (tmp_path / "out.csv").open("w") as out:
-        done = subprocess.run([sys.executable, "-m", "edgepose", "run", *rigs, "--model", "rnn"], stdout=out)
+        done = processes.run([sys.executable, "-m", "edgepose", "run", *rigs, "--model", "rnn"], stdout=out)
     assert done.returncode == 0
     assert len(read_poses(tmp_path / "out.csv").frames) == 180
 
@@ -339,7 +340,7 @@ def test_a_port_that_is_unplugged_and_comes_back_costs_only_its_wearer(wearer, r
             rig("ben", file=None, port=str(link), protocol="native", udp=ben.address),
         ]
         command = [sys.executable, "-m", "edgepose", "run", "--model", "rnn", *map(str, words(*rigs))]
-        process = subprocess.Popen(command, stderr=stack.enter_context(log.open("w")))
+        process = processes.Popen(command, stderr=stack.enter_context(log.open("w")))
         stack.callback(process.wait)
         stack.callback(process.kill)
         anna.wait_for("ok", 20)

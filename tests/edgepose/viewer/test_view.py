@@ -36,6 +36,7 @@ from edgepose.sinks.udp import UdpSink, decode, encode_binary, encode_json
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics
 from edgepose.viewer.body_mesh import TIPS, build, ground
 from edgepose.viewer.viewer import UdpPoseStream, Viewer, plain, sensor_table
+from tests.support import processes
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "chrome"))), None)
 needs_browser = pytest.mark.skipif(
@@ -245,7 +246,7 @@ def browser(tmp_path) -> Iterator[Browser]:
 @contextlib.contextmanager
 def started(*words: object) -> Iterator[subprocess.Popen]:
     """The command, running; at the end of the block it is interrupted."""
-    process = subprocess.Popen(
+    process = processes.Popen(
         [sys.executable, "-m", "edgepose", *map(str, words)],
         text=True,
         stdout=subprocess.PIPE,
@@ -384,9 +385,7 @@ def running_run(wearer, out: Path) -> subprocess.Popen:
         "rnn",
     ]
     command += ["--calibration", wearer.calibration, "--csv", out, "--view"]
-    return subprocess.Popen(
-        [*map(str, command)], text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
-    )
+    return processes.Popen([*map(str, command)], text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes as Linux shows them")
@@ -458,7 +457,7 @@ def test_a_file_that_does_not_fit_into_memory(tmp_path):
     path = tmp_path / "a.bvh"
     path.write_text(f"{head}Frames: 5000\nFrame Time: .01\n" + "0\n" * 5000)
     command = [sys.executable, "-c", SHORT_OF_MEMORY, "view", str(path)]
-    result = subprocess.run(command, text=True, capture_output=True, check=False)
+    result = processes.run(command, text=True, capture_output=True, check=False)
     assert result.returncode == 1
     assert result.stderr == "edgepose: not enough memory; give it a shorter file\n"
 

@@ -1,0 +1,84 @@
+"""A Python that has imported the libraries of edgepose, and forks a process for each command of the tests.
+
+Importing PyTorch takes longer than most tests. A forked process has it already. It imports all modules of
+edgepose as a new one does, with its own arguments, folder, environment, standard streams and session.
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import json
+import os
+import runpy
+import socket
+import sys
+from pathlib import Path
+from typing import Any
+
+LIBRARIES = (
+    *("can", "click", "filterpy.kalman", "multiprocessing.pool", "numpy", "scipy.linalg", "scipy.spatial"),
+    *("serial", "torch"),
+)
+
+
+def serve(channel: socket.socket) -> dict[str, Any]:
+    """Answer each request with the id of a new process; return the request in that process.
+
+    A request is JSON with `words`, `folder`, `environment` and `session`, sent with the descriptors of the
+    standard streams. The process is orphaned at once, and so becomes a child of the nearest reaper.
+    """
+    while True:
+        message, streams, _, _ = socket.recv_fds(channel, 1 << 20, 3)
+        if not message:
+            os._exit(0)
+        read, write = os.pipe()
+        parent = os.fork()
+        if not parent:
+            child = os.fork()
+            if child:
+                os.write(write, str(child).encode())
+                os._exit(0)
+            for name, stream in enumerate(streams):
+                os.dup2(stream, name)
+            for file in (*streams, read, write):
+                os.close(file)
+            channel.close()
+            return dict(json.loads(message))
+        os.waitpid(parent, 0)
+        channel.send(os.read(read, 100))
+        for file in (*streams, read, write):
+            os.close(file)
+
+
+def become(request: dict[str, Any]) -> None:
+    """Run what `python WORD ...` runs: a module after -m, or a script."""
+    if request["session"]:
+        os.setsid()
+    os.chdir(request["folder"])
+    os.environ.clear()
+    os.environ.update(request["environment"])
+    open_standard_streams()
+    words = request["words"]
+    if words[0] == "-m":
+        sys.argv, sys.path[0] = words[1:], str(Path.cwd())
+        runpy.run_module(words[1], run_name="__main__", alter_sys=True)
+    else:
+        sys.argv, sys.path[0] = words, str(Path(words[0]).resolve().parent)
+        runpy.run_path(words[0], run_name="__main__")
+
+
+def open_standard_streams() -> None:
+    """Open them as the interpreter does when it starts: the old ones remember what they were opened on."""
+    text = {"encoding": sys.stdout.encoding, "closefd": False}
+    sys.stdin = sys.__stdin__ = os.fdopen(0, **text)
+    sys.stdout = sys.__stdout__ = os.fdopen(1, "w", **text)
+    sys.stderr = sys.__stderr__ = os.fdopen(2, "w", 1, errors="backslashreplace", **text)
+
+
+if __name__ == "__main__":
+    for library in LIBRARIES:
+        importlib.import_module(library)
+    gc.collect()
+    gc.freeze()
+    become(serve(socket.socket(fileno=int(sys.argv[1]))))
