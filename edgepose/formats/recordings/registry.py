@@ -17,7 +17,7 @@ READERS = {
     "mvnx": "edgepose.formats.recordings.mvnx:FORMAT",
     "dip-imu": "edgepose.formats.recordings.dip_imu:FORMAT",
     "totalcapture": "edgepose.formats.recordings.totalcapture:FORMAT",
-    "mt-manager": "edgepose.formats.recordings.mt_manager:FORMAT",
+    "xsens-session": "edgepose.formats.recordings.xsens_session:FORMAT",
     "xio-session": "edgepose.formats.recordings.xio_session:FORMAT",
 }
 """Where each `RecordingFormat` is; modules are imported in this order until one fits a file."""

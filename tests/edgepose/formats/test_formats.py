@@ -135,7 +135,7 @@ WRITERS: dict[str, Callable[[Path, Recording], Path]] = {
     "mvnx": mvnx,
     "dip-imu": dip_imu,
     "totalcapture": totalcapture,
-    "mt-manager": mt_manager,
+    "xsens-session": mt_manager,
     "xio-session": xio_session,
 }
 

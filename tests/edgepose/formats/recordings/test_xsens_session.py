@@ -1,16 +1,18 @@
-"""Sessions of MT Manager, written here in its layout."""
+"""Sessions of Xsens sensors, written here in the layouts of MT Manager and Movella DOT."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.base import iter_samples, recording_from_samples
-from edgepose.formats.recordings.mt_manager import is_session, read_session
 from edgepose.formats.recordings.registry import read_recording
+from edgepose.formats.recordings.xsens_session import is_session, read_session
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
 
@@ -117,7 +119,9 @@ def test_bad_rows_cost_only_themselves(tmp_path):
     lines[-1] = lines[-1][:-3]
     head.write_text("".join(lines))
     recording = read_session(tmp_path)
-    assert recording.damage == f"{head}: 5 bad rows left out"
+    assert recording.damage == (
+        f"{head}: 5 bad rows left out, the first: row 11 holds something that is no number ('8x656100')"
+    )
     assert len(recording.sensors["head"].time_s) == 95
     assert np.isnan(recording.sensors["head"].acc).any(axis=1).sum() == 1
 
@@ -137,3 +141,110 @@ def test_other_files(tmp_path, old, new, message):
     with pytest.raises(EdgeposeError, match=message):
         read_session(tmp_path)
     assert not is_session(tmp_path / "nowhere")
+
+
+# --- other columns, clocks and spellings --------------------------------------------------------------------
+
+ROWS = [row for row in iter_samples(read_recording(REAL)) if row.sensor == 0][:100]
+QUAT = ["Quat_q0", "Quat_q1", "Quat_q2", "Quat_q3"]
+MATRIX = [f"Mat[{row}][{column}]" for column in (1, 2, 3) for row in (1, 2, 3)]
+ACC, FREE, GYR = ([f"{name}_{axis}" for axis in "XYZ"] for name in ("Acc", "FreeAcc", "Gyr"))
+ORIENTATION = {
+    "quaternion": (QUAT, lambda r: r.as_quat()[[3, 0, 1, 2]]),
+    "of DOT": (["Quat_W", "Quat_X", "Quat_Y", "Quat_Z"], lambda r: r.as_quat()[[3, 0, 1, 2]]),
+    "matrix": (MATRIX, lambda r: r.as_matrix().T.ravel()),
+    "Euler": (["Roll", "Pitch", "Yaw"], lambda r: r.as_euler("ZYX", degrees=True)[::-1]),
+    "Euler of DOT": (["Euler_X", "Euler_Y", "Euler_Z"], lambda r: r.as_euler("ZYX", degrees=True)[::-1]),
+}
+
+
+def write(
+    folder: Path, head: str, names: list[str], cells: Callable[[int, ImuSample], list[float]], **spelling: str
+) -> Path:
+    """The same sensor as all six; `cells` gives the numbers of a row."""
+    text = ",".join(names) + "\n"
+    for i, row in enumerate(ROWS):
+        text += ",".join(str(x) if isinstance(x, int) else f"{x:.9f}" for x in cells(i, row)) + "\n"
+    text = head + text.replace(",", spelling.get("separator", "\t")).replace(".", spelling.get("point", "."))
+    folder.mkdir()
+    for name in PLACEMENTS:
+        path = folder / f"{name}{spelling.get('ending', '.txt')}"
+        path.write_text(text, encoding=spelling.get("encoding", "utf-8"))
+    return folder
+
+
+def turned(row: ImuSample) -> Rotation:
+    return Rotation.from_quat(np.roll(row.quat, -1))
+
+
+def check_rows(folder: Path, gyr: bool = True) -> None:
+    recording = read_recording(folder)
+    assert recording.damage is None
+    for data in recording.sensors.values():
+        np.testing.assert_allclose(data.time_s, [row.time_s - ROWS[0].time_s for row in ROWS], atol=2e-6)
+        np.testing.assert_allclose(np.abs(np.sum(data.quat * [row.quat for row in ROWS], axis=1)), 1.0)
+        np.testing.assert_allclose(data.acc, [row.acc for row in ROWS], atol=1e-6)
+        if gyr:
+            np.testing.assert_allclose(data.gyr, [row.gyr for row in ROWS], atol=1e-6)
+        else:
+            assert data.gyr is None
+
+
+@pytest.mark.parametrize("name", ORIENTATION)
+def test_an_orientation_in_any_form(tmp_path, name):
+    columns, values = ORIENTATION[name]
+    head = "DeviceTag: A\n" if "DOT" in name else HEAD
+    check_rows(
+        write(
+            tmp_path / "walk",
+            head,
+            ["PacketCounter", "SampleTimeFine", *ACC, *columns],
+            lambda i, row: [i, 10_000 * i if "DOT" in name else 100 * i, *row.acc, *values(turned(row))],
+        ),
+        gyr=False,
+    )
+
+
+@pytest.mark.parametrize(
+    "spelling",
+    [
+        {"separator": ";", "point": ","},
+        {"separator": "\t", "point": ",", "encoding": "utf-16"},
+        {"separator": ";", "encoding": "utf-8-sig", "ending": ".csv"},
+        {"separator": ", ", "ending": ".CSV"},
+    ],
+)
+def test_a_table_of_any_spelling(tmp_path, spelling):
+    """Without an update rate: the rate is that of SampleTimeFine, which starts again at 0 on the way."""
+    check_rows(
+        write(
+            tmp_path / "walk",
+            "// MT Manager version: 2020\n",
+            ["PacketCounter", "SampleTimeFine", *ACC, *GYR, *QUAT],
+            lambda i, row: [i, (2**32 - 300 + 100 * i) % 2**32, *row.acc, *row.gyr, *row.quat],
+            **spelling,
+        )
+    )
+
+
+def test_movella_dot(tmp_path):
+    """Acceleration without gravity in the inertial frame, rates in degrees a second, microseconds."""
+
+    def cells(i: int, row: ImuSample) -> list[float]:
+        free = turned(row).apply(row.acc) - [0.0, 0.0, 9.80665]
+        return [i, (2**32 - 30_000 + 10_000 * i) % 2**32, *row.quat, *free, *np.degrees(row.gyr), 0]
+
+    names = ["PacketCounter", "SampleTimeFine", *ORIENTATION["of DOT"][0], *FREE, *GYR, "Status"]
+    head = "sep=,\nDeviceTag:,A\nOutputRate:,100Hz\n\n"
+    check_rows(write(tmp_path / "walk", head, names, cells, separator=",", ending=".csv"))
+
+
+def test_decimal_commas_between_commas(tmp_path):
+    names = ["PacketCounter", "SampleTimeFine", *ACC, *QUAT]
+    folder = write(
+        tmp_path / "walk", HEAD, names, lambda i, row: [i, i, *row.acc, *row.quat], separator=",", point=","
+    )
+    with pytest.raises(
+        EdgeposeError, match="row 6 has 16 cells for 9 columns: its numbers have decimal"
+    ):
+        read_recording(folder)

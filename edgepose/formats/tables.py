@@ -1,0 +1,178 @@
+"""Tables of numbers in text files, however a program or a spreadsheet has written them.
+
+Columns are separated by tabs, semicolons, commas or bars. Numbers have a decimal point or comma. The text is
+UTF-8 or UTF-16. There may be a byte order mark, a `sep=` line, quotes, and empty cells and rows at the ends.
+"""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from math import isfinite, nan
+from pathlib import Path
+from typing import NamedTuple, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgepose.errors import FileFormatError
+from edgepose.formats.ledger import Ledger
+
+HEAD_LINES = 50
+"""Lines in which the names of the columns have to come."""
+
+MAX_LINE = 4096
+"""Longest line, characters."""
+
+SEPARATORS = "\t;,|"
+
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+_BOMS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
+
+
+class Row(NamedTuple):
+    """One row of a table.
+
+    Attributes:
+        number: of its line in the file, from 1.
+        cells: one for each column; numbers have a decimal point.
+        ended: whether the line has an end: without one, digits may be missing.
+    """
+
+    number: int
+    cells: list[str]
+    ended: bool
+
+
+class Table(NamedTuple):
+    """A table whose rows are still to be read.
+
+    Attributes:
+        head: the lines before the names of the columns.
+        names: of the columns.
+        rows: all rows that are not empty, of any number of cells.
+    """
+
+    head: list[str]
+    names: list[str]
+    rows: Iterator[Row]
+
+
+def encoding_of(path: Path) -> str:
+    """Encoding of a text file by its byte order mark; UTF-8 without one."""
+    with path.open("rb") as file:
+        start = file.read(4)
+    return next((name for mark, name in _BOMS.items() if start.startswith(mark)), "utf-8")
+
+
+@contextmanager
+def open_table(path: Path, fits: Callable[[Sequence[str]], bool], wanted: str) -> Iterator[Table]:
+    """Open a table of which the columns are known by name.
+
+    Args:
+        path: the file.
+        fits: whether cells are the names of the columns.
+        wanted: what the columns are, for the message.
+
+    Raises:
+        FileFormatError: no line has these columns, or a line is longer than MAX_LINE.
+        OSError: the file cannot be read.
+    """
+    with path.open(encoding=encoding_of(path), errors="replace", newline="") as file:
+        lines = _Lines(path, file)
+        head: list[str] = []
+        for line in lines:
+            for separator in SEPARATORS:
+                names = _trimmed(next(csv.reader([line], delimiter=separator)))
+                if fits(names):
+                    yield Table(head, names, _rows(path, lines, separator, len(names)))
+                    return
+            head.append(line.strip())
+            if len(head) == HEAD_LINES:
+                break
+        first = next((line for line in head if line), "")
+        raise FileFormatError(f"{path}: no line has the columns {wanted}; it starts with {first[:60]!r}")
+
+
+class _Lines:
+    """Lines of a text file, counted; the csv module joins those of a quoted line break."""
+
+    def __init__(self, path: Path, file: TextIO) -> None:
+        self.number, self.ended = 0, True
+        self._path, self._file = path, file
+
+    def __iter__(self) -> _Lines:
+        return self
+
+    def __next__(self) -> str:
+        line = self._file.readline(MAX_LINE)
+        if not line:
+            raise StopIteration
+        self.number += 1
+        self.ended = line.endswith(("\n", "\r"))
+        if len(line) == MAX_LINE:
+            raise FileFormatError(
+                f"{self._path}: row {self.number} is longer than {MAX_LINE} characters; is it a table?"
+            )
+        return line
+
+
+def _rows(path: Path, lines: _Lines, separator: str, columns: int) -> Iterator[Row]:
+    # Where commas separate columns, none is in a number.
+    commas = separator != ","
+    for cells in csv.reader(lines, delimiter=separator, skipinitialspace=True):
+        cells = _trimmed(cells, columns)
+        if not any(cells):
+            continue
+        if commas:
+            cells = [cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells]
+        elif len(cells) > columns and len(cells) >= 2 * columns - 2:
+            raise FileFormatError(
+                f"{path}: row {lines.number} has {len(cells)} cells for {columns} columns: its numbers have "
+                "decimal commas, and commas separate the columns, too; export it with decimal points"
+            )
+        yield Row(lines.number, cells, lines.ended)
+
+
+def read_numbers(table: Table, ledger: Ledger) -> tuple[NDArray[np.int_], dict[str, NDArray[np.float64]]]:
+    """Read the rest of a table of numbers alone.
+
+    Args:
+        table: whose columns all hold numbers, or nothing, in a good row.
+        ledger: counts the rows that are left out.
+
+    Returns:
+        Numbers (n,) of the rows, and the values (n,) of each column; NaN where a cell is empty.
+    """
+    rows: list[int] = []
+    values: list[list[float]] = []
+    for row in table.rows:
+        try:
+            if len(row.cells) != len(table.names):
+                raise ValueError(f"has {len(row.cells)} columns and not {len(table.names)}")
+            if not row.ended:
+                raise ValueError("has no line end; digits may be missing")
+            values.append([_number(cell) if cell else nan for cell in row.cells])
+            rows.append(row.number)
+        except ValueError as error:
+            ledger.leave_out(row.number, str(error))
+    numbers = np.array(values, dtype=float).reshape(-1, len(table.names))
+    return np.array(rows, dtype=int), dict(zip(table.names, numbers.T, strict=True))
+
+
+def _number(cell: str) -> float:
+    with suppress(ValueError):
+        if isfinite(number := float(cell)):
+            return number
+    raise ValueError(f"holds something that is no number ({cell[:40]!r})")
+
+
+def _trimmed(cells: list[str], least: int = 0) -> list[str]:
+    """Cells without blanks around them and without empty ones at the end."""
+    cells = [cell.strip() for cell in cells]
+    while len(cells) > least and not cells[-1]:
+        cells.pop()
+    return cells
