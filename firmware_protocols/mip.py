@@ -134,17 +134,24 @@ class MipDecoder(StreamDecoder):
         if descriptor not in self._sets:
             self.counters.skipped += 1
             return
+        sample = self._sample(frame, descriptor)
+        if sample is None:
+            self.counters.bad += 1
+        else:
+            self._emit(sample, samples)
+
+    def _sample(self, frame: bytes, descriptor: int) -> Sample | None:
+        """Return the sample of a packet; None if a field has the wrong length."""
         time_ns = period_ns = gps_us = temperature = quat = matrix = euler = acc = gyr = mag = None
-        place, end = 4, len(frame) - 2
-        while place < end:
-            start = place + 2
-            name, layout = _FIELDS.get(descriptor << 8 | frame[place + 1], ("", None))
-            place += frame[place]
+        at, end = 4, len(frame) - 2
+        while at < end:
+            start = at + 2
+            name, layout = _FIELDS.get(descriptor << 8 | frame[at + 1], ("", None))
+            at += frame[at]
             if layout is None:
                 continue
-            if layout.size != place - start:
-                self.counters.bad += 1
-                return
+            if layout.size != at - start:
+                return None
             values = layout.unpack_from(frame, start)
             if descriptor == FILTER_SET and layout in _WITH_FLAGS:
                 if not values[-1]:  # the filter has no estimate yet
@@ -163,33 +170,22 @@ class MipDecoder(StreamDecoder):
             elif name == "euler":
                 euler = from_angles(*values[::-1])
             elif name == "matrix":
-                # The wire has NED -> device by rows.
+                # The packet has NED -> device, row by row.
                 matrix = from_matrix(values[0::3] + values[1::3] + values[2::3])
             elif name == "time":
                 time_ns = values[0]
             elif name == "period":
                 period_ns = values[0]
             elif name == "gps time":
-                # Wrong before the receiver has time, but it runs on.
-                if 0 <= values[0] <= 1e6:
-                    gps_us = values[1] * _WEEK_US + round(values[0] * 1e6)
+                gps_us = _gps_us(values[0], values[1])
             else:
-                temperature = number(values[2])  # least, largest and mean
+                temperature = number(values[2])  # minimum, maximum, mean
+        time_us = gps_us
         if time_ns is not None:
             self._count(descriptor, time_ns, period_ns)
+            time_us = time_ns // 1000
         quat = quat or matrix or euler
-        self._emit(
-            Sample(
-                0,
-                gps_us if time_ns is None else time_ns // 1000,
-                None if quat is None else z_up(quat),
-                acc,
-                gyr,
-                mag,
-                temperature,
-            ),
-            samples,
-        )
+        return Sample(0, time_us, None if quat is None else z_up(quat), acc, gyr, mag, temperature)
 
     def _count(self, descriptor: int, time_ns: int, period_ns: int | None) -> None:
         # There is no counter, but a packet says how long ago the device sent the one before.
@@ -202,6 +198,12 @@ class MipDecoder(StreamDecoder):
 
 
 _WITH_FLAGS = (_VECTOR_VALID, _QUATERNION_VALID, _MATRIX_VALID)
+
+
+def _gps_us(seconds: float, week: int) -> int | None:
+    """Return GPS time in microseconds; None if the second of the week is impossible."""
+    # Before the receiver has the time, the value is wrong but runs on: up to 1e6 is accepted.
+    return week * _WEEK_US + round(seconds * 1e6) if 0 <= seconds <= 1e6 else None
 
 
 def encode_packet(descriptor: int, parts: Iterable[tuple[int, bytes]]) -> bytes:

@@ -30,6 +30,7 @@ _MAX_DEPTH = 2
 _MAX_TAIL = 256  # more than the longest message that is looked for behind a broken one
 
 _FLOATS = {"I": (6,), "Q": (4,), "R": (9,), "A": (3,), "L": (3, 7), "E": (3, 7), "M": (3,), "T": (1,)}
+_ORIENTATIONS = frozenset("QRALE")
 _SKIPPED = "HUSYCBWONF"
 _JSON = "{"
 _BINARY = {
@@ -129,71 +130,26 @@ class Ximu3Decoder(Receiver):
         return []
 
     def _take(self, message: _Message) -> list[Sample] | None:
-        """Samples of a message; None if its content cannot be true."""
+        """Return the samples completed by a message; None if its content is impossible."""
         sensor, letter, time_us, v = message
+        if letter == "I":  # first and with positional arguments: this is the hot path
+            if max(map(abs, v[:3])) > _MAX_RATE or max(map(abs, v[3:])) > _MAX_FORCE:
+                return None
+            if not self._time_fits(sensor, time_us):
+                return None
+            acc = (v[3] * STANDARD_G, v[4] * STANDARD_G, v[5] * STANDARD_G)
+            gyr = (v[0] * _DEG, v[1] * _DEG, v[2] * _DEG)
+            return self._with_slow(self._pairing.add(Sample(sensor, time_us, None, acc, gyr), False))
+        if letter in _ORIENTATIONS:
+            return self._take_orientation(message)
         if letter in ("", _JSON):
             last = self._time.get(sensor)
             if not letter and last is not None and abs(time_us - last) > _MAX_STEP_US:
                 return None
             self.counters.skipped += 1
             return []
-        quat: Quaternion | None = None
-        acc: Vector3 | None = None
-        if letter == "I":
-            if max(map(abs, v[:3])) > _MAX_RATE or max(map(abs, v[3:])) > _MAX_FORCE:
-                return None
-        elif letter == "Q":
-            quat = unit_quaternion(v[0], v[1], v[2], v[3])
-        elif letter == "R":
-            quat = rotation.from_matrix(v)
-        elif letter == "A":
-            roll, pitch, yaw = v
-            if abs(roll) <= 180.1 and abs(pitch) <= 90.1 and abs(yaw) <= 360.1:
-                quat = rotation.from_yaw_pitch_roll(yaw * _DEG, pitch * _DEG, roll * _DEG)
-        elif letter in "LE":
-            if max(map(abs, v[-3:])) > _MAX_FORCE:
-                return None
-            if len(v) == 3:
-                # Newer firmware sends no orientation with these two; inertial messages say the same.
-                self.counters.skipped += 1
-                return []
-            quat = unit_quaternion(v[0], v[1], v[2], v[3])
-        elif not plausible(v):
+        if not plausible(v) or not self._time_fits(sensor, time_us):
             return None
-        if letter in "QRALE" and quat is None:
-            return None
-        if not self._fits(sensor, time_us):
-            return None
-
-        if letter == "I":
-            # Positional: this is the hot path.
-            return self._with_slow(
-                self._pairing.add(
-                    Sample(
-                        sensor,
-                        time_us,
-                        None,
-                        (v[3] * STANDARD_G, v[4] * STANDARD_G, v[5] * STANDARD_G),
-                        (v[0] * _DEG, v[1] * _DEG, v[2] * _DEG),
-                    ),
-                    False,
-                )
-            )
-        if quat is not None:
-            if letter in "LE":
-                moved = (v[4], v[5], v[6])
-                if letter == "E":
-                    moved = rotation.rotate_back(quat, moved)
-            if self._ned:
-                quat = z_up(quat)
-            if letter in "LE":
-                up = rotation.rotate_back(quat, (0.0, 0.0, 1.0))
-                acc = (
-                    (moved[0] + up[0]) * STANDARD_G,
-                    (moved[1] + up[1]) * STANDARD_G,
-                    (moved[2] + up[2]) * STANDARD_G,
-                )
-            return self._with_slow(self._pairing.add(Sample(sensor, time_us, quat, acc), True))
         if letter == "M":
             if sensor in self._mag:
                 self.counters.skipped += 1
@@ -204,7 +160,32 @@ class Ximu3Decoder(Receiver):
             self._temperature[sensor] = (time_us, v[0])
         return []
 
-    def _fits(self, sensor: int, time_us: int) -> bool:
+    def _take_orientation(self, message: _Message) -> list[Sample] | None:
+        """Do what `_take` does for messages with an orientation, which may have an acceleration, too."""
+        sensor, letter, time_us, v = message
+        has_acc = letter in "LE"
+        if has_acc:
+            if max(map(abs, v[-3:])) > _MAX_FORCE:
+                return None
+            if len(v) == 3:
+                # Newer firmware sends these without an orientation; inertial messages have the same content.
+                self.counters.skipped += 1
+                return []
+        if letter == "Q" or has_acc:
+            quat = unit_quaternion(v[0], v[1], v[2], v[3])
+        else:
+            quat = rotation.from_matrix(v) if letter == "R" else _from_degrees(*v)
+        if quat is None or not self._time_fits(sensor, time_us):
+            return None
+        upright = z_up(quat) if self._ned else quat
+        acc: Vector3 | None = None
+        if has_acc:
+            x, y, z = v[4:7] if letter == "L" else rotation.rotate_back(quat, (v[4], v[5], v[6]))
+            a, b, c = rotation.rotate_back(upright, (0.0, 0.0, 1.0))
+            acc = ((x + a) * STANDARD_G, (y + b) * STANDARD_G, (z + c) * STANDARD_G)
+        return self._with_slow(self._pairing.add(Sample(sensor, time_us, upright, acc), True))
+
+    def _time_fits(self, sensor: int, time_us: int) -> bool:
         """If a time can follow the last one; a jump is a restart when a second message confirms it."""
         last = self._time.get(sensor)
         if last is not None and not -_MAX_STEP_US <= time_us - last <= _MAX_STEP_US:
@@ -235,6 +216,13 @@ class Ximu3Decoder(Receiver):
                 sample = sample._replace(temperature=temperature[1])
             result.append(sample)
         return result
+
+
+def _from_degrees(roll: float, pitch: float, yaw: float) -> Quaternion | None:
+    """Return the quaternion of Rz(yaw) Ry(pitch) Rx(roll), degrees; None if an angle is out of its range."""
+    if abs(roll) <= 180.1 and abs(pitch) <= 90.1 and abs(yaw) <= 360.1:
+        return rotation.from_yaw_pitch_roll(yaw * _DEG, pitch * _DEG, roll * _DEG)
+    return None
 
 
 def _parse(line: bytes) -> _Message | None:
