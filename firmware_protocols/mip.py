@@ -18,14 +18,14 @@ from firmware_protocols.rotation import from_angles, from_matrix, to_yaw_pitch_r
 from firmware_protocols.sample import STANDARD_G, Sample, unit_quaternion, z_up
 
 SENSOR_SET = 0x80
-"""Descriptor set of the IMU and its own attitude."""
+"""Descriptor set of the IMU, with an attitude of its own."""
 
 FILTER_SET = 0x82
 """Descriptor set of the estimation filter."""
 
 _GAUSS_UT = 100.0
 _WEEK_US = 604_800_000_000
-_MIN_PERIOD_NS = 100_000  # nothing measures more often
+_MIN_PERIOD_NS = 100_000  # no device measures faster
 
 _VECTOR = struct.Struct(">3f")
 _QUATERNION = struct.Struct(">4f")
@@ -36,7 +36,7 @@ _MATRIX_VALID = struct.Struct(">9fH")
 _NANOSECONDS = struct.Struct(">Q")
 _GPS_TIME = struct.Struct(">dHH")
 
-# What a field holds and how, by descriptor set << 8 | field descriptor.
+# Quantity and layout of a field, by descriptor set << 8 | field descriptor.
 _FIELDS = {
     0x8004: ("acc g", _VECTOR),
     0x8005: ("gyr", _VECTOR),
@@ -61,13 +61,13 @@ _FIELDS = {
 
 
 def checksum(data: bytes) -> bytes:
-    """Fletcher checksum of 8 bit sums, as at the end of every packet."""
+    """Return the Fletcher checksum with 8 bit sums that ends every packet."""
     sums = list(accumulate(data))
     return bytes([sums[-1] & 0xFF, sum(sums) & 0xFF]) if sums else b"\0\0"
 
 
 def fields(packet: bytes) -> Iterator[tuple[int, bytes]]:
-    """Field descriptors and data of a whole packet.
+    """Yield descriptor and data of each field of a complete packet.
 
     Raises:
         ValueError: the fields do not fill the payload.
@@ -82,52 +82,52 @@ def fields(packet: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 class MipDecoder(StreamDecoder):
-    """Measurements out of the MIP stream of one device.
+    """Decoder for the MIP stream of one device.
 
-    A packet with at least one quantity is a sample. The device's attitude turns its frame into north, east,
-    down; samples have it with Z up.
+    Each packet with at least one quantity becomes a sample. The device's attitude maps its frame to north,
+    east, down; samples have it with Z up.
     """
 
-    # Nanoseconds in 64 bits; nothing runs that long.
+    # 64 bits of nanoseconds: 584 years.
     WRAP_US = (1 << 64) // 1000
 
     _START = re.compile(rb"u(?:e|\Z)")
 
     def __init__(self, sets: Iterable[int] = (SENSOR_SET, FILTER_SET)) -> None:
-        """Start with nothing seen.
+        """Create the decoder.
 
         Args:
-            sets: descriptor sets to read. A device may send an attitude in both, from two filters that need
-                not agree: then choose one.
+            sets: descriptor sets to read. A device may send an attitude in both, from two filters that can
+                disagree: choose one then.
 
         Raises:
-            ValueError: unknown set.
+            ValueError: unknown descriptor set.
         """
         super().__init__()
         self._sets = frozenset(sets)
         if not self._sets <= {SENSOR_SET, FILTER_SET}:
-            raise ValueError("sets must be out of 0x80 and 0x82")
+            raise ValueError("sets may contain 0x80 and 0x82 only")
         self._last_ns: dict[int, int] = {}
 
     def _length(self, buffer: bytes, at: int) -> int:
         return buffer[at + 3] + 6 if at + 3 < len(buffer) else 0
 
     def _possible(self, buffer: bytes, at: int, length: int) -> bool:
-        # The fields of a false packet end in the wrong place long before the packet does.
-        place, end = at + 4, at + length - 2
-        while length and place < len(buffer) and place < end:
-            if buffer[place] < 2:
+        # The fields of a false packet rarely fit, which shows before the packet is complete.
+        offset, end = at + 4, at + length - 2
+        while length and offset < len(buffer) and offset < end:
+            if buffer[offset] < 2:
                 return False
-            place += buffer[place]
-        return not length or place <= end
+            offset += buffer[offset]
+        return not length or offset <= end
 
     def _intact(self, buffer: bytes, at: int, length: int) -> bool | None:
-        place, end = at + 4, at + length - 2
-        while place < end:
-            if buffer[place] < 2:
+        offset, end = at + 4, at + length - 2
+        while offset < end:
+            if buffer[offset] < 2:
                 return None
-            place += buffer[place]
-        return checksum(buffer[at:end]) == buffer[end : end + 2] if place == end else None
+            offset += buffer[offset]
+        return checksum(buffer[at:end]) == buffer[end : end + 2] if offset == end else None
 
     def _message(self, frame: bytes, samples: list[Sample]) -> None:
         descriptor = frame[2]
@@ -188,7 +188,7 @@ class MipDecoder(StreamDecoder):
         return Sample(0, time_us, None if quat is None else z_up(quat), acc, gyr, mag, temperature)
 
     def _count(self, descriptor: int, time_ns: int, period_ns: int | None) -> None:
-        # There is no counter, but a packet says how long ago the device sent the one before.
+        # There is no counter, but packets can hold the time since the previous packet.
         pause = time_ns - self._last_ns.get(descriptor, time_ns)
         self._last_ns[descriptor] = time_ns
         if not 0 <= pause <= MAX_PAUSE_US * 1000:
@@ -207,10 +207,10 @@ def _gps_us(seconds: float, week: int) -> int | None:
 
 
 def encode_packet(descriptor: int, parts: Iterable[tuple[int, bytes]]) -> bytes:
-    """The bytes of a packet of fields, given as field descriptor and data.
+    """Return the bytes of a packet; each part is a field descriptor and its data.
 
     Raises:
-        ValueError: the fields are longer than 255 bytes.
+        ValueError: the payload is longer than 255 bytes.
     """
     payload = b"".join(bytes([len(data) + 2, field]) + data for field, data in parts)
     if len(payload) > 255:
@@ -226,16 +226,16 @@ def encode(
     period_us: int | None = None,
     euler: bool = False,
 ) -> bytes:
-    """The bytes that go over the line for a sample.
+    """Return the bytes on the wire for a sample.
 
     Args:
-        sample: its sensor cannot be sent; a temperature only in the sensor set.
+        sample: its sensor id is not sent, its temperature in the sensor set only.
         descriptor: SENSOR_SET or FILTER_SET.
-        period_us: time since the packet before, which shows losses; None leaves it out.
+        period_us: time since the previous packet, for the detection of losses; None leaves it out.
         euler: send angles instead of a quaternion.
 
     Raises:
-        ValueError: unknown set, or a number that does not fit.
+        ValueError: unknown descriptor set, or a number that does not fit.
     """
     if descriptor not in (SENSOR_SET, FILTER_SET):
         raise ValueError(f"descriptor must be 0x80 or 0x82, not 0x{descriptor:X}")

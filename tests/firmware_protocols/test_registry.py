@@ -54,7 +54,7 @@ def test_names_ids_and_words():
     for name, protocol in PROTOCOLS.items():
         assert name == protocol.name
         assert name == name.lower()
-        assert "\n" not in protocol.text
+        assert "\n" not in protocol.description
         assert len(set(protocol.ids)) == len(protocol.ids) in (0, 6)
         assert protocol.ids or protocol.single_device
 
@@ -174,8 +174,8 @@ def test_a_protocol_of_another_package_that_cannot_be_used_costs_only_itself(ins
         "native": "the name is taken",
         "hats": "No module named 'no_such_module'",
         "gloves": "GLOVES",
-        "socks": "is no Protocol of that name",
-        "shoes": "is no Protocol of that name",
+        "socks": "is not a Protocol of that name",
+        "shoes": "is not a Protocol of that name",
     }.items():
         (line,) = [line for line in caplog.messages if line.startswith(f"protocol {name!r} of boots ")]
         assert why in line
@@ -185,7 +185,7 @@ def test_protocols_of_other_packages_are_loaded_only_when_asked_for(install):
     install(["boots = boots_protocol:PROTOCOL"])
     script = (
         "import sys; from firmware_protocols.registry import PROTOCOLS; PROTOCOLS['native']\n"
-        "print('boots_protocol' in sys.modules, PROTOCOLS['boots'].text)"
+        "print('boots_protocol' in sys.modules, PROTOCOLS['boots'].description)"
     )
     result = subprocess.run(
         [sys.executable, "-c", script],
