@@ -111,7 +111,10 @@ class StreamDecoder(Receiver):
 
     @abstractmethod
     def _intact(self, buffer: bytes, at: int, length: int) -> bool | None:
-        """Return whether the checksum is right; None if the structure already shows that it is no frame."""
+        """Return whether the checksum is right; None if `_possible` could have ruled the frame out.
+
+        None counts as noise, as it does when `_possible` sees it: counters must not depend on the chunking.
+        """
 
     @abstractmethod
     def _message(self, frame: bytes, samples: list[Sample]) -> None:

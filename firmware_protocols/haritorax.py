@@ -87,10 +87,10 @@ def _samples(match: re.Match[bytes]) -> list[Sample]:
         return []
     data = b64decode(text)
     if slot is not None:
-        first, step, number = int(slot), _DONGLE_STEP, SLOTS
+        first, step, id_step = int(slot), _DONGLE_STEP, SLOTS
         starts: Iterable[int] = _DONGLE_BLOCKS.get(len(data), ())
     elif len(data) in _WIRED_LENGTHS:
-        first, step, number = 0, _WIRED_STEP, 1
+        first, step, id_step = 0, _WIRED_STEP, 1
         starts = range(0, len(data), _BLOCK.size)
     else:
         return []
@@ -100,7 +100,7 @@ def _samples(match: re.Match[bytes]) -> list[Sample]:
         quat = unit_quaternion(w / _QUAT_STEPS, x / _QUAT_STEPS, y / _QUAT_STEPS, z / _QUAT_STEPS, _TOLERANCE)
         if quat is None:
             return []
-        samples.append(Sample(first + i * number, None, quat, (a * step, b * step, c * step)))
+        samples.append(Sample(first + i * id_step, None, quat, (a * step, b * step, c * step)))
     return samples
 
 

@@ -39,7 +39,7 @@ MAX_NODES = 16
 """Number of nodes that one wireless receiver can serve."""
 
 _HEADER = 6
-_BLOCK = 76  # bytes of an 0x91 item
+_BLOCK = 76  # bytes of a 0x91 item
 _MAX_PAYLOAD = 8 + MAX_NODES * _BLOCK
 _MAX_OTHER = 512  # limit for payloads that do not begin with 0x62
 

@@ -46,7 +46,7 @@ USUAL_FIELDS = ("gyr", "acc", "mag", "quat")
 
 _HEAD = struct.Struct("<3H")
 _START_BYTE, _END = b"\x3a", b"\r\n"
-_AROUND = 1 + _HEAD.size + 2 + len(_END)
+_OVERHEAD = 1 + _HEAD.size + 2 + len(_END)
 
 
 def _layout(fields: Iterable[str], floats: bool) -> tuple[tuple[str, ...], struct.Struct]:
@@ -94,7 +94,7 @@ class LpmsDecoder(StreamDecoder):
         if len(buffer) - at < 1 + _HEAD.size:
             return 0
         length = buffer[at + 5] | buffer[at + 6] << 8
-        return length + _AROUND if length <= MAX_DATA else -1
+        return length + _OVERHEAD if length <= MAX_DATA else -1
 
     def _intact(self, buffer: bytes, at: int, length: int) -> bool:
         end = at + length

@@ -203,7 +203,7 @@ class Encoder:
                         )
                     )
             if sample.quat is not None:
-                # z_up is its own inverse.
+                # z_up is its own inverse, up to the sign of the quaternion.
                 messages.append(
                     self._dialect.MAVLink_attitude_quaternion_message(
                         time_ms, *z_up(sample.quat), *(sample.gyr or (0.0, 0.0, 0.0))

@@ -144,9 +144,10 @@ class MipDecoder(StreamDecoder):
         """Return the sample of a packet; None if a field has the wrong length."""
         time_ns = period_ns = gps_us = temperature = quat = matrix = euler = acc = gyr = mag = None
         at, end = 4, len(frame) - 2
+        set_bits = descriptor << 8
         while at < end:
             start = at + 2
-            name, layout = _FIELDS.get(descriptor << 8 | frame[at + 1], ("", None))
+            name, layout = _FIELDS.get(set_bits | frame[at + 1], ("", None))
             at += frame[at]
             if layout is None:
                 continue

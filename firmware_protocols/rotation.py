@@ -48,7 +48,7 @@ def from_matrix(m: tuple[float, ...], tolerance: float = 0.1) -> Quaternion | No
     Its rows have to be orthonormal, within the tolerance, and right-handed.
     """
     xx, xy, xz, yx, yy, yz, zx, zy, zz = m
-    off = (
+    errors = (
         xx * xx + xy * xy + xz * xz - 1,
         yx * yx + yy * yy + yz * yz - 1,
         zx * zx + zy * zy + zz * zz - 1,
@@ -57,7 +57,7 @@ def from_matrix(m: tuple[float, ...], tolerance: float = 0.1) -> Quaternion | No
         zx * xx + zy * xy + zz * xz,
     )
     det = xx * (yy * zz - yz * zy) - xy * (yx * zz - yz * zx) + xz * (yx * zy - yy * zx)
-    if not all(-tolerance <= value <= tolerance for value in off) or not det > 0:  # NaN compares false
+    if not all(-tolerance <= value <= tolerance for value in errors) or not det > 0:  # NaN compares false
         return None
     # The largest of the four (each is 4 times a square) is at least 1: no division by small numbers.
     squares = (1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz)

@@ -66,8 +66,8 @@ class TextDecoder(Receiver):
             for wanted in pattern.columns.values()
             for name in ([wanted] if isinstance(wanted, str) else wanted)
         }
-        # The first line of columns may lack its beginning and still have the right number of columns.
-        self._whole = self._layout is None
+        # The first line may lack its beginning and still have the right number of columns.
+        self._skip_first = self._layout is not None
         self._scales = {quantity: pattern.scale(quantity) for quantity in UNITS}
         self._clock = pattern.units.get("time") == "clock"
         self._ned = pattern.frame == "NED"
@@ -109,11 +109,11 @@ class TextDecoder(Receiver):
             header = None if self._names.isdisjoint(columns) else find_columns(self.pattern, columns)
             if header is not None:
                 # A second header: the device has restarted.
-                self.counters.restarts += self._layout is not None and self._whole
-                self._layout, self._whole = header, True
+                self.counters.restarts += self._layout is not None and not self._skip_first
+                self._layout, self._skip_first = header, False
                 return None
-            if not self._whole or self._layout is None:
-                self._whole = True
+            if self._skip_first or self._layout is None:
+                self._skip_first = False
                 self.counters.skipped += 1
                 return None
             count, indices = self._layout
@@ -223,7 +223,7 @@ def encode_header(name: str) -> bytes:
 
 
 def encode(sample: Sample, name: str) -> bytes:
-    """Return the line of a sample in a built-in pattern; a missing field or temperature is sent as 0.
+    """Return the line of a sample in a built-in pattern, with zeros for an absent `mag` or temperature.
 
     Raises:
         ValueError: no such pattern, or the sample lacks a quantity of its lines.
@@ -236,7 +236,7 @@ def encode(sample: Sample, name: str) -> bytes:
     if name == "adafruit":
         line = "Quaternion: " + ", ".join(f"{x:.4f}" for x in quat or ())
     elif name == "razor":
-        # z_up is its own inverse.
+        # z_up is its own inverse, up to the sign of the quaternion.
         angles = rotation.to_yaw_pitch_roll(z_up(quat)) if quat is not None else ()
         line = "#YPR=" + ",".join(f"{degrees(x):.2f}" for x in angles)
     else:

@@ -259,34 +259,34 @@ def encode_binary(sample: Sample, *, euler: bool = False) -> bytes:
         ValueError: a number does not fit.
     """
     common = imu = 0
-    first = second = b""
+    common_data = imu_data = b""
     quat = None if sample.quat is None else z_up(sample.quat)
     try:
         if sample.time_us is not None:
             common |= 1 << 0
-            first += struct.pack("<Q", sample.time_us * 1000)
+            common_data += struct.pack("<Q", sample.time_us * 1000)
         if quat is not None and euler:
             common |= 1 << 3
-            first += struct.pack("<3f", *_ypr(quat))
+            common_data += struct.pack("<3f", *_ypr(quat))
         elif quat is not None:
             common |= 1 << 4
-            first += struct.pack("<4f", *quat[1:], quat[0])
+            common_data += struct.pack("<4f", *quat[1:], quat[0])
         if sample.gyr is not None:
             common |= 1 << 5
-            first += struct.pack("<3f", *sample.gyr)
+            common_data += struct.pack("<3f", *sample.gyr)
         if sample.acc is not None:
             common |= 1 << 8
-            first += struct.pack("<3f", *sample.acc)
+            common_data += struct.pack("<3f", *sample.acc)
         if sample.temperature is not None:
             imu |= 1 << 4
-            second += struct.pack("<f", sample.temperature)
+            imu_data += struct.pack("<f", sample.temperature)
         if sample.mag is not None:
             imu |= 1 << 8
-            second += struct.pack("<3f", *(m / _GAUSS_UT for m in sample.mag))
+            imu_data += struct.pack("<3f", *(m / _GAUSS_UT for m in sample.mag))
     except (struct.error, OverflowError) as error:
         raise ValueError(f"cannot send {sample}: {error}") from None
     masks = b"".join(mask.to_bytes(2, "little") for mask in (common, imu) if mask)
-    body = bytes([bool(common) | bool(imu) << 2]) + masks + first + second
+    body = bytes([bool(common) | bool(imu) << 2]) + masks + common_data + imu_data
     return b"\xfa" + body + crc_hqx(body, 0).to_bytes(2, "big")
 
 

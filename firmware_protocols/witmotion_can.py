@@ -56,7 +56,7 @@ class WitCanDecoder(Receiver):
                 is in steps.
         """
         super().__init__()
-        self._fine = fine_angles
+        self._fine_angles = fine_angles
         self._mag_ut = mag_ut
         self._cycles: BoundedDict[tuple[int, bool], Cycle] = BoundedDict()
 
@@ -79,7 +79,7 @@ class WitCanDecoder(Receiver):
             values = {"mag": scaled((x, y, z), self._mag_ut)}
         elif kind != ANGLES:
             values = {}
-        elif not self._fine:
+        elif not self._fine_angles:
             values = angles_of((x, y, z))
         else:
             _, _, axis, angle = _CAN_ANGLE.unpack(data)

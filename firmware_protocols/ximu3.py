@@ -339,7 +339,7 @@ def encode(sample: Sample, *, ascii: bool = False, frame: str = "NWU") -> bytes:
     if sample.acc is not None and sample.gyr is not None:
         parts.append(("I", (*map(degrees, sample.gyr), *(x / STANDARD_G for x in sample.acc))))
     if sample.quat is not None:
-        # z_up is its own inverse.
+        # z_up is its own inverse, up to the sign of the quaternion.
         parts.append(("Q", z_up(sample.quat) if frame == "NED" else sample.quat))
     return b"".join(
         encode_message(letter, time_us, values, sensor=sample.sensor, ascii=ascii) for letter, values in parts

@@ -116,8 +116,8 @@ class Mti600CanDecoder(Receiver):
         """
         if byte_order not in ("big", "little") or frame not in FRAMES:
             raise ValueError(f"unknown byte order {byte_order!r} or frame {frame!r}")
-        sign = ">" if byte_order == "big" else "<"
-        layouts = {kind: (struct.Struct(sign + f), scale) for kind, (f, scale) in _CAN_LAYOUTS.items()}
+        order = ">" if byte_order == "big" else "<"
+        layouts = {kind: (struct.Struct(order + f), scale) for kind, (f, scale) in _CAN_LAYOUTS.items()}
         super().__init__()
         self.WRAP_US = (1 << 32) * time_unit_us
         self._tick_us = time_unit_us
@@ -222,7 +222,7 @@ def encode_mti600(
     """
     if byte_order not in ("big", "little") or frame not in FRAMES:
         raise ValueError(f"unknown byte order {byte_order!r} or frame {frame!r}")
-    sign = ">" if byte_order == "big" else "<"
+    order = ">" if byte_order == "big" else "<"
     quat = z_up(sample.quat) if sample.quat is not None and frame == "NED" else sample.quat
     values: dict[str, tuple[float, ...] | None] = {
         "time": None if sample.time_us is None else (sample.time_us // time_unit_us & 0xFFFFFFFF,),
@@ -240,7 +240,7 @@ def encode_mti600(
             continue
         layout, scale = _CAN_LAYOUTS[kind]
         raw = numbers if kind in ("time", "counter") else [int16(value / scale) for value in numbers]
-        messages.append((ids[kind], struct.pack(sign + layout, *raw)))
+        messages.append((ids[kind], struct.pack(order + layout, *raw)))
     return messages
 
 
