@@ -347,7 +347,7 @@ def encode_tables(samples: Iterable[Sample], *, gateway: int = 0) -> bytes:
 
 def _write_block(sample: Sample, node_ids: bool) -> bytes:
     if sample.quat is None or sample.acc is None or sample.gyr is None:
-        raise ValueError("needs quaternion, acceleration and angular rate")
+        raise ValueError("the sample needs a quaternion, an acceleration and an angular rate")
     return _HI91_WRITE.pack(
         0x91,
         sample.sensor if node_ids else 0,
