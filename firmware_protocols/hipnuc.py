@@ -347,7 +347,7 @@ def encode_tables(samples: Iterable[Sample], *, gateway: int = 0) -> bytes:
 
 def _write_block(sample: Sample, node_ids: bool) -> bytes:
     if sample.quat is None or sample.acc is None or sample.gyr is None:
-        raise ValueError("the sample needs a quaternion, an acceleration and an angular rate")
+        raise ValueError("quaternion, acceleration and angular rate are required")
     return _HI91_WRITE.pack(
         0x91,
         sample.sensor if node_ids else 0,

@@ -149,7 +149,7 @@ def encode_modbus(sample: Sample, *, count: int = ANGLE_REGISTERS, mag_ut: float
         ValueError: a required quantity is missing.
     """
     if sample.acc is None or sample.gyr is None or sample.quat is None:
-        raise ValueError("the sample needs a quaternion, an acceleration and an angular rate")
+        raise ValueError("quaternion, acceleration and angular rate are required")
     words = steps_of(sample.acc, ACC_STEP) + steps_of(sample.gyr, GYR_STEP)
     words += steps_of(sample.mag or (0.0, 0.0, 0.0), mag_ut) + steps_of(
         to_yaw_pitch_roll(sample.quat)[::-1], ANGLE_STEP

@@ -128,7 +128,7 @@ def test_round_trip_91():
     assert (bare.time_us, bare.temperature) == (0, 0)
     (late,), _ = decode(hipnuc.encode(sent[0]._replace(time_us=HipnucDecoder.WRAP_US + 7000)))
     assert late.time_us == 7000
-    with pytest.raises(ValueError, match="needs"):
+    with pytest.raises(ValueError, match="quaternion, acceleration and angular rate are required"):
         hipnuc.encode(Sample(0))
 
 
