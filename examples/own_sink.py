@@ -1,4 +1,4 @@
-"""An output of your own: the height of the right wrist above the pelvis, printed for each pose.
+"""A custom output: prints the height of the right wrist above the pelvis for each pose.
 
 python examples/own_sink.py walk.npz calib.json
 """

@@ -1,4 +1,4 @@
-"""A recording in, poses out: the main job in a few lines.
+"""Compute the poses of a recording, the main job of edgepose, in a few lines.
 
 python examples/poses_of_a_recording.py walk.npz calib.json poses.csv
 """

@@ -1,4 +1,4 @@
-"""The network alone, on numpy arrays: no files, no sensors, no calibration."""
+"""Run the network alone on numpy arrays, without files, sensors or calibration."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ import edgepose
 T = 120
 orientation = np.tile(np.eye(3), (T, 6, 1, 1))  # bones in the body frame: a T-pose
 acceleration = np.zeros((T, 6, 3))  # m/s^2, without gravity
-# Lower legs are vertical in a squat, too: without a motion before it the network cannot tell which it is.
+# Lower legs are vertical in a squat, too: without preceding motion the network cannot tell it from standing.
 rotations = edgepose.load_model("rnn").poses(orientation, acceleration)
 knee = edgepose.JOINTS.index("left_knee")
 angle = np.degrees(np.arccos(np.clip((np.trace(rotations[-1, knee]) - 1) / 2, -1, 1)))

@@ -1,4 +1,4 @@
-"""HiPNUC: fields and numbers that the serial and the CAN forms have in common.
+"""HiPNUC: fields and conversions shared by the serial and the CAN formats.
 
 Layouts are in docs/hipnuc.md. Everything is little-endian.
 """
@@ -12,7 +12,7 @@ from firmware_protocols._numbers import int16, number, vector
 from firmware_protocols.sample import Quaternion, Sample, Vector3, unit_quaternion
 
 WRAP_US = (1 << 32) * 1000
-"""Times of samples wrap here, microseconds: devices count milliseconds in 32 bits."""
+"""Sample times wrap here, microseconds: devices count milliseconds in 32 bits."""
 
 DEG = radians(1.0)
 """One degree, rad."""
@@ -22,21 +22,21 @@ VECTOR_F = struct.Struct("<3f")
 QUAT_I = struct.Struct("<4h")
 QUAT_F = struct.Struct("<4f")
 
-# Bytes of the fields of an 0x83 item by bit of its mask. Other bits have no known length.
+# Sizes in bytes of the fields of a 0x83 item, by bit of its mask. The sizes of other bits are unknown.
 _FIELDS = dict(
     enumerate((12, 12, 12, 12, 16, 8, 8, 4, 4, 12, 12, 12, 12, 12, 24, 4, 4, 4, 4, 4))
 ) | {30: 24, 31: 12}  # fmt: skip
 _TIME_BIT, _TEMPERATURE_BIT = 5, 8
 
 NODE_BIT = 19
-"""Bit of a mask that announces the id of a node."""
+"""Mask bit of the field with the node id."""
 
 MASK_83 = sum(1 << bit for bit in _FIELDS)
-"""Bits of a mask whose fields have a known length."""
+"""Mask bits whose fields have a known size."""
 
 
 def unit(w: float, x: float, y: float, z: float) -> Quaternion:
-    """The quaternion at norm 1.
+    """Return the quaternion normalised to norm 1.
 
     Raises:
         ValueError: its norm is too far from 1.
@@ -48,10 +48,10 @@ def unit(w: float, x: float, y: float, z: float) -> Quaternion:
 
 
 def scaled(values: tuple[float, ...], scale: float) -> Vector3:
-    """A vector times a scale.
+    """Return a vector times a scale.
 
     Raises:
-        ValueError: a value is not finite or too large.
+        ValueError: a value is not finite, or too large.
     """
     result = vector(values, scale)
     if result is None:
@@ -60,10 +60,10 @@ def scaled(values: tuple[float, ...], scale: float) -> Vector3:
 
 
 def temperature_at(data: bytes, at: int) -> float:
-    """The binary32 temperature at a place, degC.
+    """Return the binary32 temperature at an offset, degC.
 
     Raises:
-        ValueError: it is not finite or too large.
+        ValueError: it is not finite, or too large.
     """
     value = number(struct.unpack_from("<f", data, at)[0])
     if value is None:
@@ -72,22 +72,22 @@ def temperature_at(data: bytes, at: int) -> float:
 
 
 def field_or_none(values: tuple[float, ...], scale: float) -> Vector3 | None:
-    """A magnetic field times a scale; None for zeros, which devices without a magnetometer send."""
+    """Return a magnetic field times a scale; None for zeros, which devices without a magnetometer send."""
     field = scaled(values, scale)
     return field if any(field) else None
 
 
 def fields_at(data: bytes, start: int, mask: int, sensor: int) -> tuple[Sample, int]:
-    """Sample of the fields of an 0x83 item, and where they end.
+    """Return the sample in the fields of a 0x83 item, and the offset of their end.
 
     Args:
         data: the item and what follows.
-        start: where its fields begin.
-        mask: which fields there are.
-        sensor: id of the sample, unless a field has one.
+        start: offset of its first field.
+        mask: which fields are present.
+        sensor: sensor id of the sample, unless a field holds one.
 
     Raises:
-        ValueError: too short for its mask, or a value that cannot be true.
+        ValueError: too short for its mask, or an implausible value.
     """
     quat: Quaternion | None = None
     acc: Vector3 | None = None
@@ -120,7 +120,7 @@ def fields_at(data: bytes, start: int, mask: int, sensor: int) -> tuple[Sample, 
 
 
 def write_fields(sample: Sample) -> tuple[int, bytes]:
-    """Mask and fields of an 0x83 item with what the sample has."""
+    """Return mask and fields of a 0x83 item with the quantities that the sample has."""
     mask, out = 0, b""
     for bit, layout, values in (
         (0, "<3f", sample.acc),
@@ -137,10 +137,10 @@ def write_fields(sample: Sample) -> tuple[int, bytes]:
 
 
 def vector_i(values: Vector3, scale: float) -> bytes:
-    """A vector times a scale, as three int16."""
+    """Return a vector times a scale as three int16."""
     return VECTOR_I.pack(*(int16(value * scale) for value in values))
 
 
 def quat_i(quat: Quaternion) -> bytes:
-    """A quaternion as four int16, steps of 0.0001."""
+    """Return a quaternion as four int16, steps of 0.0001."""
     return QUAT_I.pack(*(int16(value * 10000) for value in quat))

@@ -1,4 +1,4 @@
-"""Numbers from and for the wire."""
+"""Checks and rounding of numbers from and for the wire."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ from math import isfinite
 from firmware_protocols.sample import Vector3
 
 LARGEST = 1e7
-"""No quantity of a sensor on a body is larger in its SI unit (uT); what is, squares to infinity later."""
+"""Upper bound of every quantity of a body-worn sensor, SI units (uT); larger values would overflow later."""
 
 
 def plausible(values: Iterable[float]) -> bool:
-    """If these are numbers, and none is beyond LARGEST."""
-    return sum(map(abs, values)) <= LARGEST  # NaN is not, either
+    """Return whether no value is NaN and their magnitudes add up to LARGEST at most."""
+    return sum(map(abs, values)) <= LARGEST  # NaN compares false
 
 
 def vector(values: tuple[float, ...], scale: float = 1.0) -> Vector3 | None:
-    """A vector times a scale; None if it is not plausible."""
+    """Return a vector times a scale; None if it is not plausible."""
     x, y, z = values
     x, y, z = x * scale, y * scale, z * scale
     return (x, y, z) if abs(x) + abs(y) + abs(z) <= LARGEST else None
 
 
 def number(value: float) -> float | None:
-    """A number, or None if it is not plausible."""
+    """Return a number; None if it is not plausible."""
     return value if -LARGEST <= value <= LARGEST else None
 
 
 def int16(value: float) -> int:
-    """The nearest whole number, held at the ends of int16.
+    """Return the nearest integer, clamped to the range of int16.
 
     Raises:
         ValueError: NaN or infinity.

@@ -1,12 +1,12 @@
-"""Losses by the counters that devices send with their packets."""
+"""Detection of lost packets by the counters that devices send."""
 
 from __future__ import annotations
 
 from firmware_protocols.sample import Counters
 
-# A counter of 16 bits can be believed if the pause between two packets is too short for it to go around at
-# the highest rate (2 kHz: 33 s) and the step is no larger than that rate allows, plus some for a coarse
-# clock.
+# A step of a 16 bit counter is believable if the pause between two packets is too short for the counter to
+# wrap at the highest rate (2 kHz: 33 s), and if it is no larger than this rate allows, plus some slack for a
+# coarse clock.
 MAX_PAUSE_US = 30_000_000
 _MIN_PERIOD_US = 500
 _SLACK = 64
@@ -15,7 +15,7 @@ _MAX_STEP = 1000  # without a clock
 
 
 class Sequence:
-    """Counts what is missing in the 16 bit packet counters of up to 256 sensors on a line."""
+    """Counts missing packets by the 16 bit packet counters of up to 256 sensors on a line."""
 
     def __init__(self, counters: Counters, wrap_us: int) -> None:
         """Count into `counters`; device clocks wrap at `wrap_us`."""
@@ -24,7 +24,7 @@ class Sequence:
         self._last: dict[int, tuple[int, int | None]] = {}  # count, time by sensor
 
     def is_new(self, sensor: int, count: int, time_us: int | None) -> bool:
-        """If a packet is none that came before; losses are counted."""
+        """Return whether a packet is neither a duplicate nor late, and count the packets lost before it."""
         last_count, last_us = self._last.get(sensor, (count - 1, time_us))
         step = (count - last_count) & 0xFFFF
         back = -step & 0xFFFF
@@ -43,7 +43,7 @@ class Sequence:
             return False
         self._last[sensor] = (count, time_us)
         if believable:
-            # A step of 0 with a new time is a sensor that does not count.
+            # A step of 0 with a new time means that the sensor does not count.
             self._counters.lost += max(step - 1, 0)
         else:
             self._counters.restarts += 1
@@ -51,10 +51,10 @@ class Sequence:
 
 
 def count_byte(counters: Counters, last: int | None, count: int) -> None:
-    """Count what is missing between two packets by an 8 bit counter.
+    """Count the packets missing between two others by their 8 bit counter.
 
-    The same count again is a device that does not count, half of the range or more a restart. Nothing is
-    late: a counter this short cannot tell.
+    An unchanged count means that the device does not count, a step of more than half the range is a restart.
+    No packet counts as late: the counter is too short to tell.
     """
     step = 0 if last is None else (count - last) & 0xFF
     if step > 128:

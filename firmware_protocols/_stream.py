@@ -1,4 +1,4 @@
-"""What decoders share: counting good and bad, and finding frames with start bytes on a bad line."""
+"""Base classes of decoders: counters, and the search for frames with start bytes on a noisy line."""
 
 from __future__ import annotations
 
@@ -10,35 +10,35 @@ from firmware_protocols.base import Decoder
 from firmware_protocols.sample import Counters, Sample
 
 NOTHING = (None,) * 5
-"""Quantities of a sample that has none."""
+"""Quantities of an empty sample."""
 
 
 class Receiver(Decoder):
-    """A decoder that counts what comes.
+    """A decoder with counters.
 
     Attributes:
-        counters: what has been seen so far.
+        counters: counts of everything decoded so far.
     """
 
     def __init__(self) -> None:
-        """Start with nothing seen."""
+        """Create the decoder."""
         self.counters = Counters()
         self._in_sync = True
 
     def _count_bad(self) -> list[Sample]:
-        """Something came that is no valid packet."""
+        """Count a piece of input that is no valid packet; return no samples."""
         self.counters.bad += 1
         self._in_sync = False
         return []
 
     def _count_good(self) -> None:
-        """A valid packet came."""
+        """Count the end of a corrupted stretch, if there was one, at a valid packet."""
         if not self._in_sync:
             self._in_sync = True
             self.counters.resyncs += 1
 
     def _emit(self, sample: Sample, samples: list[Sample]) -> None:
-        """Append a sample, if there is anything in it."""
+        """Append a sample unless it is empty."""
         if sample[2:] == NOTHING:
             self.counters.skipped += 1
         else:
@@ -47,27 +47,27 @@ class Receiver(Decoder):
 
 
 class StreamDecoder(Receiver):
-    """Samples out of a byte stream that may be cut anywhere, start anywhere and contain noise.
+    """Decoder for a byte stream that may be split anywhere, start anywhere and contain noise.
 
-    After a frame that turns out to be none, the search goes on one byte after its start: a start byte can
-    occur inside a payload, and a false length must not swallow the good frames behind it.
+    After a false frame the search continues one byte after its start: a start byte can occur inside a
+    payload, and a false length must not swallow the good frames after it.
     """
 
     _START: ClassVar[re.Pattern[bytes]]
-    """Where a frame can start; has to match its first byte alone at the end of the data."""
+    """Pattern of the start of a frame; at the end of the data, it must match the first byte alone."""
 
     _PADDING: ClassVar[bytes] = b""
     """Bytes that are allowed between frames."""
 
     def __init__(self) -> None:
-        """Start with nothing seen."""
+        """Create the decoder."""
         super().__init__()
-        self._rest = b""  # the frame under way
-        self._at = 0  # place of its first byte in the stream
-        self._bad_end = 0  # place in the stream where the last bad piece ends
+        self._rest = b""  # the beginning of an incomplete frame
+        self._at = 0  # its offset in the stream
+        self._bad_end = 0  # offset in the stream of the end of the last bad piece
 
     def feed(self, data: bytes) -> list[Sample]:
-        """Samples completed by the next bytes of the stream, in the order they came."""
+        """Return the samples completed by the next bytes of the stream, in order of arrival."""
         self.counters.bytes += len(data)
         buffer = self._rest + data
         end = len(buffer)
@@ -82,7 +82,7 @@ class StreamDecoder(Receiver):
                 continue
             length = self._length(buffer, at)
             if length > end - at or not length:
-                # A frame under way, unless what there is of it cannot be one.
+                # An incomplete frame, unless its bytes so far rule that out.
                 if self._possible(buffer, at, length):
                     break
                 length = -1
@@ -103,22 +103,25 @@ class StreamDecoder(Receiver):
 
     @abstractmethod
     def _length(self, buffer: bytes, at: int) -> int:
-        """Length of the whole frame at a place; 0 if more bytes are needed to tell; negative if none."""
+        """Return the length of the frame at an offset; 0 if more bytes are needed; negative if it is none."""
 
     def _possible(self, buffer: bytes, at: int, length: int) -> bool:
-        """If the end of the buffer can be the beginning of a frame; a length of 0 is not known yet."""
+        """Return whether a frame can begin at an offset; a length of 0 is not known yet."""
         return True
 
     @abstractmethod
     def _intact(self, buffer: bytes, at: int, length: int) -> bool | None:
-        """If the checksum is good; None if the structure is none, wherever `_possible` may have seen that."""
+        """Return whether the checksum is right; None if `_possible` could have ruled the frame out.
+
+        None counts as noise, as it does when `_possible` sees it: counters must not depend on the chunking.
+        """
 
     @abstractmethod
     def _message(self, frame: bytes, samples: list[Sample]) -> None:
-        """Append what an intact frame holds."""
+        """Append the samples of an intact frame."""
 
     def _bad_frame(self, start: int, end: int) -> None:
-        # False frames inside a bad one are part of it.
+        # Count a bad frame and the false ones inside it once.
         if self._in_sync or start >= self._bad_end:
             self.counters.bad += 1
             self._bad_end = end
@@ -132,6 +135,6 @@ class StreamDecoder(Receiver):
             start += padding
             data = data[padding:]
             self.counters.bad += 1
-        # Bytes behind a bad piece belong to it until something good comes.
+        # Bytes after a bad piece belong to it, up to the next good frame.
         self._bad_end = max(self._bad_end, start + len(data))
         self._in_sync = False

@@ -1,4 +1,4 @@
-"""WitMotion: types and steps that all its links have in common, and how packets become samples.
+"""WitMotion: packet types and scales shared by all links, and the assembly of samples from packets.
 
 Layouts are in docs/witmotion.md.
 """
@@ -14,7 +14,7 @@ from firmware_protocols.rotation import from_angles, to_yaw_pitch_roll
 from firmware_protocols.sample import STANDARD_G, Counters, Sample, Vector3
 
 TIME, ACC, GYR, ANGLES, MAG, QUAT, REGISTERS = 0x50, 0x51, 0x52, 0x53, 0x54, 0x59, 0x5F
-"""Types of packets."""
+"""Packet types."""
 
 ACC_STEP = 16 * STANDARD_G / 32768
 """Step of an acceleration, m/s^2."""
@@ -29,51 +29,51 @@ QUAT_STEP = 1 / 32768
 """Step of a quaternion's component."""
 
 DAY_US = 86_400_000_000
-"""Times of samples wrap here, microseconds: devices send the time of day."""
+"""Sample times wrap here, microseconds: devices send the time of day."""
 
 ANGLE_NAMES = ("roll", "pitch", "yaw")
-"""Angles in the order on the wire."""
+"""Angles in wire order."""
 
 
 class Cycle:
-    """Samples out of packets that hold one quantity each and have no count.
+    """Assembles samples from packets that hold one quantity each and have no counter.
 
-    A device sends the packets of a cycle in the order of their types. One whose type is not above that of the
-    packet before begins a new cycle. The sample goes out with the last type of the earlier cycles, or else
-    when the next cycle begins. It is dropped without an acceleration or an orientation, or without a quantity
-    that both cycles before had; this counts as lost.
+    A device sends the packets of a cycle in the order of their types. A packet whose type is not above that
+    of the packet before begins a new cycle. The sample is returned with the type that ended earlier cycles,
+    or else when the next cycle begins. It is dropped, and counted as lost, if it has no acceleration, no
+    orientation, or lacks a quantity that both previous cycles had.
     """
 
     def __init__(self, sensor: int, counters: Counters) -> None:
-        """Start with nothing seen.
+        """Start without packets.
 
         Args:
-            sensor: of the samples.
-            counters: `packets` and `lost` are counted here.
+            sensor: sensor id of the samples.
+            counters: where to count `packets` and `lost`.
         """
         self._sensor = sensor
         self._counters = counters
         self._values: dict[str, Any] = {}
-        self._open = False  # a packet has come that is part of no sample yet
-        self._top = -1  # type of the packet before
-        self._end: int | None = None  # the last type of a cycle
-        self._other_end = -1  # where the cycle before ended, if not there
-        self._usual = CycleDetector()
-        self._counted = True  # a stream that begins in the middle of a cycle has lost nothing
+        self._open = False  # whether packets wait for the end of their cycle
+        self._last_type = -1
+        self._end: int | None = None  # type of the last packet of a cycle
+        self._other_end = -1  # type that ended the previous cycle, if not that one
+        self._completeness = CycleDetector()
+        self._counted = True  # a stream that begins in the middle of a cycle has no loss to count
 
     def add(self, order: int, values: dict[str, Any]) -> list[Sample]:
-        """Take the next packet; `order` is its type."""
+        """Take the next packet; `order` is its position in the cycle, usually its type."""
         samples: list[Sample] = []
-        if order <= self._top:
-            if self._open and (self._end is None or self._top == self._other_end):
-                self._end = self._top
+        if order <= self._last_type:
+            if self._open and (self._end is None or self._last_type == self._other_end):
+                self._end = self._last_type
             elif self._open:
-                self._other_end = self._top
+                self._other_end = self._last_type
             samples = self._close()
             self._counted = False
-        self._top = order
+        self._last_type = order
         if not self._open and self._end is not None and order > self._end:
-            # What was taken for the end is none; the sample that this belongs to is gone.
+            # The cycle is longer than assumed, and the sample that this packet belongs to has been returned.
             self._end = order
             return samples
         self._open = True
@@ -84,19 +84,19 @@ class Cycle:
         return samples
 
     def cut(self) -> list[Sample]:
-        """Something unreadable came: what follows can be of another cycle."""
+        """Close the cycle at unreadable input: what follows may belong to another cycle."""
         was_open = self._open
         samples = self._close()
         self._counted = was_open or self._end is None
-        self._top = -1
+        self._last_type = -1
         return samples
 
     def drop(self, order: int) -> None:
-        """Take a packet that spoils its cycle."""
+        """Drop the cycle of a packet whose content is invalid."""
         self._values.clear()
         self._open = False
         self._counted = True
-        self._top = order
+        self._last_type = order
 
     def _close(self) -> list[Sample]:
         if not self._open:
@@ -109,7 +109,7 @@ class Cycle:
             if quat is not None:
                 values["quat"] = quat
         counted, self._counted = self._counted, True
-        whole = self._usual.whole(values)
+        whole = self._completeness.is_complete(values)
         if "quat" not in values or "acc" not in values or not whole:
             self._counters.lost += not counted
             return []
@@ -118,25 +118,25 @@ class Cycle:
 
 
 def scaled(vector: tuple[int, ...], step: float) -> Vector3:
-    """A vector of whole steps in its unit."""
+    """Return a vector of integer steps in its unit."""
     x, y, z = vector
     return (x * step, y * step, z * step)
 
 
 def angles_of(vector: tuple[int, ...]) -> dict[str, Any]:
-    """Angles of whole steps by name, rad."""
+    """Return angles of integer steps by name, rad."""
     return {name: value * ANGLE_STEP for name, value in zip(ANGLE_NAMES, vector, strict=True)}
 
 
 def vectors_of(sample: Sample, mag_ut: float, angles: bool) -> list[tuple[int, Vector3, float]]:
-    """Type, values and step of what the sample has, in the order of the types."""
-    turned = to_yaw_pitch_roll(sample.quat)[::-1] if angles and sample.quat is not None else None
+    """Return type, values and step of each vector that the sample has, in the order of the types."""
+    roll_pitch_yaw = to_yaw_pitch_roll(sample.quat)[::-1] if angles and sample.quat is not None else None
     return [
         (kind, values, step)
         for kind, values, step in (
             (ACC, sample.acc, ACC_STEP),
             (GYR, sample.gyr, GYR_STEP),
-            (ANGLES, turned, ANGLE_STEP),
+            (ANGLES, roll_pitch_yaw, ANGLE_STEP),
             (MAG, sample.mag, mag_ut),
         )
         if values is not None
@@ -144,5 +144,5 @@ def vectors_of(sample: Sample, mag_ut: float, angles: bool) -> list[tuple[int, V
 
 
 def steps_of(values: tuple[float, ...], step: float) -> list[int]:
-    """Values in steps, as int16."""
+    """Return values in steps, clamped to int16."""
     return [int16(value / step) for value in values]

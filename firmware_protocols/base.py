@@ -1,4 +1,4 @@
-"""What every wire format provides: a `Protocol`, its decoder and its encoder."""
+"""Interfaces of the wire formats: `Protocol`, its decoder and its encoder."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ Frame = tuple[int, bytes, bool, bool]
 """Identifier, data, whether the identifier has 29 bits, whether it is CAN FD."""
 
 Encode = Callable[[Sample, int], Any]
-"""Bytes, or a list of Frames on CAN, of a sample and its sensor's count of samples."""
+"""Encodes a sample, given the number of samples its sensor sent before: bytes, or a list of Frames on CAN."""
 
 
 class DeviceInfo(Interface):
-    """What a device reports about itself."""
+    """A device's description of itself."""
 
     @property
     def frame(self) -> str:
@@ -28,31 +28,31 @@ class DeviceInfo(Interface):
 
 
 class Decoder(ABC):
-    """Turns what comes over one line into samples.
+    """Decodes the input of one line into samples.
 
-    Feeding is incremental: any chunking of the same input gives the same samples. Nothing that comes from a
-    wire raises.
+    Feeding is incremental: any chunking of the same input gives the same samples. No input raises an
+    exception.
 
     Attributes:
-        counters: what has been seen so far.
-        infos: the last description of each device, by sensor id; empty where a format has none.
+        counters: counts of everything decoded so far.
+        infos: the last description of each device, by sensor id; empty if the format has none.
     """
 
     WRAP_US: int
-    """Sample.time_us starts again at 0 after this many microseconds."""
+    """Sample.time_us restarts at 0 after this many microseconds."""
 
     counters: Counters
     infos: Mapping[int, DeviceInfo] = MappingProxyType({})
 
     @abstractmethod
     def feed(self, *args: Any, **kwargs: Any) -> list[Sample]:
-        """Samples completed by the next input, in the order they came.
+        """Return the samples completed by the next input, in order of arrival.
 
         Byte streams: `feed(data: bytes)`. CAN: `feed(can_id: int, data: bytes, extended: bool = False)`.
         """
 
     def flush(self) -> list[Sample]:
-        """Samples still held back at the end of a recording; none by default."""
+        """Return the samples still held back at the end of a recording; by default there are none."""
         return []
 
 
@@ -61,18 +61,18 @@ class Protocol:
     """One wire format.
 
     Attributes:
-        name: as a user types it.
-        transport: "bytes" of a serial line or frames on a "can" bus.
-        speed: usual baud or bit rate as the devices are delivered, bit/s.
-        text: what it is, one line.
-        decoder: makes a decoder with nothing seen. Two protocols with the same one are told apart by name
-            only: the first stands for both when a line's format is detected.
-        encoder: makes a function that encodes samples; one for each line, as some count for themselves. Where
-            a device has an id on its line, `sample.sensor` is it. None where the format is only read.
-        ids: ids of six devices on one line when nothing else is said; empty where nothing is usual.
-        alone: a device usually has a line to itself.
-        request: what has to be sent to the device with an id for one sample, and the length of its answer,
-            where devices speak only when asked.
+        name: the name that users type.
+        transport: "bytes" on a serial line or frames on a "can" bus.
+        default_bitrate: usual baud or bit rate of the devices as delivered, bit/s.
+        description: one line that describes the format.
+        decoder: creates a decoder. Two protocols may share one and then differ by name only: detection
+            reports the first of them.
+        encoder: creates a function that encodes samples; create one per line, because some keep counters. If
+            devices have ids on their line, the id is `sample.sensor`. None if the format can only be decoded.
+        ids: default ids of six devices on one line; empty if there are no usual ones.
+        single_device: whether a device usually has a line to itself.
+        request: for devices that send only on request: returns the request for one sample of the device with
+            an id, and the length of the answer in bytes.
     """
 
     name: str
@@ -87,25 +87,25 @@ class Protocol:
 
     @property
     def wrap_us(self) -> int:
-        """Where the time of its samples starts again at 0, microseconds."""
+        """Sample times restart at 0 after this many microseconds."""
         return self.decoder().WRAP_US
 
     def encode(self, sample: Sample, seq: int) -> Any:
-        """`encoder()(sample, seq)`, for formats without a count of their own.
+        """Return `encoder()(sample, seq)`, for formats whose encoders keep no counter.
 
         Raises:
-            ValueError: the format is only read.
+            ValueError: the format has no encoder.
         """
         if self.encoder is None:
-            raise ValueError(f"{self.name} is only read")
+            raise ValueError(f"{self.name} can only be decoded: it has no encoder")
         return self.encoder()(sample, seq)
 
 
 def uncounted(encode: Callable[[Sample], bytes]) -> Callable[[], Encode]:
-    """`Protocol.encoder` of a serial format whose samples have no count."""
+    """Return the `Protocol.encoder` of a serial format without a sample counter."""
     return lambda: lambda sample, seq: encode(sample)
 
 
 def uncounted_can(encode: Callable[[Sample], list[CanFrame]]) -> Callable[[], Encode]:
-    """`Protocol.encoder` of a CAN 2.0 format whose samples have no count."""
+    """Return the `Protocol.encoder` of a CAN 2.0 format without a sample counter."""
     return lambda: lambda sample, seq: [(*frame, False) for frame in encode(sample)]

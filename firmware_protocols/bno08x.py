@@ -1,7 +1,7 @@
 """BNO08x in UART-RVC mode: 19 bytes, 100 times a second, with three angles and the specific force.
 
-Layout, and why the angles are read as they are, in docs/bno08x.md. No time, no angular rate; the heading is
-counted from power-up, so every sensor has its own zero.
+The layout, and the reasons for reading the angles as they are read here, are in docs/bno08x.md. There is no
+time and no angular rate. The heading starts at 0 at power-up, so every sensor has its own zero.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FRAME_BYTES = 19
 """Bytes of a frame, header and checksum included."""
 
 ORDERS = ("zxy", "zyx", "zyx-swapped")
-"""How the three angles make a rotation, see `Bno08xDecoder`."""
+"""Orders in which the three angles combine into a rotation, see `Bno08xDecoder`."""
 
 _HEADER = b"\xaa\xaa"
 _FRAME = struct.Struct("<xxB6h3xx")
@@ -31,22 +31,21 @@ _MAX_TEXT = 256
 
 
 class Bno08xDecoder(StreamDecoder):
-    """Samples out of a byte stream; sensor is 0 and the time None."""
+    """Decoder for the byte stream of one device; sensor is 0, the time None."""
 
     WRAP_US = 1 << 64
 
     _START = re.compile(rb"\xaa(?:\xaa|\Z)")
 
     def __init__(self, order: str = "zxy", clockwise: bool = True) -> None:
-        """Start with nothing seen.
+        """Create the decoder.
 
         Args:
-            order: with a, b, c for the frame's first, second and third angle, the rotation is
+            order: the rotation, where a, b and c are the first, second and third angle of a frame:
                 "zxy": Rz(a) Rx(b) Ry(c);
-                "zyx": Rz(a) Ry(b) Rx(c), what the data sheet's names say;
+                "zyx": Rz(a) Ry(b) Rx(c), as the names in the data sheet suggest;
                 "zyx-swapped": Rz(a) Ry(c) Rx(b).
-            clockwise: the first angle grows when the sensor is turned clockwise, seen from above, as
-                a compass does.
+            clockwise: whether the first angle grows clockwise, seen from above, like that of a compass.
 
         Raises:
             ValueError: order is not one of ORDERS.
@@ -54,7 +53,7 @@ class Bno08xDecoder(StreamDecoder):
         super().__init__()
         self._order = _checked(order)
         self._yaw_step = -_STEP if clockwise else _STEP
-        self._text = b""  # what stood between two frames, as long as it is text
+        self._text = b""  # text between two frames
         self._index: int | None = None
 
     def _length(self, buffer: bytes, at: int) -> int:
@@ -71,7 +70,7 @@ class Bno08xDecoder(StreamDecoder):
 
     def _message(self, frame: bytes, samples: list[Sample]) -> None:
         index, a, b, c, x, y, z = _FRAME.unpack(frame)
-        # The sensor greets with lines of text when it starts.
+        # The sensor sends lines of text when it starts.
         if self._index is not None and b"%" in self._text and self._text.isascii():
             self.counters.restarts += 1
         else:
@@ -82,7 +81,7 @@ class Bno08xDecoder(StreamDecoder):
         self._emit(Sample(0, None, quat, (x * _MG, y * _MG, z * _MG)), samples)
 
     def _bad_frame(self, start: int, end: int) -> None:
-        self._text = _HEADER  # no text
+        self._text = _HEADER  # not ASCII, hence no restart message
         super()._bad_frame(start, end)
 
     def _noise(self, data: bytes, start: int) -> None:
@@ -97,9 +96,9 @@ def _checked(order: str) -> str:
 
 
 def _quaternion(a: float, b: float, c: float, order: str) -> Quaternion:
-    """Of angles in radians."""
+    """Return the quaternion of three angles, radians."""
     if order == "zxy":
-        # Turned by 90 degrees about Z: Y becomes X, X becomes -Y.
+        # Rotated by 90 degrees about Z: Y becomes X, X becomes -Y.
         w, x, y, z = rotation.from_yaw_pitch_roll(a, -b, c)
         return (w, -y, x, z)
     if order == "zyx":
@@ -108,15 +107,15 @@ def _quaternion(a: float, b: float, c: float, order: str) -> Quaternion:
 
 
 def encode(sample: Sample, index: int, *, order: str = "zxy", clockwise: bool = True) -> bytes:
-    """The frame of a sample; index counts frames and wraps at 256.
+    """Return the frame of a sample; index counts frames and wraps at 256.
 
     Raises:
         ValueError: the sample has no orientation or no specific force, or a value cannot be sent.
     """
     if sample.quat is None or sample.acc is None:
-        raise ValueError("a frame has both orientation and specific force")
+        raise ValueError("a frame needs both orientation and specific force")
     if _checked(order) == "zxy":
-        # Turned by 90 degrees about Z: X becomes Y, Y becomes -X.
+        # Rotated by 90 degrees about Z: X becomes Y, Y becomes -X.
         w, x, y, z = sample.quat
         a, b, c = rotation.to_yaw_pitch_roll((w, -y, x, z))
         c = -c

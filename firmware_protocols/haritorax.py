@@ -1,6 +1,7 @@
 """HaritoraX full-body trackers on a serial port: text lines of the GX dongle and of the wired model.
 
-Layouts, and where the scales come from, are in docs/haritorax.md. No time, no angular rate, no checksum.
+Layouts and the origin of the scales are in docs/haritorax.md. There is no time, no angular rate and no
+checksum.
 """
 
 from __future__ import annotations
@@ -15,48 +16,48 @@ from firmware_protocols.base import Protocol, uncounted
 from firmware_protocols.sample import STANDARD_G, Sample, unit_quaternion
 
 MAX_LINE = 512
-"""Longest line that is read, bytes; eight wired sensors need 155."""
+"""Length limit of a line, bytes; eight wired sensors need 155."""
 
 SLOTS = 8
-"""Places of trackers on one port of a dongle; the second sensor of tracker n is n + SLOTS."""
+"""Tracker slots on one port of a dongle; the second sensor of tracker n has id n + SLOTS."""
 
 _BLOCK = struct.Struct("<7h")
 _QUAT_STEPS = 16384
-# Of all captured quaternions the norm is 16384 to 0.02 %, so this tells most damaged lines from good ones.
+# The norm of all captured quaternions is 16384 within 0.02 %: this detects most corrupted lines.
 _TOLERANCE = 0.005
 _DONGLE_STEP = STANDARD_G / 2048
 _WIRED_STEP = 1 / 256  # m/s^2
 _LINE = re.compile(rb"(?:X([0-7])|P):([A-Za-z0-9+/]+={0,2})\r*\Z")
 _OTHER = re.compile(rb"[a-z][0-9]?:[ -~]*\r*\Z")
 
-# Bytes of a dongle's line: one sensor and two bytes of ankle distance; or two sensors and two bytes of state
-# between them. Neither is a whole number of blocks.
+# Sizes in bytes of a dongle's line: one sensor and two bytes of ankle distance; or two sensors with two bytes
+# of state between them. Neither is a whole number of blocks.
 _DONGLE_BLOCKS = {16: (0,), 30: (0, 16)}
 _WIRED_LENGTHS = range(_BLOCK.size, 8 * _BLOCK.size + 1, _BLOCK.size)
 
 
 class HaritoraxDecoder(Receiver):
-    """Samples out of a byte stream that may be cut anywhere, start anywhere and contain noise.
+    """Decoder for a byte stream that may be split anywhere, start anywhere and contain noise.
 
-    Sensor is the slot of the tracker on this port of the dongle (0 to 7; 8 more for the second sensor of a
-    leg tracker), or the place in the line of the wired model.
+    `sensor` is the slot of the tracker on this port of the dongle (0 to 7; 8 more for the second sensor of a
+    leg tracker), or the position in the line of the wired model.
 
     Attributes:
-        counters: what has been seen so far.
+        counters: counts of everything decoded so far.
     """
 
     WRAP_US = 1 << 64
 
     def __init__(self) -> None:
-        """Start with nothing seen."""
+        """Create the decoder."""
         super().__init__()
         self._rest = b""
 
     def feed(self, data: bytes) -> list[Sample]:
-        """Samples completed by the next bytes of the stream, in the order they came."""
+        """Return the samples completed by the next bytes of the stream, in order of arrival."""
         self.counters.bytes += len(data)
         *lines, rest = (self._rest + data).split(b"\n")
-        # One byte more than a line may have, so that a longer one cannot pass for a whole one.
+        # One byte above the limit is kept, so that a line that is too long cannot pass for a whole one.
         self._rest = rest[-MAX_LINE - 1 :]
         samples: list[Sample] = []
         for line in lines:
@@ -70,7 +71,7 @@ class HaritoraxDecoder(Receiver):
             self.counters.skipped += 1  # buttons, battery, settings
             return []
         samples = _samples(match) if match is not None else []
-        # A good line may follow on a broken one that has lost its end.
+        # A good line may directly follow a corrupted one whose end is missing.
         if match is None or match.start() or not samples:
             self._count_bad()
         if samples:
@@ -80,16 +81,16 @@ class HaritoraxDecoder(Receiver):
 
 
 def _samples(match: re.Match[bytes]) -> list[Sample]:
-    """Samples of a line; none if it cannot be true."""
+    """Return the samples of a line; none if its content is impossible."""
     slot, text = match.groups()
     if len(text) % 4:
         return []
     data = b64decode(text)
     if slot is not None:
-        first, step, number = int(slot), _DONGLE_STEP, SLOTS
+        first, step, id_step = int(slot), _DONGLE_STEP, SLOTS
         starts: Iterable[int] = _DONGLE_BLOCKS.get(len(data), ())
     elif len(data) in _WIRED_LENGTHS:
-        first, step, number = 0, _WIRED_STEP, 1
+        first, step, id_step = 0, _WIRED_STEP, 1
         starts = range(0, len(data), _BLOCK.size)
     else:
         return []
@@ -99,12 +100,12 @@ def _samples(match: re.Match[bytes]) -> list[Sample]:
         quat = unit_quaternion(w / _QUAT_STEPS, x / _QUAT_STEPS, y / _QUAT_STEPS, z / _QUAT_STEPS, _TOLERANCE)
         if quat is None:
             return []
-        samples.append(Sample(first + i * number, None, quat, (a * step, b * step, c * step)))
+        samples.append(Sample(first + i * id_step, None, quat, (a * step, b * step, c * step)))
     return samples
 
 
 def encode(sample: Sample) -> bytes:
-    """The line by which a dongle gives the only sensor of tracker `sample.sensor`.
+    """Return a dongle's line for tracker `sample.sensor`, which has one sensor.
 
     Raises:
         ValueError: there is no such slot, or the sample has no orientation or no specific force.
@@ -115,13 +116,13 @@ def encode(sample: Sample) -> bytes:
 
 
 def encode_wired(samples: Iterable[Sample]) -> bytes:
-    """The line of the wired model with all its sensors, in the order they are given."""
+    """Return the line of the wired model with all its sensors, in the order of `samples`."""
     return b"P:" + b64encode(b"".join(_block(sample, _WIRED_STEP) for sample in samples)) + b"\n"
 
 
 def _block(sample: Sample, step: float) -> bytes:
     if sample.quat is None or sample.acc is None:
-        raise ValueError("a block has both orientation and specific force")
+        raise ValueError("a block needs both orientation and specific force")
     w, *xyz = (round(value * _QUAT_STEPS) for value in sample.quat)
     return _BLOCK.pack(*xyz, w, *(max(-32768, min(32767, round(value / step))) for value in sample.acc))
 

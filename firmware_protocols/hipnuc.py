@@ -36,23 +36,23 @@ from firmware_protocols.sample import STANDARD_G, Quaternion, Sample, Vector3, u
 _SYNC = b"\x5a\xa5"
 
 MAX_NODES = 16
-"""Most nodes that one wireless receiver serves."""
+"""Number of nodes that one wireless receiver can serve."""
 
 _HEADER = 6
-_BLOCK = 76  # bytes of an 0x91 item
+_BLOCK = 76  # bytes of a 0x91 item
 _MAX_PAYLOAD = 8 + MAX_NODES * _BLOCK
-_MAX_OTHER = 512  # payloads that do not begin with 0x62
+_MAX_OTHER = 512  # limit for payloads that do not begin with 0x62
 
 _HI91 = struct.Struct("<xBxbxxxxI9f12x4f")
 _HI91_WRITE = struct.Struct("<BBBbfI9f12x4f")
 _HI83 = struct.Struct("<BHBI")
 
-# Bytes of single items after their tag.
+# Sizes in bytes of single items, without their tag.
 _ITEMS = {
     0x90: 1,  # id
     0xA0: 6,  # acceleration
     0xA1: 6,  # acceleration, calibrated
-    0xA5: 6,  # acceleration of the motion, without gravity
+    0xA5: 6,  # acceleration without gravity
     0xB0: 6,  # angular rate
     0xB1: 6,  # angular rate, calibrated
     0xC0: 6,  # magnetic field
@@ -63,22 +63,22 @@ _ITEMS = {
     0xF0: 4,  # pressure
 }
 
-# Bytes a node of items of the old wireless receiver.
+# Bytes per node of the items of the old wireless receiver.
 _NODE_ITEMS = {0x71: 16, 0x72: 6, 0x75: 6, 0x78: 6, 0x7A: 6}
 
 
 class _Unknown(Exception):
-    """An intact payload whose content is not known here."""
+    """An intact payload of unknown content."""
 
 
 def _integer_angles(data: bytes, start: int) -> Quaternion:
-    # These old devices all turn in the order yaw, pitch, roll.
+    # These old devices all use the order yaw, pitch, roll.
     pitch, roll, yaw = VECTOR_I.unpack_from(data, start)
     return from_yaw_pitch_roll(radians(yaw / 10), radians(pitch / 100), radians(roll / 100))
 
 
 def _block(data: bytes, start: int, sensor: int | None) -> Sample:
-    """Sample of an 0x91 item. Without a given sensor its second byte is the node id, and time 0 is none."""
+    """Return the sample of a 0x91 item; without `sensor`, byte 1 is its node id and time 0 means no time."""
     node, degrees, ms, ax, ay, az, gx, gy, gz, mx, my, mz, w, x, y, z = _HI91.unpack_from(data, start)
     if not plausible((ax, ay, az, gx, gy, gz, mx, my, mz)):
         raise ValueError("NaN, infinity, or too large")
@@ -89,26 +89,26 @@ def _block(data: bytes, start: int, sensor: int | None) -> Sample:
         (ax * STANDARD_G, ay * STANDARD_G, az * STANDARD_G),
         (gx * DEG, gy * DEG, gz * DEG),
         (mx, my, mz) if mx or my or mz else None,
-        None if sensor is None else float(degrees),  # not in the layout that has a node id
+        None if sensor is None else float(degrees),  # the layout with a node id has none
     )
 
 
 class HipnucDecoder(StreamDecoder):
-    """Samples out of a HiPNUC serial stream.
+    """Decoder for a HiPNUC serial stream.
 
     Attributes:
-        counters: what has been seen so far.
+        counters: counts of everything decoded so far.
     """
 
     WRAP_US = WRAP_US
     _START = re.compile(rb"\x5a(?:\xa5|\Z)")
 
     def __init__(self, *, node_ids: bool = False) -> None:
-        """Start with nothing seen.
+        """Create the decoder.
 
         Args:
-            node_ids: the second byte of an 0x91 item that comes on its own is the id of the device, as older
-                and wireless models have it. Newer ones have status bits there; their samples are of sensor 0.
+            node_ids: whether the second byte of a 0x91 item outside of a wireless frame is the device id, as
+                in older and wireless models. Newer ones have status bits there; their sensor id is 0.
         """
         super().__init__()
         self._single = None if node_ids else 0
@@ -122,7 +122,7 @@ class HipnucDecoder(StreamDecoder):
             return -1
         if known < _HEADER + min(length, 3):
             return 0
-        # The tag tells more than the length alone: a false start must not hold up the stream for long.
+        # Check the tag, too: a false start with a large length would hold up the stream.
         tag = buffer[at + _HEADER]
         if tag == 0x62:
             nodes = buffer[at + _HEADER + 2] if length > 2 else 0
@@ -160,14 +160,14 @@ class HipnucDecoder(StreamDecoder):
                 if payload[start] != 0x91:
                     raise ValueError("no measurement")
                 samples.append(_block(payload, start, None))
-            except ValueError:  # costs the other nodes nothing
+            except ValueError:  # the other nodes are still read
                 self.counters.bad += 1
         if not payload[2]:
             self.counters.skipped += 1
         return samples
 
     def _items(self, payload: bytes, samples: list[Sample]) -> None:
-        single: dict[int, int] = {}  # where the data of single items are
+        single: dict[int, int] = {}  # offsets of the data of single items
         at = 0
         while at < len(payload):
             tag = payload[at]
@@ -212,7 +212,7 @@ def _single_items(data: bytes, at: dict[int, int]) -> Sample:
         pitch, roll, yaw = scaled(VECTOR_F.unpack_from(data, at[0xD9]), DEG)
         quat = from_angles(yaw, pitch, roll)
         if quat is None:
-            raise ValueError("angles beyond a turn")
+            raise ValueError("angles beyond a full turn")
     elif 0xD0 in at:
         quat = _integer_angles(data, at[0xD0])
     for tag in (0xA0, 0xA1):
@@ -229,13 +229,13 @@ def _single_items(data: bytes, at: dict[int, int]) -> Sample:
 
 
 def _dongle(payload: bytes) -> list[Sample]:
-    """Samples of the old wireless receiver: one table a quantity, one row a node in the order of the ids."""
+    """Return the samples of the old wireless receiver: a table per quantity, a row per node in id order."""
     at, counts = 0, range(1, MAX_NODES + 1)
     if payload[0] == 0x61:
         if len(payload) < 4 or payload[3] not in counts:
             raise ValueError("no number of nodes")
         at, counts = 4, range(payload[3], payload[3] + 1)
-    # Without 0x61 the number of nodes shows in the length only.
+    # Without 0x61 the number of nodes follows from the length only.
     fits = [(n, tables) for n in counts if (tables := _tables(payload, at, n))]
     if len(fits) != 1:
         raise _Unknown
@@ -266,7 +266,7 @@ def _dongle(payload: bytes) -> list[Sample]:
 
 
 def _tables(payload: bytes, at: int, n: int) -> dict[int, int]:
-    """Where each table begins if there are n nodes, or nothing if that does not fit."""
+    """Return the offset of each table for n nodes; an empty dict if the payload does not fit n nodes."""
     tables: dict[int, int] = {}
     while at < len(payload):
         tag = payload[at]
@@ -281,32 +281,32 @@ def _tables(payload: bytes, at: int, n: int) -> dict[int, int]:
 
 
 def encode_frame(payload: bytes) -> bytes:
-    """The bytes that go over the line for a payload."""
+    """Return the bytes on the wire for a payload."""
     head = _SYNC + len(payload).to_bytes(2, "little")
     return head + crc_hqx(payload, crc_hqx(head, 0)).to_bytes(2, "little") + payload
 
 
 def encode(sample: Sample, *, node_ids: bool = False) -> bytes:
-    """Serial frame with one 0x91 item. Its Euler angles and pressure are zeros.
+    """Return a serial frame with one 0x91 item. Its Euler angles and pressure are zeros.
 
     Args:
-        sample: with quaternion, acceleration and angular rate; time in whole milliseconds.
-        node_ids: send the sensor id in place of status bits.
+        sample: must have quaternion, acceleration and angular rate; its time is cut to whole milliseconds.
+        node_ids: send the sensor id instead of status bits.
 
     Raises:
-        ValueError: a needed quantity is missing.
+        ValueError: a required quantity is missing.
     """
     return encode_frame(_write_block(sample, node_ids))
 
 
 def encode_nodes(samples: Iterable[Sample], *, gateway: int = 0) -> bytes:
-    """Serial frame of a wireless receiver with one block (0x62) for each sample; see `encode`."""
+    """Return the serial frame of a wireless receiver (0x62) with one block per sample; see `encode`."""
     blocks = [_write_block(sample, True) for sample in samples]
     return encode_frame(bytes([0x62, gateway, len(blocks), 0, 0, 0, 0, 0]) + b"".join(blocks))
 
 
 def encode_fields(sample: Sample, *, node_ids: bool = False) -> bytes:
-    """Serial frame with one 0x83 item of what the sample has."""
+    """Return a serial frame with one 0x83 item of the quantities that the sample has."""
     mask, fields = write_fields(sample)
     if node_ids:
         mask |= 1 << NODE_BIT
@@ -315,7 +315,7 @@ def encode_fields(sample: Sample, *, node_ids: bool = False) -> bytes:
 
 
 def encode_items(sample: Sample) -> bytes:
-    """Serial frame with the single items of older models of what the sample has, no time."""
+    """Return a serial frame with single items, as older models send them; the time is left out."""
     out = bytes([0x90, sample.sensor])
     if sample.acc is not None:
         out += b"\xa0" + vector_i(sample.acc, 1000 / STANDARD_G)
@@ -331,7 +331,7 @@ def encode_items(sample: Sample) -> bytes:
 
 
 def encode_tables(samples: Iterable[Sample], *, gateway: int = 0) -> bytes:
-    """Serial frame of the old wireless receiver (0x61, 0x71, 0x75, 0x78) of sensors 0..15."""
+    """Return the serial frame of the old wireless receiver (0x61, 0x71, 0x75, 0x78) for sensors 0..15."""
     by_id = {sample.sensor: sample for sample in samples}
     nodes = [by_id.get(sensor, Sample(sensor)) for sensor in range(max(by_id) + 1)]
     zero = (0.0, 0.0, 0.0)
@@ -347,7 +347,7 @@ def encode_tables(samples: Iterable[Sample], *, gateway: int = 0) -> bytes:
 
 def _write_block(sample: Sample, node_ids: bool) -> bytes:
     if sample.quat is None or sample.acc is None or sample.gyr is None:
-        raise ValueError("needs quaternion, acceleration and angular rate")
+        raise ValueError("quaternion, acceleration and angular rate are required")
     return _HI91_WRITE.pack(
         0x91,
         sample.sensor if node_ids else 0,

@@ -28,18 +28,19 @@ _MASK_FD = 0x17F
 
 
 class _CanDecoder(Receiver):
-    """Samples out of frames that hold one quantity each, by the order in which a node's frames come.
+    """Assembles samples from frames that hold one quantity each, by their order.
 
-    A node sends its quantities in a fixed order with the quaternion last. A sample is what came since the
-    node's last quaternion, and goes out with this one. It is dropped without an acceleration, or without a
-    quantity that both cycles before had; and so is all that came before a quantity that comes again, as a
-    quaternion is missing there. Every drop counts as lost.
+    A node sends its quantities in a fixed order with the quaternion last. A quaternion completes a sample
+    with everything received since the node's previous quaternion. The sample is dropped if it has no
+    acceleration, or lacks a quantity that both previous cycles had. If a quantity arrives twice, the
+    quaternion between them is missing, and everything before the second is dropped. Every drop counts as
+    lost.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self._parts: dict[int, dict[str, Vector3 | float]] = {}
-        self._usual: dict[int, CycleDetector] = {}
+        self._completeness: dict[int, CycleDetector] = {}
 
     def _add(self, node: int, kind: str, value: Vector3 | float) -> list[Sample]:
         self._count_good()
@@ -52,8 +53,8 @@ class _CanDecoder(Receiver):
 
     def _close(self, node: int, values: tuple[int, ...]) -> list[Sample]:
         parts = self._parts.pop(node, {})
-        known = node in self._usual
-        whole = self._usual.setdefault(node, CycleDetector()).whole(parts)
+        known = node in self._completeness
+        whole = self._completeness.setdefault(node, CycleDetector()).is_complete(parts)
         quat = unit_quaternion(*(value / 10000 for value in values))
         if quat is None:
             return self._count_bad()
@@ -66,20 +67,20 @@ class _CanDecoder(Receiver):
 
 
 class HipnucCanopenDecoder(_CanDecoder):
-    """Samples out of the CANopen process data of any number of nodes; `sensor` is the node id (1..64).
+    """Decoder for the CANopen process data of any number of nodes; `sensor` is the node id (1..64).
 
-    All nodes must send acceleration and quaternion (TPDO1 and TPDO4) at one rate, and nothing faster. The
-    frames have neither count nor time: if just as many frames of a node as make whole cycles are lost in a
-    row, quantities of different cycles meet unnoticed.
+    All nodes must send acceleration and quaternion (TPDO1 and TPDO4) at the same rate, and nothing faster.
+    The frames have neither counter nor time. If one or more whole cycles of consecutive frames of a node are
+    lost, quantities of different cycles are combined, which cannot be detected.
 
     Attributes:
-        counters: what has been seen so far; `lost` are incomplete cycles.
+        counters: counts of everything decoded so far; `lost` counts incomplete cycles.
     """
 
     WRAP_US = WRAP_US
 
     def feed(self, can_id: int, data: bytes, extended: bool = False) -> list[Sample]:
-        """The sample that this frame completes, if any."""
+        """Return the sample that this frame completes, if any."""
         self.counters.bytes += len(data)
         node = can_id & 0x7F
         kind = can_id - node
@@ -102,30 +103,32 @@ _J1939_VECTORS = {
     0xFF3A: ("mag", 1000 / 32768),
 }
 _J1939_TEMPERATURE = 0xFF43
-# One of the maker's DBC files has the second number for the quaternion, all else the first.
+# One of the vendor's DBC files has the second number for the quaternion, all other sources the first.
 _J1939_QUATS = (0xFF46, 0xFF42)
 _J1939_FD = 0xFF5B
 
 
 class HipnucJ1939Decoder(_CanDecoder):
-    """Samples out of the J1939 groups of any number of devices; `sensor` is the source address.
+    """Decoder for the J1939 groups of any number of devices; `sensor` is the source address.
 
-    All must send acceleration and quaternion (FF34 and FF46) at one rate, and nothing faster; see
-    `HipnucCanopenDecoder` for what cannot be noticed. A CAN FD frame (FF5B) is a whole sample with a count.
+    All devices must send acceleration and quaternion (FF34 and FF46) at the same rate, and nothing faster;
+    see `HipnucCanopenDecoder` for losses that cannot be detected. A CAN FD frame (FF5B) is a complete sample
+    with a counter.
 
     Attributes:
-        counters: what has been seen so far; `lost` are incomplete cycles, and gaps in the CAN FD count.
+        counters: counts of everything decoded so far; `lost` counts incomplete cycles, and gaps in the
+            counter of CAN FD frames.
     """
 
     WRAP_US = WRAP_US
 
     def __init__(self) -> None:
-        """Start with nothing seen."""
+        """Create the decoder."""
         super().__init__()
         self._counts: dict[int, int] = {}
 
     def feed(self, can_id: int, data: bytes, extended: bool = True) -> list[Sample]:
-        """The sample that this frame completes, if any."""
+        """Return the sample that this frame completes, if any."""
         self.counters.bytes += len(data)
         node = can_id & 0xFF
         group = can_id >> 8 & 0x3FFFF
@@ -144,11 +147,11 @@ class HipnucJ1939Decoder(_CanDecoder):
                 return self._count_bad()
             return self._add(node, "temperature", int.from_bytes(data[:2], "little", signed=True) / 100)
         if group == _J1939_FD:
-            return self._whole(node, data)
+            return self._fd(node, data)
         self.counters.skipped += 1
         return []
 
-    def _whole(self, node: int, data: bytes) -> list[Sample]:
+    def _fd(self, node: int, data: bytes) -> list[Sample]:
         if not 8 <= len(data) <= 64:
             return self._count_bad()
         mask = int.from_bytes(data[:4], "little")
@@ -173,7 +176,7 @@ class HipnucJ1939Decoder(_CanDecoder):
 
 
 def encode_canopen(sample: Sample) -> list[CanFrame]:
-    """CAN frames of one cycle of a CANopen node: acceleration, angular rate, quaternion."""
+    """Return the CAN frames of one cycle of a CANopen node: acceleration, angular rate, quaternion."""
     frames = []
     if sample.acc is not None:
         frames.append((0x180 + sample.sensor, vector_i(sample.acc, 1000 / STANDARD_G), False))
@@ -185,7 +188,10 @@ def encode_canopen(sample: Sample) -> list[CanFrame]:
 
 
 def encode_j1939(sample: Sample) -> list[CanFrame]:
-    """CAN frames of one cycle of a J1939 device: acceleration, rate, field, temperature, quaternion."""
+    """Return the CAN frames of one cycle of a J1939 device.
+
+    Their order is acceleration, angular rate, magnetic field, temperature, quaternion.
+    """
     parts: list[tuple[int, bytes]] = []
     for group, (kind, scale) in _J1939_VECTORS.items():
         values = getattr(sample, kind)
@@ -199,17 +205,17 @@ def encode_j1939(sample: Sample) -> list[CanFrame]:
 
 
 def encode_j1939_fd(sample: Sample, count: int = 0) -> CanFrame:
-    """CAN FD frame with what the sample has, padded to a length that CAN FD knows.
+    """Return a CAN FD frame with the quantities that the sample has, padded to a legal length.
 
     Raises:
-        ValueError: more than fits into 64 bytes.
+        ValueError: they do not fit into 64 bytes.
     """
     mask, fields = write_fields(sample)
     data = struct.pack("<IHBB", mask, 0, 0, count & 0xFF) + fields
     for length in (8, 12, 16, 20, 24, 32, 48, 64):
         if len(data) <= length:
             return _j1939_id(_J1939_FD, sample.sensor), data.ljust(length, b"\0"), True
-    raise ValueError("too much for one frame")
+    raise ValueError("too much data for one CAN FD frame")
 
 
 def _j1939_id(group: int, node: int) -> int:

@@ -1,7 +1,7 @@
 """SAE J1939 Slope Sensor Information 2 (PGN 61481): pitch and roll of a machine's inclinometer.
 
-Layout in docs/j1939.md. The message has no heading and no rotation that one could name without it, so there
-is no Sample in it and no decoder here that could drive a body: only the angles.
+The layout is in docs/j1939.md. The message has no heading, and without one there is no orientation. So this
+module has no decoder of samples: it returns the angles only.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from typing import NamedTuple
 SSI2 = 61481
 """Parameter group number of the message."""
 
-_STEPS = 32768  # of an angle in a degree
+_STEPS = 32768  # steps of an angle per degree
 _OFFSET_DEG = 250.0
 _LATENCY_STEP_S = 0.0005
-_MAX_ANGLE, _MAX_LATENCY = 0xFAFFFF, 0xFA  # numbers above mean: error, or not available
+_MAX_ANGLE, _MAX_LATENCY = 0xFAFFFF, 0xFA  # larger numbers mean an error or no value
 
 
 class Tilt(NamedTuple):
@@ -23,9 +23,9 @@ class Tilt(NamedTuple):
 
     Attributes:
         source: address of the sensor, 0 to 253.
-        pitch: rad; None if the sensor says that it is wrong or not available.
+        pitch: rad; None if the sensor reports an error or no value.
         roll: rad; None likewise.
-        latency_s: how old the angles were when they were sent, seconds; None likewise.
+        latency_s: age of the angles when they were sent, seconds; None likewise.
     """
 
     source: int
@@ -35,7 +35,7 @@ class Tilt(NamedTuple):
 
 
 def tilt(can_id: int, data: bytes, extended: bool = True) -> Tilt | None:
-    """Angles of a CAN frame; None if it is no SSI2."""
+    """Return the angles of a CAN frame; None if it is not an SSI2 message."""
     source = can_id & 0xFF
     if not extended or can_id >> 8 & 0x3FFFF != SSI2 or source > 253 or len(data) != 8:
         return None
@@ -49,7 +49,7 @@ def tilt(can_id: int, data: bytes, extended: bool = True) -> Tilt | None:
 
 
 def encode(message: Tilt, priority: int = 3) -> tuple[int, bytes]:
-    """Identifier (29 bits) and data of the frame; what is not known is sent as not available."""
+    """Return identifier (29 bits) and data of the frame; unknown values are sent as not available."""
     latency = 0xFF if message.latency_s is None else round(message.latency_s / _LATENCY_STEP_S)
     if not 0 <= message.source <= 253 or not 0 <= latency <= 0xFF or not 0 <= priority <= 7:
         raise ValueError(f"cannot send {message} with priority {priority}")

@@ -1,7 +1,7 @@
 """LP-Research LPMS: LPBUS frames over a serial line (USB, UART, Bluetooth SPP).
 
-Layout in docs/lpms.md. Everything is little-endian. A frame does not say which quantities it holds: that is
-the setting of the sensor, and the decoder has to be told.
+The layout is in docs/lpms.md. Everything is little-endian. A frame does not say which quantities it holds:
+they are a setting of the sensor, which has to be passed to the decoder.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ SENSOR_DATA = 9
 """Command of a measurement."""
 
 MAX_DATA = 256
-"""Most bytes of data in a frame; a measurement with all quantities has 108."""
+"""Limit of the data in a frame, bytes; a measurement with all quantities has 108."""
 
 TICK_US = 2500
 """Step of the time, microseconds."""
 
-# Numbers in a quantity and steps of an int16 in its unit, in the order on the wire.
+# Number of values of each quantity and int16 steps per unit, in wire order.
 _QUANTITIES = {
     "gyr": (3, 1000),  # rad/s, as measured
     "acc": (3, 1000),  # g
@@ -39,54 +39,54 @@ _QUANTITIES = {
 }
 
 FIELDS = tuple(_QUANTITIES)
-"""Quantities that a sensor can be set to send."""
+"""Quantities that a sensor can send."""
 
 USUAL_FIELDS = ("gyr", "acc", "mag", "quat")
-"""What a sensor should be set to send."""
+"""Quantities that sensors should be set to send."""
 
 _HEAD = struct.Struct("<3H")
 _START_BYTE, _END = b"\x3a", b"\r\n"
-_AROUND = 1 + _HEAD.size + 2 + len(_END)
+_OVERHEAD = 1 + _HEAD.size + 2 + len(_END)
 
 
 def _layout(fields: Iterable[str], floats: bool) -> tuple[tuple[str, ...], struct.Struct]:
-    """Quantities in the order on the wire, and the layout of time and values."""
+    """Return the quantities in wire order, and the layout of time and values."""
     wanted = tuple(fields)
     unknown = [name for name in wanted if name not in FIELDS]
     if unknown or not wanted:
-        raise ValueError(f"fields must be of {', '.join(FIELDS)}, not {', '.join(unknown) or 'none'}")
+        raise ValueError(f"fields must be among {', '.join(FIELDS)}, not {', '.join(unknown) or 'none'}")
     names = tuple(name for name in FIELDS if name in wanted)
     count = sum(_QUANTITIES[name][0] for name in names)
     return names, struct.Struct(f"<I{count}{'f' if floats else 'h'}")
 
 
 class LpmsDecoder(StreamDecoder):
-    """Measurements of the sensors on a line; `sensor` is the id in the frame (OpenMAT id).
+    """Decoder for the sensors on a line; `sensor` is the id in the frame (OpenMAT id).
 
-    The orientation on the wire turns inertial to sensor, and the acceleration points down at rest: both are
-    turned around here.
+    On the wire, the orientation maps inertial to sensor and the acceleration points down at rest: the decoder
+    inverts both.
     """
 
     WRAP_US = (1 << 32) * TICK_US
     _START = re.compile(_START_BYTE)
 
     def __init__(self, fields: Iterable[str] = USUAL_FIELDS, floats: bool = True) -> None:
-        """Start with nothing seen.
+        """Create the decoder.
 
         Args:
-            fields: what the sensors are set to send, of FIELDS, in any order.
-            floats: numbers are binary32 and not int16.
+            fields: quantities that the sensors are set to send, out of FIELDS, in any order.
+            floats: whether numbers are binary32 instead of int16.
 
         Raises:
             ValueError: unknown fields.
         """
         super().__init__()
         names, self._layout = _layout(fields, floats)
-        self._at_of: dict[str, int] = {}
+        self._index_of: dict[str, int] = {}
         self._scale = {name: 1.0 if floats else 1.0 / _QUANTITIES[name][1] for name in names}
         at = 1
         for name in names:
-            self._at_of[name] = at
+            self._index_of[name] = at
             at += _QUANTITIES[name][0]
         self._rate = "rate" if "rate" in names else "gyr"
 
@@ -94,7 +94,7 @@ class LpmsDecoder(StreamDecoder):
         if len(buffer) - at < 1 + _HEAD.size:
             return 0
         length = buffer[at + 5] | buffer[at + 6] << 8
-        return length + _AROUND if length <= MAX_DATA else -1
+        return length + _OVERHEAD if length <= MAX_DATA else -1
 
     def _intact(self, buffer: bytes, at: int, length: int) -> bool:
         end = at + length
@@ -106,12 +106,12 @@ class LpmsDecoder(StreamDecoder):
         if command != SENSOR_DATA:
             self.counters.skipped += 1
             return
-        if length != self._layout.size:  # the sensor is set to send something else
+        if length != self._layout.size:  # the sensor is set to send other quantities
             self.counters.bad += 1
             return
         v = self._layout.unpack_from(frame, 1 + _HEAD.size)
         quat: Quaternion | None = None
-        at = self._at_of.get("quat")
+        at = self._index_of.get("quat")
         if at is not None:
             s = self._scale["quat"]
             quat = unit_quaternion(v[at] * s, -v[at + 1] * s, -v[at + 2] * s, -v[at + 3] * s)
@@ -119,13 +119,13 @@ class LpmsDecoder(StreamDecoder):
         gyr = self._vector(v, self._rate, 1.0)
         mag = self._vector(v, "mag", 1.0)
         temperature = None
-        at = self._at_of.get("temperature")
+        at = self._index_of.get("temperature")
         if at is not None and isfinite(v[at]):
             temperature = v[at] * self._scale["temperature"]
         self._emit(Sample(sensor, v[0] * TICK_US, quat, acc, gyr, mag, temperature), samples)
 
     def _vector(self, v: tuple[float, ...], name: str, unit: float) -> Vector3 | None:
-        at = self._at_of.get(name)
+        at = self._index_of.get(name)
         if at is None:
             return None
         s = self._scale[name] * unit
@@ -134,7 +134,7 @@ class LpmsDecoder(StreamDecoder):
 
 
 def encode(sample: Sample, fields: Iterable[str] = USUAL_FIELDS, floats: bool = True) -> bytes:
-    """The frame of a sample; see `LpmsDecoder` for the settings. What the sample lacks is sent as zeros.
+    """Return the frame of a sample; see `LpmsDecoder` for the settings. Missing quantities are sent as zeros.
 
     Raises:
         ValueError: unknown fields, or a number that does not fit.

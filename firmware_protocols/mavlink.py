@@ -1,7 +1,7 @@
 """MAVLink 1 and 2 through pymavlink: ATTITUDE_QUATERNION with SCALED_IMU or HIGHRES_IMU.
 
-pymavlink is an extra of its own (`pip install "edgepose[mavlink]"`) and only imported when a decoder or an
-encoder is made. Layouts are in docs/mavlink.md.
+pymavlink is an optional dependency (`pip install "edgepose[mavlink]"`), which is imported when a decoder or
+an encoder is created. Layouts are in docs/mavlink.md.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ def _dialect() -> Any:
 
 
 class MavlinkDecoder(StreamDecoder):
-    """Samples out of a byte stream.
+    """Decoder for a byte stream; `sensor` is sysid << 8 | compid.
 
-    Sensor is sysid << 8 | compid. An orientation and a reading of one component whose times are no more than
-    the tolerance apart become one sample with the orientation's time; either comes out alone if the other is
-    missing.
+    An orientation and a reading of one component whose times differ by the tolerance at most become one
+    sample with the time of the orientation. If one of the two is missing, the other becomes a sample by
+    itself.
     """
 
     WRAP_US = _WRAP_US
@@ -50,11 +50,12 @@ class MavlinkDecoder(StreamDecoder):
     _START = re.compile(rb"[\xfd\xfe]")
 
     def __init__(self, tolerance_us: int = 5000, imu: int | None = None) -> None:
-        """Start with nothing seen.
+        """Create the decoder.
 
         Args:
-            tolerance_us: how far apart the times of what belongs together may be, below half of the period.
-            imu: which of several HIGHRES_IMU of a component to take; None if there is only one.
+            tolerance_us: largest time difference of an orientation and a reading that belong together; keep
+                it below half the sampling period.
+            imu: id of the HIGHRES_IMU to use if a component has several; None if there is only one.
 
         Raises:
             RuntimeError: pymavlink is not installed.
@@ -69,7 +70,7 @@ class MavlinkDecoder(StreamDecoder):
         self._sequence: BoundedDict[int, int] = BoundedDict()
 
     def flush(self) -> list[Sample]:
-        """What still waits for its partner, at the end of a recording."""
+        """Return the samples that still wait for their partner, at the end of a recording."""
         return self._pairing.flush()
 
     def _length(self, buffer: bytes, at: int) -> int:
@@ -85,13 +86,13 @@ class MavlinkDecoder(StreamDecoder):
                 return 0
             kind = int.from_bytes(head[7:10], "little")
             size = head[1] + 12 + (_SIGNATURE_BYTES if head[2] else 0)
-        # The checksum of a kind that is not known cannot be known either.
+        # The checksum of an unknown message type cannot be verified.
         return size if kind in self._known else -1
 
     def _intact(self, buffer: bytes, at: int, length: int) -> bool:
         try:
             self._decoded = self._decode(bytearray(buffer[at : at + length]))
-        except Exception:  # its own error, and whatever else a parser of others finds in noise
+        except Exception:  # pymavlink's own error, and whatever else noise makes it raise
             return False
         return True
 
@@ -119,11 +120,11 @@ class MavlinkDecoder(StreamDecoder):
                     None,
                     (message.xacc * _MG, message.yacc * _MG, message.zacc * _MG),
                     (message.xgyro / 1000, message.ygyro / 1000, message.zgyro / 1000),
-                    # Without a magnetometer it says 0, which no place on earth has.
+                    # Without a magnetometer all are 0, a field that occurs nowhere on Earth.
                     vector((message.xmag, message.ymag, message.zmag), _UT_OF_MGAUSS)
                     if message.xmag or message.ymag or message.zmag
                     else None,
-                    # degC of 0 stands for none, 1 for 0.
+                    # 0 means no temperature; 0.00 degC is sent as 1.
                     message.temperature / 100 if message.temperature else None,
                 ),
                 False,
@@ -154,13 +155,14 @@ class MavlinkDecoder(StreamDecoder):
 
 
 class Encoder:
-    """The messages of samples, for simulation; counts them for each component."""
+    """Encodes samples as messages, for simulation, with a sequence counter for each component."""
 
     def __init__(self, *, highres: bool = True) -> None:
-        """Start counting at 0.
+        """Create the encoder; the counters start at 0.
 
         Args:
-            highres: readings as HIGHRES_IMU; otherwise as SCALED_IMU, in steps of 1 mg, 1 mrad/s, 0.1 uT.
+            highres: send readings as HIGHRES_IMU instead of SCALED_IMU, whose steps are 1 mg, 1 mrad/s and
+                0.1 uT.
 
         Raises:
             RuntimeError: pymavlink is not installed.
@@ -170,15 +172,16 @@ class Encoder:
         self._components: dict[int, Any] = {}
 
     def encode(self, sample: Sample) -> bytes:
-        """A reading and an orientation, as far as the sample has them.
+        """Return the messages of a sample: a reading and an orientation, those of the two that it has.
 
         Raises:
-            ValueError: the sample has no time, only one of force and rate, or a value cannot be sent.
+            ValueError: the sample has no time, only one of acceleration and angular rate, or a value that
+                cannot be sent.
         """
         if sample.time_us is None or not 0 <= sample.sensor < 1 << 16:
-            raise ValueError("a message has a time, and sensor is sysid << 8 | compid")
+            raise ValueError("a MAVLink message needs a time, and a sensor id of sysid << 8 | compid")
         if (sample.acc is None) != (sample.gyr is None):
-            raise ValueError("a reading has both force and rate")
+            raise ValueError("a reading needs both acceleration and angular rate")
         link = self._components.get(sample.sensor)
         if link is None:
             link = self._dialect.MAVLink(None, sample.sensor >> 8, sample.sensor & 0xFF)
@@ -200,7 +203,7 @@ class Encoder:
                         )
                     )
             if sample.quat is not None:
-                # A half turn of the inertial frame is its own inverse.
+                # z_up is its own inverse, up to the sign of the quaternion.
                 messages.append(
                     self._dialect.MAVLink_attitude_quaternion_message(
                         time_ms, *z_up(sample.quat), *(sample.gyr or (0.0, 0.0, 0.0))
@@ -210,7 +213,7 @@ class Encoder:
             for message in messages:
                 parts.append(bytes(message.pack(link)))
                 link.seq = (link.seq + 1) % 256
-        except Exception as error:  # struct.error and others, as pymavlink has it
+        except Exception as error:  # struct.error and others from pymavlink
             raise ValueError(f"cannot send {sample}: {error}") from None
         return b"".join(parts)
 
@@ -235,7 +238,7 @@ class Encoder:
 
 
 def _encoder() -> Encode:
-    encoder = Encoder()  # counts for itself
+    encoder = Encoder()  # keeps its own counters
     return lambda sample, seq: encoder.encode(sample)
 
 

@@ -18,14 +18,14 @@ from firmware_protocols.rotation import from_angles, from_matrix, to_yaw_pitch_r
 from firmware_protocols.sample import STANDARD_G, Sample, unit_quaternion, z_up
 
 SENSOR_SET = 0x80
-"""Descriptor set of the IMU and its own attitude."""
+"""Descriptor set of the IMU, with an attitude of its own."""
 
 FILTER_SET = 0x82
 """Descriptor set of the estimation filter."""
 
 _GAUSS_UT = 100.0
 _WEEK_US = 604_800_000_000
-_MIN_PERIOD_NS = 100_000  # nothing measures more often
+_MIN_PERIOD_NS = 100_000  # no device measures faster
 
 _VECTOR = struct.Struct(">3f")
 _QUATERNION = struct.Struct(">4f")
@@ -36,7 +36,7 @@ _MATRIX_VALID = struct.Struct(">9fH")
 _NANOSECONDS = struct.Struct(">Q")
 _GPS_TIME = struct.Struct(">dHH")
 
-# What a field holds and how, by descriptor set << 8 | field descriptor.
+# Quantity and layout of a field, by descriptor set << 8 | field descriptor.
 _FIELDS = {
     0x8004: ("acc g", _VECTOR),
     0x8005: ("gyr", _VECTOR),
@@ -61,13 +61,13 @@ _FIELDS = {
 
 
 def checksum(data: bytes) -> bytes:
-    """Fletcher checksum of 8 bit sums, as at the end of every packet."""
+    """Return the Fletcher checksum with 8 bit sums that ends every packet."""
     sums = list(accumulate(data))
     return bytes([sums[-1] & 0xFF, sum(sums) & 0xFF]) if sums else b"\0\0"
 
 
 def fields(packet: bytes) -> Iterator[tuple[int, bytes]]:
-    """Field descriptors and data of a whole packet.
+    """Yield descriptor and data of each field of a complete packet.
 
     Raises:
         ValueError: the fields do not fill the payload.
@@ -82,69 +82,77 @@ def fields(packet: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 class MipDecoder(StreamDecoder):
-    """Measurements out of the MIP stream of one device.
+    """Decoder for the MIP stream of one device.
 
-    A packet with at least one quantity is a sample. The device's attitude turns its frame into north, east,
-    down; samples have it with Z up.
+    Each packet with at least one quantity becomes a sample. The device's attitude maps its frame to north,
+    east, down; samples have it with Z up.
     """
 
-    # Nanoseconds in 64 bits; nothing runs that long.
+    # 64 bits of nanoseconds: 584 years.
     WRAP_US = (1 << 64) // 1000
 
     _START = re.compile(rb"u(?:e|\Z)")
 
     def __init__(self, sets: Iterable[int] = (SENSOR_SET, FILTER_SET)) -> None:
-        """Start with nothing seen.
+        """Create the decoder.
 
         Args:
-            sets: descriptor sets to read. A device may send an attitude in both, from two filters that need
-                not agree: then choose one.
+            sets: descriptor sets to read. A device may send an attitude in both, from two filters that can
+                disagree: choose one then.
 
         Raises:
-            ValueError: unknown set.
+            ValueError: unknown descriptor set.
         """
         super().__init__()
         self._sets = frozenset(sets)
         if not self._sets <= {SENSOR_SET, FILTER_SET}:
-            raise ValueError("sets must be out of 0x80 and 0x82")
+            raise ValueError("sets may contain 0x80 and 0x82 only")
         self._last_ns: dict[int, int] = {}
 
     def _length(self, buffer: bytes, at: int) -> int:
         return buffer[at + 3] + 6 if at + 3 < len(buffer) else 0
 
     def _possible(self, buffer: bytes, at: int, length: int) -> bool:
-        # The fields of a false packet end in the wrong place long before the packet does.
-        place, end = at + 4, at + length - 2
-        while length and place < len(buffer) and place < end:
-            if buffer[place] < 2:
+        # The fields of a false packet rarely fit, which shows before the packet is complete.
+        offset, end = at + 4, at + length - 2
+        while length and offset < len(buffer) and offset < end:
+            if buffer[offset] < 2:
                 return False
-            place += buffer[place]
-        return not length or place <= end
+            offset += buffer[offset]
+        return not length or offset <= end
 
     def _intact(self, buffer: bytes, at: int, length: int) -> bool | None:
-        place, end = at + 4, at + length - 2
-        while place < end:
-            if buffer[place] < 2:
+        offset, end = at + 4, at + length - 2
+        while offset < end:
+            if buffer[offset] < 2:
                 return None
-            place += buffer[place]
-        return checksum(buffer[at:end]) == buffer[end : end + 2] if place == end else None
+            offset += buffer[offset]
+        return checksum(buffer[at:end]) == buffer[end : end + 2] if offset == end else None
 
     def _message(self, frame: bytes, samples: list[Sample]) -> None:
         descriptor = frame[2]
         if descriptor not in self._sets:
             self.counters.skipped += 1
             return
+        sample = self._sample(frame, descriptor)
+        if sample is None:
+            self.counters.bad += 1
+        else:
+            self._emit(sample, samples)
+
+    def _sample(self, frame: bytes, descriptor: int) -> Sample | None:
+        """Return the sample of a packet; None if a field has the wrong length."""
         time_ns = period_ns = gps_us = temperature = quat = matrix = euler = acc = gyr = mag = None
-        place, end = 4, len(frame) - 2
-        while place < end:
-            start = place + 2
-            name, layout = _FIELDS.get(descriptor << 8 | frame[place + 1], ("", None))
-            place += frame[place]
+        at, end = 4, len(frame) - 2
+        set_bits = descriptor << 8
+        while at < end:
+            start = at + 2
+            name, layout = _FIELDS.get(set_bits | frame[at + 1], ("", None))
+            at += frame[at]
             if layout is None:
                 continue
-            if layout.size != place - start:
-                self.counters.bad += 1
-                return
+            if layout.size != at - start:
+                return None
             values = layout.unpack_from(frame, start)
             if descriptor == FILTER_SET and layout in _WITH_FLAGS:
                 if not values[-1]:  # the filter has no estimate yet
@@ -163,36 +171,25 @@ class MipDecoder(StreamDecoder):
             elif name == "euler":
                 euler = from_angles(*values[::-1])
             elif name == "matrix":
-                # The wire has NED -> device by rows.
+                # The packet has NED -> device, row by row.
                 matrix = from_matrix(values[0::3] + values[1::3] + values[2::3])
             elif name == "time":
                 time_ns = values[0]
             elif name == "period":
                 period_ns = values[0]
             elif name == "gps time":
-                # Wrong before the receiver has time, but it runs on.
-                if 0 <= values[0] <= 1e6:
-                    gps_us = values[1] * _WEEK_US + round(values[0] * 1e6)
+                gps_us = _gps_us(values[0], values[1])
             else:
-                temperature = number(values[2])  # least, largest and mean
+                temperature = number(values[2])  # minimum, maximum, mean
+        time_us = gps_us
         if time_ns is not None:
             self._count(descriptor, time_ns, period_ns)
+            time_us = time_ns // 1000
         quat = quat or matrix or euler
-        self._emit(
-            Sample(
-                0,
-                gps_us if time_ns is None else time_ns // 1000,
-                None if quat is None else z_up(quat),
-                acc,
-                gyr,
-                mag,
-                temperature,
-            ),
-            samples,
-        )
+        return Sample(0, time_us, None if quat is None else z_up(quat), acc, gyr, mag, temperature)
 
     def _count(self, descriptor: int, time_ns: int, period_ns: int | None) -> None:
-        # There is no counter, but a packet says how long ago the device sent the one before.
+        # There is no counter, but packets can hold the time since the previous packet.
         pause = time_ns - self._last_ns.get(descriptor, time_ns)
         self._last_ns[descriptor] = time_ns
         if not 0 <= pause <= MAX_PAUSE_US * 1000:
@@ -204,11 +201,17 @@ class MipDecoder(StreamDecoder):
 _WITH_FLAGS = (_VECTOR_VALID, _QUATERNION_VALID, _MATRIX_VALID)
 
 
+def _gps_us(seconds: float, week: int) -> int | None:
+    """Return GPS time in microseconds; None if the second of the week is impossible."""
+    # Before the receiver has the time, the value is wrong but runs on: up to 1e6 is accepted.
+    return week * _WEEK_US + round(seconds * 1e6) if 0 <= seconds <= 1e6 else None
+
+
 def encode_packet(descriptor: int, parts: Iterable[tuple[int, bytes]]) -> bytes:
-    """The bytes of a packet of fields, given as field descriptor and data.
+    """Return the bytes of a packet; each part is a field descriptor and its data.
 
     Raises:
-        ValueError: the fields are longer than 255 bytes.
+        ValueError: the payload is longer than 255 bytes.
     """
     payload = b"".join(bytes([len(data) + 2, field]) + data for field, data in parts)
     if len(payload) > 255:
@@ -224,16 +227,16 @@ def encode(
     period_us: int | None = None,
     euler: bool = False,
 ) -> bytes:
-    """The bytes that go over the line for a sample.
+    """Return the bytes on the wire for a sample.
 
     Args:
-        sample: its sensor cannot be sent; a temperature only in the sensor set.
+        sample: its sensor id is not sent, its temperature in the sensor set only.
         descriptor: SENSOR_SET or FILTER_SET.
-        period_us: time since the packet before, which shows losses; None leaves it out.
+        period_us: time since the previous packet, for the detection of losses; None leaves it out.
         euler: send angles instead of a quaternion.
 
     Raises:
-        ValueError: unknown set, or a number that does not fit.
+        ValueError: unknown descriptor set, or a number that does not fit.
     """
     if descriptor not in (SENSOR_SET, FILTER_SET):
         raise ValueError(f"descriptor must be 0x80 or 0x82, not 0x{descriptor:X}")

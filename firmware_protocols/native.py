@@ -1,6 +1,6 @@
-"""The native packet of self-built sensors, serial form: COBS(body + CRC-16) + 00.
+"""The native packet of self-built sensors on a serial line: COBS(body + CRC-16) + 00.
 
-Layouts are in README.md next to this file; `c/edgepose_packet.h` is the sender for firmware.
+Layouts are in README.md next to this file; `c/edgepose_packet.h` is the encoder for firmware.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from firmware_protocols.native_packet import (
 from firmware_protocols.sample import Sample
 
 MAX_FRAME = MAX_BODY + 2 + 1
-"""Longest frame without its closing 00, bytes: body, CRC, one byte that COBS adds."""
+"""Longest frame without its closing 00, bytes: body, CRC, one byte added by COBS."""
 
 
 # --- framing --------------------------------------------------------------------------------------
 
 
 def cobs_encode(data: bytes) -> bytes:
-    """Consistent Overhead Byte Stuffing: the same bytes without any 00, and without the closing 00."""
+    """Return data in Consistent Overhead Byte Stuffing, which has no 00; the closing 00 is left out."""
     out = bytearray()
     runs = data.split(b"\0")
     for last, run in zip([False] * (len(runs) - 1) + [True], runs, strict=True):
@@ -40,7 +40,7 @@ def cobs_encode(data: bytes) -> bytes:
             out.append(255)
             out += run[start : start + 254]
             start += 254
-        # A full block stands for no 00, so the end of the data after one needs no code byte of its own.
+        # A full block implies no 00, so data that end with one need no further code byte.
         if not last or start < len(run) or not start:
             out.append(len(run) - start + 1)
             out += run[start:]
@@ -48,7 +48,7 @@ def cobs_encode(data: bytes) -> bytes:
 
 
 def cobs_decode(data: bytes) -> bytes:
-    """Inverse of `cobs_encode`.
+    """Return the data of `cobs_encode`'s output.
 
     Raises:
         ValueError: data contains a 00 or ends inside a block.
@@ -66,24 +66,24 @@ def cobs_decode(data: bytes) -> bytes:
             after_full.append(code_at)
     if code_at > end:
         raise ValueError("COBS data ends inside a block")
-    # Each code byte stands for a 00, except the first one and those behind a full block.
+    # Each code byte stands for a 00, except the first one and those after a full block.
     for code_at in reversed(after_full):
         del out[code_at : code_at + 1]
     return bytes(out[1:])
 
 
 def frame_body(body: bytes) -> bytes:
-    """The bytes that go over the line for a body: checksum, COBS, closing 00."""
+    """Return the bytes on the wire for a body: checksum, COBS, closing 00."""
     return cobs_encode(body + crc_hqx(body, 0xFFFF).to_bytes(2, "little")) + b"\0"
 
 
 def encode(packet: Packet, *, floats: bool = False) -> bytes:
-    """The bytes that go over the line for a measurement; see `encode_body`."""
+    """Return the bytes on the wire for a measurement; see `encode_body`."""
     return frame_body(encode_body(packet, floats=floats))
 
 
 def encode_info(info: Info) -> bytes:
-    """The bytes that go over the line for an INFO packet; see `encode_info_body`."""
+    """Return the bytes on the wire for an INFO packet; see `encode_info_body`."""
     return frame_body(encode_info_body(info))
 
 
@@ -91,22 +91,22 @@ def encode_info(info: Info) -> bytes:
 
 
 class NativeReceiver(Receiver):
-    """What the serial and the CAN decoder do alike: count, keep INFO and battery, drop late messages.
+    """Common part of the serial and the CAN decoder: counters, INFO, battery, late packets.
 
     Attributes:
-        infos: the last INFO packet of each sensor id.
-        batteries: the last charge in percent and status bits of each sensor id that sends them.
+        infos: the last INFO packet, by sensor id.
+        batteries: the last charge in percent and status bits, by sensor id.
     """
 
     def __init__(self) -> None:
-        """Start with nothing seen."""
+        """Create the decoder."""
         super().__init__()
         self.infos: dict[int, Info] = {}
         self.batteries: dict[int, tuple[int, int]] = {}
         self._sequence = Sequence(self.counters, 1 << 32)
 
     def _take(self, message: Packet | Info) -> list[Sample]:
-        """The sample in an intact message, if it holds a new one."""
+        """Return the sample of an intact message, if it is new and not empty."""
         samples: list[Sample] = []
         self._count_good()
         if isinstance(message, Info):
@@ -120,26 +120,27 @@ class NativeReceiver(Receiver):
 
 
 class NativeDecoder(NativeReceiver):
-    """Samples out of a byte stream that may be cut anywhere, start anywhere and contain noise.
+    """Decoder for a byte stream that may be split anywhere, start anywhere and contain noise.
 
-    INFO packets and packets with nothing for a Sample count as skipped; `NativeReceiver` says where they go.
+    INFO packets and packets without any quantity count as skipped. INFO and battery are in the attributes of
+    `NativeReceiver`.
     """
 
     WRAP_US = 1 << 32
 
     def __init__(self) -> None:
-        """Start with nothing seen."""
+        """Create the decoder."""
         super().__init__()
-        self._rest = b""  # the frame under way; at most MAX_FRAME + 1 bytes, the last of a longer one
+        self._rest = b""  # incomplete frame; at most its last MAX_FRAME + 1 bytes
 
     def feed(self, data: bytes) -> list[Sample]:
-        """Samples completed by the next bytes of the stream, in the order they came."""
+        """Return the samples completed by the next bytes of the stream, in order of arrival."""
         self.counters.bytes += len(data)
         *frames, rest = (self._rest + data).split(b"\0")
         self._rest = rest[-MAX_FRAME - 1 :]
         samples: list[Sample] = []
         for frame in frames:
-            # Nothing between two 00 is legal: senders may open with a 00 to end any noise.
+            # An empty frame is legal: senders may begin with a 00 to end any noise.
             message = self._message(frame) if frame else None
             if message is not None:
                 samples += self._take(message)
@@ -152,8 +153,8 @@ class NativeDecoder(NativeReceiver):
             except ValueError:
                 pass
         self._count_bad()
-        # Noise, or a packet without its 00, may have run into a good packet at the end. Its first body byte
-        # is known, which leaves few places to try.
+        # A good packet may follow noise, or a packet whose 00 is lost. Its first body byte is known, so there
+        # are few offsets to try.
         frame = frame[-MAX_FRAME:]
         for start in range(len(frame) - 2):
             if frame[start + 1] in (DATA_TYPE, INFO_TYPE):
@@ -165,7 +166,11 @@ class NativeDecoder(NativeReceiver):
 
 
 def _open_frame(frame: bytes) -> Packet | Info:
-    """Packet or Info of a frame without its closing 00; ValueError if there is anything wrong with it."""
+    """Return the message in a frame without its closing 00.
+
+    Raises:
+        ValueError: the frame is invalid.
+    """
     body = cobs_decode(frame)
     if crc_hqx(body[:-2], 0xFFFF) != int.from_bytes(body[-2:], "little"):
         raise ValueError("wrong checksum")

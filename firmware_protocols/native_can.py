@@ -1,7 +1,7 @@
 """The native packet of self-built sensors on a CAN bus: two to four frames of CAN 2.0, or one of CAN FD.
 
-Layouts are in README.md next to this file; `c/edgepose_packet.h` is the sender for firmware. Everything is
-little-endian. Identifiers are `base + (message << 5 | sensor)`, 11 bits long if all of them fit, else 29.
+Layouts are in README.md next to this file; `c/edgepose_packet.h` is the encoder for firmware. Everything is
+little-endian. Identifiers are `base + (message << 5 | sensor)`, with 11 bits if all of them fit, else 29.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from firmware_protocols.native_packet import (
 from firmware_protocols.sample import Sample, Vector3, unit_quaternion
 
 BASE = 0x400
-"""Usual identifier of message 0 of sensor 0."""
+"""Default identifier of message 0 of sensor 0."""
 
 SENSORS = 32
-"""Sensors on one base."""
+"""Number of sensors per base."""
 
 SYNC_ID = 0x080
-"""Identifier (11 bits) of the frame by which one node gives its time to the others."""
+"""Identifier (11 bits) of the frame with which one node sends its time to the others."""
 
 TICK_US = 100
 """Step of the time in CAN 2.0 frames, microseconds."""
 
 ACC, QUAT, GYR, MAG = range(4)
-"""Messages. ACC opens a sample and QUAT closes it. On CAN FD message 0 is a whole packet."""
+"""Messages. ACC opens a sample and QUAT closes it. On CAN FD, message 0 is a complete packet."""
 
 FD_LENGTHS = (8, 12, 16, 20, 24, 32, 48, 64)
-"""Lengths that a body is padded to on CAN FD."""
+"""Legal lengths of CAN FD data, to which bodies are padded."""
 
 _VECTOR = struct.Struct("<3hH")
 _QUATERNION = struct.Struct("<4h")
@@ -51,7 +51,7 @@ _SPAN = 4 * SENSORS
 
 
 def can_id(message: int, sensor: int, base: int = BASE) -> int:
-    """Identifier of a message of a sensor.
+    """Return the identifier of a message of a sensor.
 
     Raises:
         ValueError: no such sensor or base.
@@ -63,26 +63,26 @@ def can_id(message: int, sensor: int, base: int = BASE) -> int:
 
 
 def is_extended(base: int) -> bool:
-    """Whether the identifiers of a base have 29 bits: those that do not all fit in 11."""
+    """Return whether the identifiers of a base have 29 bits, because not all of them fit in 11."""
     return base + _SPAN > 1 << 11
 
 
 def _check_base(base: int) -> None:
     if not 0 <= base <= (1 << 29) - _SPAN or base <= SYNC_ID < base + _SPAN:
-        raise ValueError(f"base {base:#x}: identifiers would not fit in 29 bits or would meet SYNC")
+        raise ValueError(f"base {base:#x}: identifiers do not fit in 29 bits or include SYNC")
 
 
 # --- sending --------------------------------------------------------------------------------------
 
 
 def encode(packet: Packet, base: int = BASE) -> list[tuple[int, bytes]]:
-    """Identifiers and data of the CAN 2.0 frames of a measurement, in the order to send them.
+    """Return identifiers and data of the CAN 2.0 frames of a measurement, in sending order.
 
-    Sequence number, temperature and battery are left out. The time may have more than 32 bits, and should
-    where it can: its wrap at 2^32 us would be a jump here.
+    Sequence number, temperature and battery are left out. Pass the time without a wrap at 2^32 us if
+    possible: that wrap would be a jump in the 16 bit time.
 
     Raises:
-        ValueError: no acceleration, a quantity is NaN or infinite, or there is no such sensor or base.
+        ValueError: no acceleration, a quantity is NaN or infinite, or no such sensor or base.
     """
     if packet.acc is None:
         raise ValueError("CAN 2.0 frames need an acceleration")
@@ -101,15 +101,15 @@ def encode(packet: Packet, base: int = BASE) -> list[tuple[int, bytes]]:
 
 
 def encode_fd(message: Packet | Info, base: int = BASE, *, floats: bool = False) -> tuple[int, bytes]:
-    """Identifier and data of the CAN FD frame of a measurement or an INFO packet.
+    """Return identifier and data of the CAN FD frame of a measurement or an INFO packet.
 
     Args:
-        message: what to send; time and sequence number as on a serial line.
+        message: measurement or INFO; time and sequence number as on a serial line.
         base: identifier of message 0 of sensor 0.
         floats: send vectors and quaternion as binary32 instead of int16.
 
     Raises:
-        ValueError: as `encode_body`; no such sensor or base; or the body is longer than 64 bytes.
+        ValueError: see `encode_body`; no such sensor or base; the body is longer than 64 bytes.
     """
     body = encode_info_body(message) if isinstance(message, Info) else encode_body(message, floats=floats)
     for length in FD_LENGTHS:
@@ -119,7 +119,7 @@ def encode_fd(message: Packet | Info, base: int = BASE, *, floats: bool = False)
 
 
 def encode_sync(t_us: int) -> tuple[int, bytes]:
-    """Identifier and data of a SYNC frame; the time wraps at 2^32 us."""
+    """Return identifier and data of a SYNC frame; the time wraps at 2^32 us."""
     return SYNC_ID, (t_us & 0xFFFFFFFF).to_bytes(4, "little")
 
 
@@ -131,11 +131,11 @@ class _Open:
     """A CAN 2.0 sample that waits for its QUAT.
 
     Attributes:
-        ticks: its time.
-        acc: its acceleration.
-        gyr: its angular rate, if that has come.
-        mag: its magnetic field, if that has come.
-        arrival_s: when its ACC came, if that is known.
+        ticks: time, steps of TICK_US.
+        acc: acceleration.
+        gyr: angular rate, if it has arrived.
+        mag: magnetic field, if it has arrived.
+        arrival_s: arrival time of the ACC, if known.
     """
 
     ticks: int
@@ -146,46 +146,46 @@ class _Open:
 
 
 class NativeCanDecoder(NativeReceiver):
-    """Samples out of the frames of a bus, CAN 2.0 and CAN FD in any mixture.
+    """Decoder for the frames of a bus, CAN 2.0 and CAN FD in any mixture.
 
-    In CAN 2.0 a QUAT belongs to the ACC before it only if it is the first QUAT after it. A sample of which
-    one of the two got lost is dropped and counted as lost; a GYR or MAG whose time is not that of the open
-    ACC shows such a loss too. Where only a GYR or MAG is lost, its quantity is None. CAN 2.0 has no sequence
-    numbers: samples of which nothing came are not counted. Frames of others on the bus count as skipped, like
-    INFO packets.
+    In CAN 2.0 a QUAT belongs to the ACC before it only if it is the first QUAT after that ACC. If either is
+    lost, the sample is dropped and counted as lost; a GYR or MAG whose time differs from that of the open ACC
+    reveals such a loss, too. If only a GYR or MAG is lost, its quantity is None. CAN 2.0 has no sequence
+    numbers, so a sample all of whose frames are lost is not counted. Frames of other senders count as
+    skipped, like INFO packets.
 
-    `Sample.time_us` wraps at WRAP_US, the range of the 16 bit time of CAN 2.0; the longer time of CAN FD is
-    brought to the same range without a step where it wraps itself.
+    `Sample.time_us` wraps at WRAP_US, the range of the 16 bit time of CAN 2.0. The longer time of CAN FD is
+    reduced to this range, without a jump at its own wrap.
     """
 
     WRAP_US = 65536 * TICK_US
 
     def __init__(self, base: int = BASE) -> None:
-        """Start with nothing seen.
+        """Create the decoder.
 
         Raises:
-            ValueError: identifiers of this base would not fit in 29 bits or would meet SYNC.
+            ValueError: the identifiers of this base do not fit in 29 bits or include SYNC.
         """
         super().__init__()
         _check_base(base)
         self._base = base
         self._extended = is_extended(base)
         self._open: dict[int, _Open] = {}
-        self._acc: dict[int, tuple[int, int]] = {}  # ticks of the last ACC and period, by sensor
-        self._fd_us: dict[int, int] = {}  # unwrapped time of CAN FD, by sensor
+        self._acc: dict[int, tuple[int, int]] = {}  # by sensor: ticks of the last ACC, period in ticks
+        self._fd_us: dict[int, int] = {}  # by sensor: unwrapped time of CAN FD
 
     def feed(
         self, can_id: int, data: bytes, extended: bool = False, time_s: float | None = None
     ) -> list[Sample]:
-        """The sample that a frame completes, if any.
+        """Return the sample that a frame completes, if any.
 
         Args:
             can_id: identifier.
             data: up to 8 bytes of a CAN 2.0 frame or 64 of a CAN FD frame.
-            extended: the identifier has 29 bits.
-            time_s: when the frame was on the bus, seconds on any steady clock, only if controller or kernel
-                measured it. With it a QUAT that comes more than half a period after its ACC is refused: else
-                the loss of a QUAT and the very next ACC of its sensor cannot be seen.
+            extended: whether the identifier has 29 bits.
+            time_s: when the frame was on the bus, seconds on any steady clock; pass it only if the controller
+                or the kernel measured it. With it, a QUAT more than half a period after its ACC is rejected;
+                without it, the loss of a QUAT and of the very next ACC of its sensor cannot be detected.
         """
         self.counters.bytes += len(data)
         offset = can_id - self._base
@@ -214,13 +214,13 @@ class NativeCanDecoder(NativeReceiver):
             last, period = self._acc.get(sensor, (ticks, 0))
             step = ticks - last & 0xFFFF
             if step:
-                # The shortest of late, for steps over lost samples are too long.
+                # The shortest recent step, because steps across lost samples are too long.
                 period = min(step, period + period // 8 + 1) if period else step
             self._acc[sensor] = ticks, period
         elif open_ is None:
             self._count_bad()
         elif open_.ticks != ticks:
-            # QUAT of the open sample and ACC of this one are lost; the QUAT to come shows the second loss.
+            # QUAT of the open sample and ACC of this one are lost; the next QUAT counts the second loss.
             del self._open[sensor]
             self.counters.lost += 1
         elif message == GYR:
@@ -231,7 +231,7 @@ class NativeCanDecoder(NativeReceiver):
     def _close(self, sensor: int, data: bytes, time_s: float | None) -> list[Sample]:
         open_ = self._open.pop(sensor, None)
         if open_ is None:
-            # Its ACC is lost, unless the sensor has only just come into sight.
+            # Its ACC is lost, unless decoding has just begun.
             self.counters.lost += sensor in self._acc
             return []
         quat = None
@@ -269,7 +269,7 @@ class NativeCanDecoder(NativeReceiver):
 
 def _encoder() -> Encode:
     def encode_sample(sample: Sample, seq: int) -> list[Frame]:
-        # The whole time: a wrap at 2^32 us would be a jump in the 16 bit time.
+        # Keep all bits of the time: a wrap at 2^32 us would be a jump in the 16 bit time.
         packet = packet_of(sample, seq)._replace(t_us=sample.time_us or 0)
         return [(can_id, data, False, False) for can_id, data in encode(packet)]
 

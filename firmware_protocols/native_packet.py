@@ -1,6 +1,6 @@
-"""The native packet of self-built sensors: the messages themselves, without checksum and framing.
+"""The native packet of self-built sensors: message bodies, without checksum and framing.
 
-Layouts are in README.md next to this file; `c/edgepose_packet.h` is the sender for firmware. Everything is
+Layouts are in README.md next to this file; `c/edgepose_packet.h` is the encoder for firmware. Everything is
 little-endian.
 """
 
@@ -27,14 +27,14 @@ MAX_FIRMWARE = 32
 """Longest firmware string of an INFO packet, bytes."""
 
 MAX_BODY = 66
-"""Longest body, bytes: header, every block, vectors as floats."""
+"""Longest body, bytes: header and all blocks, with vectors as floats."""
 
 QUAT_SCALE, ACC_SCALE, GYR_SCALE, MAG_SCALE, TEMPERATURE_SCALE = 32767, 100, 900, 10, 100
-"""Steps of an int16 in 1, m/s^2, rad/s, uT, degC."""
+"""Steps of an int16 per unit: 1, m/s^2, rad/s, uT, degC."""
 
 
 class Packet(NamedTuple):
-    """One measurement as it is sent: a Sample with what only the line needs. Absent quantities are None.
+    """One measurement as it is sent: a Sample and a sequence number. Absent quantities are None.
 
     Attributes:
         sensor_id: 0..255.
@@ -45,7 +45,7 @@ class Packet(NamedTuple):
         gyr: angular rate, rad/s.
         mag: magnetic field, uT.
         temperature: degC.
-        battery: charge in percent (0..100) and eight status bits whose meaning is up to the device.
+        battery: charge in percent (0..100) and eight status bits, which the device defines.
     """
 
     sensor_id: int
@@ -60,20 +60,20 @@ class Packet(NamedTuple):
 
 
 def packet_of(sample: Sample, seq: int) -> Packet:
-    """The packet of a sample with its sensor's count of samples; no time is sent as 0."""
+    """Return the packet of a sample with sequence number `seq`; a missing time is sent as 0."""
     time_us = (sample.time_us or 0) & 0xFFFFFFFF
     return Packet(sample.sensor, seq & 0xFFFF, time_us, *sample[2:])
 
 
 class Info(NamedTuple):
-    """What a sensor says about itself, every few seconds.
+    """A sensor's description of itself, sent every few seconds.
 
     Attributes:
         sensor_id: 0..255.
         firmware: name and version, printable ASCII, at most MAX_FIRMWARE characters.
         segment: SMPL joint (0..23) whose bone carries the sensor; None if the device does not know.
         frame: inertial frame of its quaternions, one of FRAMES.
-        rate_hz: packets a second, steps of 0.1 up to 6553.5; 0 if unknown.
+        rate_hz: packets per second, steps of 0.1 up to 6553.5; 0 if unknown.
     """
 
     sensor_id: int
@@ -104,7 +104,7 @@ _LAYOUTS = {
 
 
 def fixed(values: Iterable[float], scale: int) -> list[int]:
-    """Values times scale as int16: to the nearest, halves away from zero, held at the ends of the range.
+    """Return values times scale as int16: rounded to nearest, halves away from zero, clamped.
 
     Raises:
         ValueError: a value is NaN or infinite.
@@ -113,8 +113,8 @@ def fixed(values: Iterable[float], scale: int) -> list[int]:
     for value in values:
         if not isfinite(value):
             raise ValueError(f"cannot send {value}")
-        # Firmware has binary32 floats: round to one first, so that both sides see the same ties. Its product
-        # with the scale has at most 39 bits and is exact here; the bound keeps huge values inside binary32.
+        # Firmware has binary32 floats: round to binary32 first, so that both sides round the same ties. The
+        # product with the scale has at most 39 bits and is exact here; the clamp keeps huge values in range.
         (single,) = struct.unpack("<f", struct.pack("<f", min(max(value, -1e6), 1e6)))
         size = floor(abs(single) * scale + 0.5)
         result.append(min(size, 32767) if single > 0 else -min(size, 32768))
@@ -129,14 +129,14 @@ def _finite(values: Iterable[float]) -> list[float]:
 
 
 def encode_body(packet: Packet, *, floats: bool = False) -> bytes:
-    """Body of a measurement without CRC and framing.
+    """Return the body of a measurement, without CRC and framing.
 
     Args:
-        packet: quantities beyond the range of int16 are held at its ends, a battery charge at 0 and 100.
+        packet: quantities are clamped to the range of int16, a battery charge to 0..100.
         floats: send vectors and quaternion as binary32 instead of int16.
 
     Raises:
-        ValueError: a quantity is NaN, infinite or too large for binary32, or a whole number does not fit.
+        ValueError: a quantity is NaN, infinite or too large for binary32, or an integer does not fit.
     """
     mask = 0
     values: list[float] = []
@@ -169,10 +169,10 @@ def encode_body(packet: Packet, *, floats: bool = False) -> bytes:
 
 
 def encode_info_body(info: Info) -> bytes:
-    """Body of an INFO packet without CRC and framing.
+    """Return the body of an INFO packet, without CRC and framing.
 
     Raises:
-        ValueError: a field is outside of what `Info` allows.
+        ValueError: a field is outside the range given in `Info`.
     """
     if not _is_text(info.firmware.encode("utf-8")):
         raise ValueError(
@@ -201,7 +201,7 @@ def encode_info_body(info: Info) -> bytes:
 
 
 def body_size(data: bytes) -> int:
-    """Length of the body at the start of data, from its own fields.
+    """Return the length of the body at the start of data, from its own fields.
 
     Raises:
         ValueError: unknown version, type or mask bits, or too few bytes to tell.
@@ -216,10 +216,10 @@ def body_size(data: bytes) -> int:
 
 
 def decode_body(body: bytes) -> Packet | Info:
-    """Packet or Info of a body without CRC and framing. Quaternions come out with norm 1.
+    """Return the message in a body without CRC and framing. Quaternions are normalised.
 
     Raises:
-        ValueError: unknown version, type or mask bits, wrong length, or values that cannot be true.
+        ValueError: unknown version, type or mask bits, wrong length, or impossible values.
     """
     kind = body[0] if body else None
     if kind == DATA_TYPE:
@@ -307,5 +307,5 @@ def _decode_info(body: bytes) -> Info:
 
 
 def _is_text(text: bytes) -> bool:
-    # Printable only: the string ends up on terminals and in logs.
+    # Printable characters only: the string is shown on terminals and in logs.
     return len(text) <= MAX_FIRMWARE and all(0x20 <= byte <= 0x7E for byte in text)

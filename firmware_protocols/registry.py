@@ -1,7 +1,7 @@
 """The wire formats by name.
 
-A format's module is imported when its `Protocol` is looked up, not before. Other packages add formats with
-the entry-point group `edgepose.protocols`.
+The module of a format is imported when its `Protocol` is looked up. Other packages add formats through the
+entry-point group `edgepose.protocols`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ __all__ = ["PROTOCOLS", "Decoder", "Encode", "Frame", "Protocol", "protocol_name
 _log = logging.getLogger(__name__)
 
 GROUP = "edgepose.protocols"
-"""Entry points of other packages: name of the format -> its `Protocol`."""
+"""Group of the entry points of other packages: name of the format -> its `Protocol`."""
 
 _BUILT_IN = {
     "native": "native:PROTOCOL",
@@ -45,11 +45,11 @@ _BUILT_IN = {
     "openlog-dmp": "text:PROTOCOL_OPENLOG_DMP",
     "mavlink": "mavlink:PROTOCOL",
 }
-"""Module of this package and constant in it, by name of the format."""
+"""Module in this package and its constant, by name of the format."""
 
 
 def protocol_names() -> tuple[str, ...]:
-    """Names of all formats, those of other packages last; nothing is imported."""
+    """Return the names of all formats, those of other packages last, without importing any."""
     others = {point.name for point in entry_points(group=GROUP)}
     return (*_BUILT_IN, *sorted(others - set(_BUILT_IN)))
 
@@ -77,7 +77,7 @@ class _Registry(Mapping[str, Protocol]):
 
 @cache
 def _installed() -> dict[str, Protocol]:
-    """Formats of other packages, sorted by name. One that is unusable is left out with a warning."""
+    """Return the formats of other packages, sorted by name. Warn about unusable ones and leave them out."""
     found: dict[str, Protocol] = {}
     for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
         package = f"protocol {point.name!r} of {point.dist.name if point.dist else point.value}"
@@ -90,7 +90,7 @@ def _installed() -> dict[str, Protocol]:
             _log.warning("%s cannot be loaded: %s: %s", package, type(error).__name__, error)
             continue
         if not isinstance(protocol, Protocol) or protocol.name != point.name:
-            _log.warning("%s is ignored: %s is no Protocol of that name", package, point.value)
+            _log.warning("%s is ignored: %s is not a Protocol of that name", package, point.value)
             continue
         found[point.name] = protocol
     return found

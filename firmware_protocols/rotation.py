@@ -1,4 +1,4 @@
-"""Rotations between the forms that devices send; quaternions are w, x, y, z and turn sensor to inertial."""
+"""Conversions between representations of rotations; quaternions are w, x, y, z, sensor to inertial."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from math import atan2, cos, hypot, pi, remainder, sin, sqrt, tau
 
 from firmware_protocols.sample import Quaternion, Vector3, unit_quaternion
 
-_MAX_ANGLE = 7.0  # a turn and some, radians
+_MAX_ANGLE = 7.0  # slightly more than a full turn, radians
 
 
 def from_yaw_pitch_roll(yaw: float, pitch: float, roll: float) -> Quaternion:
-    """Rz(yaw) Ry(pitch) Rx(roll), radians."""
+    """Return the quaternion of Rz(yaw) Ry(pitch) Rx(roll), radians."""
     cy, sy = cos(yaw / 2), sin(yaw / 2)
     cp, sp = cos(pitch / 2), sin(pitch / 2)
     cr, sr = cos(roll / 2), sin(roll / 2)
@@ -23,16 +23,17 @@ def from_yaw_pitch_roll(yaw: float, pitch: float, roll: float) -> Quaternion:
 
 
 def from_angles(yaw: float, pitch: float, roll: float) -> Quaternion | None:
-    """As `from_yaw_pitch_roll`; None if the angles are no numbers, or larger than any device sends."""
+    """Do the same as `from_yaw_pitch_roll`, but return None for NaN and for angles that no device sends."""
     if not abs(yaw) <= _MAX_ANGLE or not abs(pitch) <= _MAX_ANGLE or not abs(roll) <= _MAX_ANGLE:
         return None
     return from_yaw_pitch_roll(yaw, pitch, roll)
 
 
 def to_yaw_pitch_roll(quat: Quaternion) -> Vector3:
-    """Inverse of `from_yaw_pitch_roll`: pitch from -pi/2 to pi/2, the others from -pi to pi."""
+    """Return yaw, pitch and roll of a quaternion: pitch from -pi/2 to pi/2, the others from -pi to pi."""
     w, x, y, z = quat
-    # Half the sum and half the difference of yaw and roll. Upright one of the two is any angle, and cancels.
+    # Half the sum and half the difference of yaw and roll. With x vertical, one of them is arbitrary and
+    # cancels.
     half_sum, half_difference = atan2(z + x, w - y), atan2(z - x, w + y)
     return (
         remainder(half_sum + half_difference, tau),
@@ -42,12 +43,12 @@ def to_yaw_pitch_roll(quat: Quaternion) -> Vector3:
 
 
 def from_matrix(m: tuple[float, ...], tolerance: float = 0.1) -> Quaternion | None:
-    """Quaternion of a rotation matrix, row after row; None if it is none.
+    """Return the quaternion of a rotation matrix, given row by row; None if it is not a rotation.
 
-    Its rows have to be of length 1, upright on each other and right-handed, each to the tolerance.
+    Its rows have to be orthonormal, within the tolerance, and right-handed.
     """
     xx, xy, xz, yx, yy, yz, zx, zy, zz = m
-    off = (
+    errors = (
         xx * xx + xy * xy + xz * xz - 1,
         yx * yx + yy * yy + yz * yz - 1,
         zx * zx + zy * zy + zz * zz - 1,
@@ -56,9 +57,9 @@ def from_matrix(m: tuple[float, ...], tolerance: float = 0.1) -> Quaternion | No
         zx * xx + zy * xy + zz * xz,
     )
     det = xx * (yy * zz - yz * zy) - xy * (yx * zz - yz * zx) + xz * (yx * zy - yy * zx)
-    if not all(-tolerance <= value <= tolerance for value in off) or not det > 0:  # NaN is not either
+    if not all(-tolerance <= value <= tolerance for value in errors) or not det > 0:  # NaN compares false
         return None
-    # The largest of the four squares is at least 1 (times 4), so that nothing small is divided by.
+    # The largest of the four (each is 4 times a square) is at least 1: no division by small numbers.
     squares = (1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz)
     largest = max(squares)
     s = 2 * sqrt(largest)
@@ -74,7 +75,7 @@ def from_matrix(m: tuple[float, ...], tolerance: float = 0.1) -> Quaternion | No
 
 
 def rotate(quat: Quaternion, v: Vector3) -> Vector3:
-    """A vector of the sensor frame in the inertial frame."""
+    """Return a vector of the sensor frame in the inertial frame."""
     w, x, y, z = quat
     a, b, c = v
     # v + 2 u x (u x v + w v) with u the vector part
@@ -83,6 +84,6 @@ def rotate(quat: Quaternion, v: Vector3) -> Vector3:
 
 
 def rotate_back(quat: Quaternion, v: Vector3) -> Vector3:
-    """A vector of the inertial frame in the sensor frame."""
+    """Return a vector of the inertial frame in the sensor frame."""
     w, x, y, z = quat
     return rotate((w, -x, -y, -z), v)

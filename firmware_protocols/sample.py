@@ -1,4 +1,4 @@
-"""What every decoder gives: one reading of one sensor in one convention, whatever the wire says.
+"""The output of all decoders: readings of sensors in one convention, whatever the wire format.
 
 `base.Decoder` is the interface of the decoders.
 """
@@ -15,22 +15,22 @@ CanFrame = tuple[int, bytes, bool]
 """Identifier, data, whether the identifier has 29 bits."""
 
 STANDARD_G = 9.80665
-"""One g of devices that send accelerations in g, m/s^2."""
+"""One g, m/s^2, for devices that send accelerations in g."""
 
 
 class Sample(NamedTuple):
     """One measurement, SI units; absent quantities are None.
 
     Attributes:
-        sensor: the device's own id on its line or bus (node id, source address, id byte); 0 where the
-            protocol has none.
-        time_us: device clock at the measurement, microseconds, wrapping at the decoder's WRAP_US; None where
-            the device sends no time.
-        quat: unit quaternion w, x, y, z (scalar first) that turns vectors of the sensor frame into an
-            inertial frame with Z up.
+        sensor: the device's own id on its line or bus (node id, source address, id byte); 0 if the protocol
+            has none.
+        time_us: device clock at the measurement, microseconds, wrapping at the decoder's WRAP_US; None if the
+            device sends no time.
+        quat: unit quaternion w, x, y, z (scalar first) that maps vectors from the sensor frame to an inertial
+            frame with Z up.
         acc: specific force in the sensor frame, m/s^2: +9.81 on the axis that points up at rest.
         gyr: angular rate in the sensor frame, rad/s.
-        mag: magnetic field in the sensor frame, uT, or in the device's own unit where it is not calibrated to
+        mag: magnetic field in the sensor frame, uT, or in the device's own unit if it is not calibrated to
             uT.
         temperature: degC.
     """
@@ -46,17 +46,17 @@ class Sample(NamedTuple):
 
 @dataclass
 class Counters:
-    """What a decoder has seen since it was made.
+    """Counts of what a decoder has received since its creation.
 
     Attributes:
         bytes: bytes fed (CAN: data bytes).
         packets: samples returned.
-        bad: pieces of the input that were no valid packet: wrong checksum, impossible length or content.
-        resyncs: times a good packet followed one or more bad ones.
-        lost: packets missing by the devices' own counts.
-        late: packets dropped as duplicates or older than their sensor's last one.
-        skipped: intact packets that hold nothing for a Sample.
-        restarts: times a device's count and clock began anew, or paused too long to count what is missing.
+        bad: invalid pieces of the input: wrong checksum, impossible length or content.
+        resyncs: valid packets that directly follow bad input.
+        lost: missing packets, according to the devices' counters.
+        late: packets dropped as duplicates, or as older than the last one of their sensor.
+        skipped: valid packets that hold no quantity of a Sample.
+        restarts: restarts of a device's counter or clock, and pauses too long to count what is missing.
     """
 
     bytes: int = 0
@@ -70,9 +70,9 @@ class Counters:
 
 
 def unit_quaternion(w: float, x: float, y: float, z: float, tolerance: float = 0.1) -> Quaternion | None:
-    """The quaternion at norm 1, or None if its norm is further than the tolerance from 1 or not a number.
+    """Return the quaternion normalised to norm 1; None if its norm is not 1 within the tolerance.
 
-    Sensors that are starting send zeros; normalising those would invent an orientation.
+    Sensors send zeros while they start; normalising those would invent an orientation.
     """
     norm = (w * w + x * x + y * y + z * z) ** 0.5
     if not abs(norm - 1.0) <= tolerance:
@@ -81,8 +81,8 @@ def unit_quaternion(w: float, x: float, y: float, z: float, tolerance: float = 0
 
 
 def z_up(quat: Quaternion) -> Quaternion:
-    """A quaternion sensor -> NED made sensor -> ENU: (x, y, z) becomes (y, x, -z) on the inertial side."""
+    """Convert a quaternion sensor -> NED to sensor -> ENU, or back: inertial (x, y, z) becomes (y, x, -z)."""
     w, x, y, z = quat
-    # R_ENU_NED is a half turn about (1, 1, 0) / sqrt(2).
+    # R_ENU_NED is a rotation by 180 degrees about (1, 1, 0) / sqrt(2).
     h = 0.5**0.5
     return (-h * (x + y), h * (w + z), h * (w - z), h * (y - x))

@@ -1,6 +1,6 @@
-"""Text lines with numbers: one reader for the many sketches and loggers that print their readings.
+"""Text lines with numbers: one decoder for all sketches and loggers that print their readings.
 
-A `Pattern` says what a line looks like and what its numbers mean; docs/text.md shows how one is written in a
+A `Pattern` describes the lines and the meaning of their numbers; docs/text.md shows how to write one in a
 TOML file.
 """
 
@@ -30,25 +30,25 @@ from firmware_protocols.text_pattern import (
 )
 
 MAX_LINE = 512
-"""Longest line that is read, bytes."""
+"""Length limit of a line, bytes."""
 
 
 class TextDecoder(Receiver):
-    """Samples out of a byte stream of lines that may be cut anywhere, start anywhere and contain noise.
+    """Decoder for a stream of text lines that may be split anywhere, start anywhere and contain noise.
 
-    Lines that the pattern says nothing about are skipped. Text has no checksum: a wrong digit stays unseen.
+    Lines that do not match the pattern are skipped. Text has no checksum, so wrong digits are not detected.
     """
 
     WRAP_US = 1 << 64
 
     def __init__(self, pattern: Pattern | str) -> None:
-        """Start with nothing seen.
+        """Create the decoder.
 
         Args:
-            pattern: a pattern, or the name of one of PATTERNS.
+            pattern: a pattern, or its name in PATTERNS.
 
         Raises:
-            ValueError: there is no pattern of that name.
+            ValueError: no pattern has that name.
         """
         if isinstance(pattern, str):
             if pattern not in PATTERNS:
@@ -66,8 +66,8 @@ class TextDecoder(Receiver):
             for wanted in pattern.columns.values()
             for name in ([wanted] if isinstance(wanted, str) else wanted)
         }
-        # Of columns, the first line may lack its beginning and still have enough of them.
-        self._whole = self._layout is None
+        # The first line may lack its beginning and still have the right number of columns.
+        self._skip_first = self._layout is not None
         self._scales = {quantity: pattern.scale(quantity) for quantity in UNITS}
         self._clock = pattern.units.get("time") == "clock"
         self._ned = pattern.frame == "NED"
@@ -75,7 +75,7 @@ class TextDecoder(Receiver):
         self._too_long = False
 
     def feed(self, data: bytes) -> list[Sample]:
-        """Samples completed by the next bytes of the stream, in the order they came."""
+        """Return the samples completed by the next bytes of the stream, in order of arrival."""
         self.counters.bytes += len(data)
         *lines, rest = (self._rest + data).replace(b"\r", b"\n").split(b"\n")
         samples = []
@@ -93,7 +93,7 @@ class TextDecoder(Receiver):
         return samples
 
     def _line(self, line: str) -> Sample | None:
-        # A line that is too long comes as an empty one.
+        # `feed` passes a line that is too long as an empty one.
         if not line or not line.isascii():
             self._count_bad()
             return None
@@ -108,19 +108,19 @@ class TextDecoder(Receiver):
             columns = columns_of(line, self.pattern.separator)
             header = None if self._names.isdisjoint(columns) else find_columns(self.pattern, columns)
             if header is not None:
-                # A second one: the device has started again.
-                self.counters.restarts += self._layout is not None and self._whole
-                self._layout, self._whole = header, True
+                # A second header: the device has restarted.
+                self.counters.restarts += self._layout is not None and not self._skip_first
+                self._layout, self._skip_first = header, False
                 return None
-            if not self._whole or self._layout is None:
-                self._whole = True
+            if self._skip_first or self._layout is None:
+                self._skip_first = False
                 self.counters.skipped += 1
                 return None
-            count, places = self._layout
+            count, indices = self._layout
             if len(columns) != count:
                 self._count_bad()
                 return None
-            values = {name: columns[place] for name, place in places.items()}
+            values = {name: columns[index] for name, index in indices.items()}
         try:
             sample = self._sample(values)
         except (ValueError, OverflowError):
@@ -185,7 +185,7 @@ class TextDecoder(Receiver):
             return None
         result = vector((numbers[a], numbers[b], numbers[c]), self._scales[quantity])
         if result is None:
-            raise ValueError("no quantity is this large")
+            raise ValueError("a value is implausibly large")
         return result
 
     def _time(self, text: str) -> int:
@@ -195,7 +195,7 @@ class TextDecoder(Receiver):
             hours, minutes, seconds = text.split(":")
             time_us = round((int(hours) * 60 + int(minutes)) * 60_000_000 + float(seconds) * 1e6)
         else:
-            # Whole steps stay whole, however many there are.
+            # Integer arithmetic is exact for any number of steps.
             scale = self._scales["time"]
             time_us = (
                 int(text) * int(scale)
@@ -217,36 +217,36 @@ _HEADERS = {
 
 
 def encode_header(name: str) -> bytes:
-    """Line that comes before those of `encode`; empty where the device sends none."""
+    """Return the header line that precedes the lines of `encode`; empty if the device sends none."""
     header = _HEADERS.get(name)
     return b"" if header is None else header.encode() + b"\r\n"
 
 
 def encode(sample: Sample, name: str) -> bytes:
-    """The line of a sample in one of the ready patterns; an absent magnetometer or temperature is sent as 0.
+    """Return the line of a sample in a built-in pattern, with zeros for an absent `mag` or temperature.
 
     Raises:
-        ValueError: there is no such pattern, or the sample lacks something that its lines have.
+        ValueError: no such pattern, or the sample lacks a quantity of its lines.
     """
     quat, acc, gyr = sample.quat, sample.acc, sample.gyr
     if name not in PATTERNS:
         raise ValueError(f"pattern must be one of {', '.join(PATTERNS)}, not {name!r}")
     if quat is None and name != "artemis":
-        raise ValueError(f"lines of {name} have an orientation")
+        raise ValueError(f"lines of {name} need an orientation")
     if name == "adafruit":
         line = "Quaternion: " + ", ".join(f"{x:.4f}" for x in quat or ())
     elif name == "razor":
-        # A half turn of the inertial frame is its own inverse.
+        # z_up is its own inverse, up to the sign of the quaternion.
         angles = rotation.to_yaw_pitch_roll(z_up(quat)) if quat is not None else ()
         line = "#YPR=" + ",".join(f"{degrees(x):.2f}" for x in angles)
     else:
         if acc is None or gyr is None or sample.time_us is None:
-            raise ValueError(f"lines of {name} have time, force and rate")
+            raise ValueError(f"lines of {name} need time, acceleration and angular rate")
         pattern = PATTERNS[name]
         raw = name == "artemis-dmp"
         parts = ["01/01/2026", _clock(sample.time_us)]
         if raw and quat is not None:
-            # Only x, y, z are sent: w is above 0.
+            # Only x, y, z are sent: w has to be positive.
             sign = -1.0 if quat[0] < 0 else 1.0
             parts += [f"{x * sign:.5f}" for x in quat[1:]] + ["0"]
         for quantity, vector in (("acc", acc), ("gyr", gyr), ("mag", sample.mag or (0.0, 0.0, 0.0))):
@@ -264,7 +264,7 @@ def _clock(time_us: int) -> str:
 
 
 def _encoder(pattern: str) -> Callable[[], Encode]:
-    """`Protocol.encoder` of a ready pattern; a header line goes before a sensor's first sample."""
+    """Return the `Protocol.encoder` of a built-in pattern; it sends a header line before the first sample."""
 
     def encode_sample(sample: Sample, seq: int) -> bytes:
         header = b"" if seq else encode_header(pattern)

@@ -1,6 +1,6 @@
-"""What lines of text look like: the patterns that `text` reads.
+"""Descriptions of text lines, for the decoder in `text`.
 
-docs/text.md shows how one is written in a TOML file.
+docs/text.md shows how to write one in a TOML file.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ FIELDS = (
     "sensor", "time", "w", "x", "y", "z", "yaw", "pitch", "roll",
     "ax", "ay", "az", "gx", "gy", "gz", "mx", "my", "mz", "temperature",
 )  # fmt: skip
-"""Names of what a line can hold: groups of a regular expression, or keys of `columns`."""
+"""Names of the values in a line: groups of a regular expression, or keys of `columns`."""
 
 FRAMES = ("Z-up", "NED")
 
@@ -37,21 +37,22 @@ ACC, GYR, MAG = ("ax", "ay", "az"), ("gx", "gy", "gz"), ("mx", "my", "mz")
 
 @dataclass(frozen=True)
 class Pattern:
-    """What the lines of a device look like: either a regular expression or columns.
+    """Description of the lines of a device: either a regular expression or columns.
 
     Attributes:
-        regex: searched in every line; its named groups are FIELDS. It should begin with fixed text and end in
-            `$`, so that no piece of a line, and no two pieces run together, can match. A group should not be
-            able to hold what separates it from the next, or bad lines take long to be refused.
-        columns: name of the column for each of the FIELDS, or a list of names of which the first that is
-            there counts; names are in a header line. Those that the header does not have are absent.
+        regex: searched for in every line; its named groups are FIELDS. It should begin with fixed text and
+            end in `$`, so that neither a part of a line nor two joined parts can match. A group should not
+            match the text that separates it from the next, or bad lines take long to be rejected.
+        columns: for each of the FIELDS, the name of its column in the header line, or a list of names, the
+            first of which in the header is used. Fields without a column in the header are absent.
         header: the header line, for devices that send none or sent it before the port was open.
-        separator: between columns.
+        separator: text between columns.
         units: of acc (m/s2, g, mg), gyr (rad/s, deg/s, mrad/s), mag (uT, nT, mG, G), angle (deg, rad), time
             (us, ms, s, clock: hours:minutes:seconds), or the SI value (uT, us) of one step as a number; a
-            leading minus turns the sign around. What is not named is SI, degrees or us.
+            leading minus inverts the sign. The defaults are SI units, degrees and us.
         frame: inertial frame of the orientation, "Z-up" or "NED".
-        wrap_us: where the time starts again at 0; by default 2^32 us or ms, a day for clock, never for s.
+        wrap_us: the time restarts at 0 after this many microseconds; by default after 2^32 us or ms, after a
+            day for clock, never for s.
 
     Without w, w = sqrt(1 - x^2 - y^2 - z^2). Angles are Rz(yaw) Ry(pitch) Rx(roll).
     """
@@ -65,13 +66,13 @@ class Pattern:
     wrap_us: int | None = None
 
     def __post_init__(self) -> None:
-        """Check.
+        """Check the pattern.
 
         Raises:
-            ValueError: the pattern means nothing, or not one thing.
+            ValueError: the pattern is invalid or ambiguous.
         """
         if (self.regex is None) == (not self.columns):
-            raise ValueError("a pattern has either a regex or columns")
+            raise ValueError("a pattern needs either a regex or columns")
         if self.regex is not None:
             try:
                 names = set(re.compile(self.regex).groupindex)
@@ -97,15 +98,15 @@ class Pattern:
         if "w" in names and "x" not in names:
             raise ValueError("w without x")
         if not names & {"x", "yaw", "ax", "gx"}:
-            raise ValueError("a pattern needs an orientation, a force or a rate")
+            raise ValueError("a pattern needs an orientation, an acceleration or an angular rate")
         if {"x", "yaw"} <= names:
-            raise ValueError("a pattern has either a quaternion or angles")
+            raise ValueError("a pattern can have either a quaternion or angles, not both")
         if not self.separator or not isinstance(self.separator, str):
-            raise ValueError("separator must be a character")
+            raise ValueError("separator must be a non-empty string")
         if self.frame not in FRAMES:
             raise ValueError(f"frame must be one of {', '.join(FRAMES)}, not {self.frame!r}")
         if self.wrap_us is not None and not (type(self.wrap_us) is int and self.wrap_us > 0):
-            raise ValueError(f"wrap_us must be a whole number above 0, not {self.wrap_us!r}")
+            raise ValueError(f"wrap_us must be an integer above 0, not {self.wrap_us!r}")
         for quantity in self.units:
             self.scale(quantity)
         if self.header is not None and (
@@ -114,10 +115,10 @@ class Pattern:
             raise ValueError("the header has none of the columns")
 
     def scale(self, quantity: str) -> float:
-        """SI value (uT, us) of one step.
+        """Return the SI value (uT, us) of one step.
 
         Raises:
-            ValueError: there is no such quantity or unit.
+            ValueError: no such quantity or unit.
         """
         known = UNITS.get(quantity)
         if known is None:
@@ -133,7 +134,7 @@ class Pattern:
 
     @property
     def wraps_at_us(self) -> int:
-        """Where the time starts again at 0."""
+        """The time restarts at 0 after this many microseconds."""
         if self.wrap_us is not None:
             return self.wrap_us
         unit = self.units.get("time", "us")
@@ -141,10 +142,10 @@ class Pattern:
 
 
 def pattern_from_table(table: Mapping[str, object]) -> Pattern:
-    """Pattern of a table of a TOML file; its keys are the attributes.
+    """Return the pattern of a TOML table, whose keys are the attributes of `Pattern`.
 
     Raises:
-        ValueError: an unknown key, or values that mean nothing.
+        ValueError: an unknown key or an invalid value.
     """
     known = {f.name for f in fields(Pattern)}
     unknown = sorted(set(table) - known)
@@ -200,11 +201,11 @@ PATTERNS = {
         units={"acc": STANDARD_G / 8192, "gyr": radians(1 / 16.4), "mag": 0.15, "time": "clock"},
     ),
 }
-"""Ready patterns by name."""
+"""Built-in patterns by name."""
 
 
 def columns_of(line: str, separator: str) -> list[str]:
-    """Columns of a line, without the empty ones at its end."""
+    """Return the columns of a line, without empty ones at its end."""
     columns = [column.strip() for column in line.split(separator)]
     # Loggers end lines with a separator.
     while columns and not columns[-1]:
@@ -213,17 +214,17 @@ def columns_of(line: str, separator: str) -> list[str]:
 
 
 def find_columns(pattern: Pattern, columns: list[str]) -> tuple[int, dict[str, int]] | None:
-    """Number of columns and index of each field; None if these are not the columns of a header."""
-    places = {}
+    """Return the number of columns and the index of each field; None if the columns are not a header."""
+    indices = {}
     for name, wanted in pattern.columns.items():
         for column in [wanted] if isinstance(wanted, str) else wanted:
             if column in columns:
-                places[name] = columns.index(column)
+                indices[name] = columns.index(column)
                 break
     for group in (QUAT[1:], ANGLES, ACC, GYR, MAG):
-        if not all(name in places for name in group):
+        if not all(name in indices for name in group):
             for name in group:
-                places.pop(name, None)
-    if not places.keys() & {"x", "yaw", "ax", "gx"}:
+                indices.pop(name, None)
+    if not indices.keys() & {"x", "yaw", "ax", "gx"}:
         return None
-    return len(columns), places
+    return len(columns), indices

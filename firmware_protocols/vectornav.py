@@ -1,6 +1,6 @@
-"""VectorNav VN-100, VN-200 and VN-300: binary outputs and ASCII lines, on one line together if need be.
+"""VectorNav VN-100, VN-200 and VN-300: binary outputs and ASCII lines, which may be mixed.
 
-Layouts are in docs/vectornav.md. Binary numbers are little-endian, but the checksum is big-endian.
+Layouts are in docs/vectornav.md. Binary numbers are little-endian, the checksum is big-endian.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from firmware_protocols.sample import Quaternion, Sample, Vector3, unit_quaterni
 
 _GAUSS_UT = 100.0
 
-# Bytes of the fields of each group, from bit 0 up. Bit 15 announces another mask, for bits 16 and up.
+# Sizes in bytes of the fields of each group, from bit 0 up. Bit 15 means that another mask follows, for bits
+# 16 and up.
 _GNSS = (8, 8, 2, 1, 1, 24, 24, 12, 12, 12, 4, 4, 2, 28, 0, 0, 0, 2, 8)
 _SIZES: dict[int, tuple[int, ...]] = {
     0: (8, 8, 8, 12, 16, 12, 24, 12, 12, 24, 20, 28, 2, 4, 8),  # common
@@ -38,7 +39,7 @@ _MAX_GROUP_BYTES = 2
 _MAX_PAYLOAD = 1024
 _MAX_PLANS = 64
 
-# Fields that a sample takes, by group and bit: name, place in the field, format, in the order of preference.
+# Fields that become quantities of a sample, in order of preference: group, bit, name, offset, format.
 _FIELDS: tuple[tuple[int, int, str, int, str], ...] = (
     (0, 0, "time", 0, "<Q"),
     (1, 0, "time", 0, "<Q"),
@@ -61,7 +62,7 @@ _FIELDS: tuple[tuple[int, int, str, int, str], ...] = (
     (2, 4, "temperature", 0, "<f"),
 )
 
-# Quantities of the ASCII lines, in their order. "-" is one that a sample does not take.
+# "-" is a quantity that a sample does not have.
 ASCII_LINES: dict[str, tuple[str, ...]] = {
     "VNYPR": ("ypr",),
     "VNQTN": ("quat",),
@@ -80,36 +81,36 @@ ASCII_LINES: dict[str, tuple[str, ...]] = {
     "VNMAR": ("mag", "acc", "gyr"),
     "VNIMU": ("mag", "acc", "gyr", "temperature"),
 }
-"""ASCII lines that are read, and what they hold."""
+"""ASCII lines that are decoded, and their quantities in order."""
 
 _LINE = re.compile(rb"\$VN[A-Z0-9]{3}[ -#%-)+-~]{0,250}\*(?:[0-9A-Fa-f]{2}){1,2}\r")
 _PART_OF_LINE = re.compile(rb"\$(?:V(?:N(?:[ -#%-~]{0,260}\r?)?)?)?\Z")
 
 
 class _Plan(NamedTuple):
-    """Where in the payload of a binary output the quantities are; the same for all with one header."""
+    """Offsets of the quantities in binary outputs with the same header."""
 
     length: int
     parts: tuple[tuple[str, int, struct.Struct], ...]
 
 
 class VectorNavDecoder(StreamDecoder):
-    """Measurements out of the serial line of one device.
+    """Decoder for the serial line of one device.
 
-    Samples have a time only from binary outputs with the time since start-up.
+    Only samples of binary outputs with the time since start-up have a time.
     """
 
-    # Nanoseconds in 64 bits; nothing runs that long.
+    # 64 bits of nanoseconds: 584 years.
     WRAP_US = (1 << 64) // 1000
 
     _START = re.compile(rb"[\xfa$]")
     _PADDING = b"\r\n"
 
     def __init__(self) -> None:
-        """Start with nothing seen."""
+        """Create the decoder."""
         super().__init__()
-        self._plans: dict[bytes, _Plan | None] = {}  # by header; None is no output
-        self._current: _Plan | None = None  # of the output that was measured last
+        self._plans: dict[bytes, _Plan | None] = {}  # by header; None: not an output
+        self._current: _Plan | None = None  # of the output whose length was asked for last
 
     def _length(self, buffer: bytes, at: int) -> int:
         if buffer[at] == 0xFA:
@@ -126,7 +127,7 @@ class VectorNavDecoder(StreamDecoder):
 
     def _plan(self, header: bytes) -> _Plan | None:
         if header not in self._plans:
-            # A device has a few outputs; noise must not fill the memory.
+            # A device has a few outputs only: noise must not fill the memory.
             if len(self._plans) >= _MAX_PLANS:
                 self._plans.clear()
             self._plans[header] = _make_plan(header)
@@ -159,7 +160,7 @@ class VectorNavDecoder(StreamDecoder):
 
     def _binary(self, frame: bytes) -> dict[str, tuple]:
         parts = self._current.parts if self._current else ()
-        return {name: layout.unpack_from(frame, place) for name, place, layout in parts}
+        return {name: layout.unpack_from(frame, offset) for name, offset, layout in parts}
 
     def _ascii(self, frame: bytes) -> dict[str, tuple] | None:
         text, _, _ = frame[1:].rpartition(b"*")
@@ -173,7 +174,7 @@ class VectorNavDecoder(StreamDecoder):
         try:
             for kind in kinds:
                 count = _COUNTS.get(kind, 3)
-                # Behind the last one the device may add counters and states, if it is told to.
+                # The device can be set to append counters and states.
                 values[kind] = tuple(map(float, numbers[at : at + count]))
                 at += count
         except ValueError:
@@ -188,7 +189,7 @@ _COUNTS = {"quat": 4, "temperature": 1}
 
 
 def header_size(buffer: bytes, at: int = 0) -> int:
-    """Bytes of a binary output before its payload; 0 if more are needed to tell; negative if it is none."""
+    """Return the size of a binary output's header; 0 if more bytes are needed; negative if it is none."""
     groups = 1
     while True:
         if at + groups >= len(buffer):
@@ -199,22 +200,22 @@ def header_size(buffer: bytes, at: int = 0) -> int:
         if groups > _MAX_GROUP_BYTES:
             return -1
     masks = sum(bin(buffer[at + i] & 0x7F).count("1") for i in range(1, groups + 1))
-    place = at + 1 + groups
+    offset = at + 1 + groups
     while masks:
-        if place + 1 >= len(buffer):
+        if offset + 1 >= len(buffer):
             return 0
-        masks -= not buffer[place + 1] & 0x80
-        place += 2
-    return place - at
+        masks -= not buffer[offset + 1] & 0x80
+        offset += 2
+    return offset - at
 
 
 def _make_plan(header: bytes) -> _Plan | None:
-    """Plan for outputs with a header; None if it holds a group or a field of unknown length, or nothing."""
+    """Return the plan for a header; None if a group or field has an unknown size, or if there is no field."""
     groups = [header[1]] if not header[1] & 0x80 else [header[1], header[2]]
     numbers = [8 * i + bit for i, byte in enumerate(groups) for bit in range(7) if byte >> bit & 1]
     at = 1 + len(groups)
-    place = len(header)
-    places: dict[tuple[int, int], int] = {}
+    offset = len(header)
+    offsets: dict[tuple[int, int], int] = {}
     for group in numbers:
         sizes = _SIZES.get(group)
         if sizes is None:
@@ -232,68 +233,68 @@ def _make_plan(header: bytes) -> _Plan | None:
                     field = first + bit
                     if field >= len(sizes) or not sizes[field]:
                         return None
-                    places[group, field] = place
-                    place += sizes[field]
+                    offsets[group, field] = offset
+                    offset += sizes[field]
             first += 16
-    if place == len(header) or place - len(header) > _MAX_PAYLOAD:
+    if offset == len(header) or offset - len(header) > _MAX_PAYLOAD:
         return None
     parts: dict[str, tuple[str, int, struct.Struct]] = {}
-    for group, bit, name, offset, layout in _FIELDS:
-        if (group, bit) in places and name not in parts:
-            parts[name] = (name, places[group, bit] + offset, struct.Struct(layout))
-    return _Plan(place + 2, tuple(parts.values()))
+    for group, bit, name, shift, layout in _FIELDS:
+        if (group, bit) in offsets and name not in parts:
+            parts[name] = (name, offsets[group, bit] + shift, struct.Struct(layout))
+    return _Plan(offset + 2, tuple(parts.values()))
 
 
 # --- encoders -------------------------------------------------------------------------------------
 
 
 def encode_binary(sample: Sample, *, euler: bool = False) -> bytes:
-    """The bytes of a binary output for a sample, fields of the common and the IMU group.
+    """Return the bytes of a binary output for a sample, with fields of the common and the IMU group.
 
     Args:
-        sample: its sensor cannot be sent.
+        sample: its sensor id is not sent.
         euler: send angles instead of a quaternion.
 
     Raises:
         ValueError: a number does not fit.
     """
     common = imu = 0
-    first = second = b""
+    common_data = imu_data = b""
     quat = None if sample.quat is None else z_up(sample.quat)
     try:
         if sample.time_us is not None:
             common |= 1 << 0
-            first += struct.pack("<Q", sample.time_us * 1000)
+            common_data += struct.pack("<Q", sample.time_us * 1000)
         if quat is not None and euler:
             common |= 1 << 3
-            first += struct.pack("<3f", *_ypr(quat))
+            common_data += struct.pack("<3f", *_ypr(quat))
         elif quat is not None:
             common |= 1 << 4
-            first += struct.pack("<4f", *quat[1:], quat[0])
+            common_data += struct.pack("<4f", *quat[1:], quat[0])
         if sample.gyr is not None:
             common |= 1 << 5
-            first += struct.pack("<3f", *sample.gyr)
+            common_data += struct.pack("<3f", *sample.gyr)
         if sample.acc is not None:
             common |= 1 << 8
-            first += struct.pack("<3f", *sample.acc)
+            common_data += struct.pack("<3f", *sample.acc)
         if sample.temperature is not None:
             imu |= 1 << 4
-            second += struct.pack("<f", sample.temperature)
+            imu_data += struct.pack("<f", sample.temperature)
         if sample.mag is not None:
             imu |= 1 << 8
-            second += struct.pack("<3f", *(m / _GAUSS_UT for m in sample.mag))
+            imu_data += struct.pack("<3f", *(m / _GAUSS_UT for m in sample.mag))
     except (struct.error, OverflowError) as error:
         raise ValueError(f"cannot send {sample}: {error}") from None
     masks = b"".join(mask.to_bytes(2, "little") for mask in (common, imu) if mask)
-    body = bytes([bool(common) | bool(imu) << 2]) + masks + first + second
+    body = bytes([bool(common) | bool(imu) << 2]) + masks + common_data + imu_data
     return b"\xfa" + body + crc_hqx(body, 0).to_bytes(2, "big")
 
 
 def encode_ascii(sample: Sample, name: str = "VNQMR", *, crc: bool = False) -> bytes:
-    """An ASCII line with the quantities of a sample, with its line end.
+    """Return an ASCII line with quantities of a sample, line end included.
 
     Args:
-        sample: has to hold what the line holds; its sensor and time cannot be sent.
+        sample: must have the quantities of the line; its sensor id and time are not sent.
         name: one of ASCII_LINES.
         crc: send the 16 bit checksum instead of the 8 bit one.
 
@@ -301,7 +302,7 @@ def encode_ascii(sample: Sample, name: str = "VNQMR", *, crc: bool = False) -> b
         ValueError: unknown line, or the sample lacks a quantity.
     """
     if name not in ASCII_LINES:
-        raise ValueError(f"no line {name!r}, only {', '.join(ASCII_LINES)}")
+        raise ValueError(f"line must be one of {', '.join(ASCII_LINES)}, not {name!r}")
     text = name
     quat = None if sample.quat is None else z_up(sample.quat)
     for kind in ASCII_LINES[name]:
@@ -326,7 +327,7 @@ def encode_ascii(sample: Sample, name: str = "VNQMR", *, crc: bool = False) -> b
             raise ValueError(f"a {name} line needs a sample with {kind}")
         text += "".join("," + format(number, form) for number in numbers)
     if name == "VNIMU":
-        text += ",+00101.325"  # the line ends with a pressure, which a sample has not
+        text += ",+00101.325"  # the line ends with a pressure, which samples do not have
     body = text.encode("ascii")
     check = f"{crc_hqx(body, 0):04X}" if crc else f"{reduce(xor, body):02X}"
     return b"$" + body + b"*" + check.encode("ascii") + b"\r\n"

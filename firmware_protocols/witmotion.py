@@ -37,35 +37,35 @@ _WORDS = struct.Struct("<4h")
 
 
 class WitDecoder(StreamDecoder):
-    """Samples out of a serial stream of the standard protocol: one sensor, always `sensor` 0.
+    """Decoder for a serial stream of the standard protocol: one sensor, `sensor` is always 0.
 
     The orientation is that of the quaternion packet, or else the angles as Rz(yaw) Ry(pitch) Rx(roll). The
     time is the time of day on the device's clock.
 
     Attributes:
-        counters: what has been seen so far; `lost` are incomplete cycles.
+        counters: counts of everything decoded so far; `lost` counts incomplete cycles.
     """
 
     WRAP_US = DAY_US
     _START = re.compile(rb"\x55(?:[\x50-\x5a\x5f]|\Z)")
 
     def __init__(self, *, mag_ut: float = 1.0) -> None:
-        """Start with nothing seen.
+        """Create the decoder.
 
         Args:
-            mag_ut: microtesla of one step of the magnetic field, which differs between models. With 1 the
-                field comes in steps.
+            mag_ut: microtesla per step of the magnetic field, which depends on the model. With 1 the field
+                is in steps.
         """
         super().__init__()
         self._cycle = Cycle(0, self.counters)
         self._mag_ut = mag_ut
-        self._due: list[Sample] = []
+        self._pending: list[Sample] = []
 
     def feed(self, data: bytes) -> list[Sample]:
-        """Samples completed by the next bytes of the stream, in the order they came."""
+        """Return the samples completed by the next bytes of the stream, in order of arrival."""
         samples = super().feed(data)
-        samples += self._due
-        self._due = []
+        samples += self._pending
+        self._pending = []
         return samples
 
     def _length(self, buffer: bytes, at: int) -> int:
@@ -75,10 +75,10 @@ class WitDecoder(StreamDecoder):
         return sum(buffer[at : at + _SIZE - 1]) & 0xFF == buffer[at + _SIZE - 1]
 
     def _message(self, frame: bytes, samples: list[Sample]) -> None:
-        samples += self._due
-        self._due = []
+        samples += self._pending
+        self._pending = []
         kind = frame[1]
-        if kind == REGISTERS:  # an answer, at any place
+        if kind == REGISTERS:  # an answer can come anywhere in the cycle
             self.counters.skipped += 1
             return
         w, x, y, z = words = _WORDS.unpack_from(frame, 2)
@@ -114,7 +114,7 @@ class WitDecoder(StreamDecoder):
 
     def _cut(self) -> None:
         if self._in_sync:
-            self._due += self._cycle.cut()
+            self._pending += self._cycle.cut()
 
 
 def _time_of_day(frame: bytes) -> int | None:
@@ -125,12 +125,12 @@ def _time_of_day(frame: bytes) -> int | None:
 
 
 def encode(sample: Sample, *, angles: bool = False, mag_ut: float = 1.0) -> bytes:
-    """Serial packets of one cycle of what the sample has.
+    """Return the serial packets of one cycle, with the quantities that the sample has.
 
     Args:
-        sample: its time becomes that of a day.
-        angles: send Euler angles, as new devices do, and not the quaternion.
-        mag_ut: microtesla of one step of the magnetic field.
+        sample: its time is sent as a time of day.
+        angles: send Euler angles, as new devices do, instead of the quaternion.
+        mag_ut: microtesla per step of the magnetic field.
     """
     out = b""
     if sample.time_us is not None:

@@ -35,33 +35,33 @@ _CAN_ANGLE = struct.Struct("<BBBxi")
 
 
 class WitCanDecoder(Receiver):
-    """Samples out of CAN frames; `sensor` is the identifier of the device.
+    """Decoder for CAN frames; `sensor` is the identifier of the device.
 
-    The orientation is that of the angles: a quaternion does not fit into a frame and comes without its last
-    component. The frames have neither count nor time: if just as many frames of a device as make whole cycles
-    are lost in a row, quantities of different cycles meet unnoticed.
+    The orientation is that of the angles: a quaternion does not fit into a frame and lacks its last
+    component. The frames have neither counter nor time. If one or more whole cycles of consecutive frames of
+    a device are lost, quantities of different cycles are combined, which cannot be detected.
 
     Attributes:
-        counters: what has been seen so far; `lost` are incomplete cycles.
+        counters: counts of everything decoded so far; `lost` counts incomplete cycles.
     """
 
     WRAP_US = DAY_US
 
     def __init__(self, *, fine_angles: bool = False, mag_ut: float = 1.0) -> None:
-        """Start with nothing seen.
+        """Create the decoder.
 
         Args:
-            fine_angles: devices of high precision (HWT9073) send each angle in a frame of its own.
-            mag_ut: microtesla of one step of the magnetic field, which differs between models. With 1 the
-                field comes in steps.
+            fine_angles: whether each angle comes in its own frame, as from high-precision devices (HWT9073).
+            mag_ut: microtesla per step of the magnetic field, which depends on the model. With 1 the field
+                is in steps.
         """
         super().__init__()
-        self._fine = fine_angles
+        self._fine_angles = fine_angles
         self._mag_ut = mag_ut
         self._cycles: BoundedDict[tuple[int, bool], Cycle] = BoundedDict()
 
     def feed(self, can_id: int, data: bytes, extended: bool = False) -> list[Sample]:
-        """The samples that this frame completes."""
+        """Return the samples that this frame completes."""
         self.counters.bytes += len(data)
         if len(data) != 8 or data[0] != 0x55 or not (TIME <= data[1] <= 0x5A):
             self.counters.skipped += 1
@@ -79,7 +79,7 @@ class WitCanDecoder(Receiver):
             values = {"mag": scaled((x, y, z), self._mag_ut)}
         elif kind != ANGLES:
             values = {}
-        elif not self._fine:
+        elif not self._fine_angles:
             values = angles_of((x, y, z))
         else:
             _, _, axis, angle = _CAN_ANGLE.unpack(data)
@@ -92,7 +92,10 @@ class WitCanDecoder(Receiver):
 
 
 def encode_can(sample: Sample, *, fine_angles: bool = False, mag_ut: float = 1.0) -> list[CanFrame]:
-    """CAN frames of one cycle of what the sample has; identifiers above 0x7FF are extended."""
+    """Return the CAN frames of one cycle, with the quantities that the sample has.
+
+    Identifiers above 0x7FF are extended.
+    """
     frames = []
     for kind, values, step in vectors_of(sample, mag_ut, True):
         if kind == ANGLES and fine_angles:

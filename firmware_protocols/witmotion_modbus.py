@@ -1,4 +1,4 @@
-"""WitMotion on RS-485: Modbus registers that are asked for, device by device.
+"""WitMotion on RS-485: Modbus registers, which the host polls device by device.
 
 Layouts are in docs/witmotion.md. Registers are big-endian.
 """
@@ -24,7 +24,8 @@ from firmware_protocols.rotation import from_yaw_pitch_roll, to_yaw_pitch_roll
 from firmware_protocols.sample import Quaternion, Sample, unit_quaternion
 
 FIRST_REGISTER, ANGLE_REGISTERS, ALL_REGISTERS = 0x34, 12, 33
-"""Acceleration, rate, field and angles; with temperature and quaternion in addition."""
+"""Register of the acceleration; number of registers up to the angles (acceleration, rate, field, angles), and
+up to the quaternion (also temperature and quaternion)."""
 
 
 def _crc_table() -> tuple[int, ...]:
@@ -40,7 +41,7 @@ _CRC_TABLE = _crc_table()
 
 
 def crc16(data: bytes) -> int:
-    """CRC-16 of Modbus: polynomial 0x8005 reflected, initial value 0xFFFF; sent low byte first."""
+    """Return the CRC-16 of Modbus: polynomial 0x8005 reflected, initial value 0xFFFF; sent low byte first."""
     crc = 0xFFFF
     for byte in data:
         crc = crc >> 8 ^ _CRC_TABLE[(crc ^ byte) & 0xFF]
@@ -52,10 +53,10 @@ def _with_crc(data: bytes) -> bytes:
 
 
 def poll(address: int, first: int = FIRST_REGISTER, count: int = ANGLE_REGISTERS) -> bytes:
-    """The request to send to a device on RS-485 for one sample; `count` is that of the decoder.
+    """Return the request to an RS-485 device for one sample; `count` must be that of the decoder.
 
     Raises:
-        ValueError: no such address or registers.
+        ValueError: invalid address or registers.
     """
     if not 1 <= address <= 247 or not 0 <= first <= 0xFFFF or not 1 <= count <= 125:
         raise ValueError(f"cannot ask {address} for {count} registers from {first}")
@@ -63,28 +64,28 @@ def poll(address: int, first: int = FIRST_REGISTER, count: int = ANGLE_REGISTERS
 
 
 class WitModbusDecoder(StreamDecoder):
-    """Samples out of the answers to `poll` on an RS-485 line; `sensor` is the address of the device.
+    """Decoder for the answers to `poll` on an RS-485 line; `sensor` is the address of the device.
 
-    An answer does not say which registers it holds: all requests must be for the same. Requests that come
-    back as an echo, and refusals, are skipped.
+    An answer does not say which registers it holds, so all requests must be for the same ones. Echoed
+    requests and error responses are skipped.
 
     Attributes:
-        counters: what has been seen so far.
+        counters: counts of everything decoded so far.
     """
 
     WRAP_US = DAY_US
     _START = re.compile(rb"[\x01-\xf7](?:[\x03\x83]|\Z)")
 
     def __init__(self, *, count: int = ANGLE_REGISTERS, mag_ut: float = 1.0) -> None:
-        """Start with nothing seen.
+        """Create the decoder.
 
         Args:
-            count: registers asked for, from FIRST_REGISTER on: ANGLE_REGISTERS or ALL_REGISTERS.
-            mag_ut: microtesla of one step of the magnetic field, which differs between models. With 1 the
-                field comes in steps.
+            count: number of registers requested, from FIRST_REGISTER on: ANGLE_REGISTERS or ALL_REGISTERS.
+            mag_ut: microtesla per step of the magnetic field, which depends on the model. With 1 the field
+                is in steps.
 
         Raises:
-            ValueError: another count.
+            ValueError: any other count.
         """
         if count not in (ANGLE_REGISTERS, ALL_REGISTERS):
             raise ValueError(f"count must be {ANGLE_REGISTERS} or {ALL_REGISTERS}, not {count}")
@@ -142,13 +143,13 @@ class WitModbusDecoder(StreamDecoder):
 
 
 def encode_modbus(sample: Sample, *, count: int = ANGLE_REGISTERS, mag_ut: float = 1.0) -> bytes:
-    """Answer of the device `sample.sensor` to a request for `count` registers.
+    """Return the answer of device `sample.sensor` to a request for `count` registers.
 
     Raises:
-        ValueError: a needed quantity is missing.
+        ValueError: a required quantity is missing.
     """
     if sample.acc is None or sample.gyr is None or sample.quat is None:
-        raise ValueError("needs quaternion, acceleration and angular rate")
+        raise ValueError("quaternion, acceleration and angular rate are required")
     words = steps_of(sample.acc, ACC_STEP) + steps_of(sample.gyr, GYR_STEP)
     words += steps_of(sample.mag or (0.0, 0.0, 0.0), mag_ut) + steps_of(
         to_yaw_pitch_roll(sample.quat)[::-1], ANGLE_STEP
@@ -165,7 +166,7 @@ PROTOCOL = Protocol(
     name="witmotion-modbus",
     transport="bytes",
     default_bitrate=9600,
-    description="WitMotion on RS-485; ids are Modbus addresses, which are asked in turn",
+    description="WitMotion on RS-485; ids are Modbus addresses, which are polled in turn",
     decoder=WitModbusDecoder,
     encoder=uncounted(encode_modbus),
     ids=range(0x50, 0x56),

@@ -19,10 +19,10 @@ from firmware_protocols.rotation import from_angles, from_matrix, rotate, to_yaw
 from firmware_protocols.sample import Quaternion, Sample, unit_quaternion, z_up
 
 MTDATA2 = 0x36
-"""Message id of measurements."""
+"""Id of messages with measurements."""
 
 MAX_PAYLOAD = 2048
-"""Longest payload of a frame, bytes."""
+"""Length limit of a payload, bytes."""
 
 NUMBER_FORMATS = ("f32", "fp12.20", "fp16.32", "f64")
 """Formats of real numbers; the index is the code in the lowest two bits of an item's id."""
@@ -33,13 +33,13 @@ FRAMES = ("ENU", "NED", "NWU")
 TICK_US = 100
 """Step of the sample time (SampleTimeFine), microseconds."""
 
-_BROADCAST = 0xFF  # bus id of a device that is alone on its line
+_BROADCAST = 0xFF  # bus id of a single device on its line
 _MAX_BUS_ID = 0x20
 
 _REALS = {
     0x0810: 1,  # temperature
     0x2010: 4,  # quaternion w, x, y, z
-    0x2020: 9,  # rotation matrix, by columns
+    0x2020: 9,  # rotation matrix, column by column
     0x2030: 3,  # roll, pitch, yaw
     0x4010: 3,  # velocity increment
     0x4020: 3,  # acceleration
@@ -104,7 +104,7 @@ def _readers() -> dict[int, tuple[int, _Reader]]:
     for kind, layout in _INTEGERS.items():
         reader = struct.Struct(layout)
         for low in range(16):
-            # Whole numbers take no notice of the format bits.
+            # The format bits do not apply to integers.
             result[kind | low] = (reader.size, reader.unpack)
     return result
 
@@ -115,7 +115,7 @@ _SAMPLE_READERS = {item: reader for item, reader in _READERS.items() if item & 0
 
 
 def mtdata2_items(payload: bytes) -> Iterator[tuple[int, Values | bytes]]:
-    """All items of an MTData2 payload: id as sent, values; plain bytes where the layout is not known.
+    """Yield all items of an MTData2 payload: id as sent and values, or bytes if the layout is unknown.
 
     Raises:
         ValueError: the items do not fill the payload.
@@ -135,9 +135,9 @@ def mtdata2_items(payload: bytes) -> Iterator[tuple[int, Values | bytes]]:
 
 
 class XbusDecoder(StreamDecoder):
-    """Measurements out of the Xbus stream of one device, or of a master with several sensors.
+    """Decoder for the Xbus stream of one device, or of a master with several sensors.
 
-    The sensor of a sample is the bus id behind a master, 0 for a device that is alone.
+    `sensor` is the bus id behind a master, 0 for a single device.
     """
 
     WRAP_US = (1 << 32) * TICK_US
@@ -145,7 +145,7 @@ class XbusDecoder(StreamDecoder):
     _START = re.compile(b"\xfa")
 
     def __init__(self) -> None:
-        """Start with nothing seen."""
+        """Create the decoder."""
         super().__init__()
         self._sequence = Sequence(self.counters, self.WRAP_US)
 
@@ -157,7 +157,7 @@ class XbusDecoder(StreamDecoder):
             return 0
         if head[3] != 0xFF:
             return head[3] + 5
-        if head[2] != MTDATA2:  # nothing else is that long
+        if head[2] != MTDATA2:  # no other message is that long
             return -1
         if len(head) < 6:
             return 0
@@ -165,22 +165,22 @@ class XbusDecoder(StreamDecoder):
         return length + 7 if length <= MAX_PAYLOAD else -1
 
     def _possible(self, buffer: bytes, at: int, length: int) -> bool:
-        # The items of a false frame end in the wrong place long before the frame does.
+        # The items of a false frame rarely fit, which shows before the frame is complete.
         if not length or buffer[at + 2] != MTDATA2:
             return True
         end = at + length - 1
-        place = at + (6 if buffer[at + 3] == 0xFF else 4)
-        while place + 2 < len(buffer) and place < end:
-            place += 3 + buffer[place + 2]
-        return place <= end
+        offset = at + (6 if buffer[at + 3] == 0xFF else 4)
+        while offset + 2 < len(buffer) and offset < end:
+            offset += 3 + buffer[offset + 2]
+        return offset <= end
 
     def _intact(self, buffer: bytes, at: int, length: int) -> bool | None:
         if buffer[at + 2] == MTDATA2:
             end = at + length - 1
-            place = at + (6 if buffer[at + 3] == 0xFF else 4)
-            while place + 2 < end:
-                place += 3 + buffer[place + 2]
-            if place != end:
+            offset = at + (6 if buffer[at + 3] == 0xFF else 4)
+            while offset + 2 < end:
+                offset += 3 + buffer[offset + 2]
+            if offset != end:
                 return None
         return not sum(buffer[at + 1 : at + length]) & 0xFF
 
@@ -189,19 +189,19 @@ class XbusDecoder(StreamDecoder):
             self.counters.skipped += 1
             return
         count = time_us = temperature = quat = euler = matrix = acc = gyr = mag = None
-        place = 6 if frame[3] == 0xFF else 4
+        offset = 6 if frame[3] == 0xFF else 4
         end = len(frame) - 1
-        while place < end:
-            item = frame[place] << 8 | frame[place + 1]
-            start = place + 3
-            place = start + frame[place + 2]
+        while offset < end:
+            item = frame[offset] << 8 | frame[offset + 1]
+            start = offset + 3
+            offset = start + frame[offset + 2]
             size, read = _SAMPLE_READERS.get(item, (-1, None))
             if read is None:
                 continue
-            if size != place - start:
+            if size != offset - start:
                 self.counters.bad += 1
                 return
-            values = read(frame[start:place])
+            values = read(frame[start:offset])
             kind = item & 0xFFF0
             if kind == 0x1020:
                 count = values[0]
@@ -210,7 +210,7 @@ class XbusDecoder(StreamDecoder):
             elif kind == 0x2010:
                 quat = _z_up(unit_quaternion(*values), item)
             elif kind == 0x2020:
-                # The wire has columns.
+                # Column by column on the wire.
                 matrix = _z_up(from_matrix(values[0::3] + values[1::3] + values[2::3]), item)
             elif kind == 0x2030:
                 euler = _z_up(from_angles(*map(radians, values[::-1])), item)
@@ -229,12 +229,12 @@ class XbusDecoder(StreamDecoder):
 
 
 def _z_up(quat: Quaternion | None, item: int) -> Quaternion | None:
-    # ENU and NWU have Z up already.
+    # ENU and NWU already have Z up.
     return z_up(quat) if quat is not None and item & 0xC == 4 else quat
 
 
 def encode_xbus(message_id: int, payload: bytes = b"", bus_id: int = _BROADCAST) -> bytes:
-    """The bytes that go over the line for an Xbus message.
+    """Return the bytes on the wire for an Xbus message.
 
     Raises:
         ValueError: the payload is longer than 2048 bytes, or an id does not fit a byte.
@@ -254,21 +254,21 @@ def encode_mtdata2(
     frame: str = "ENU",
     orientation: str = "quaternion",
 ) -> bytes:
-    """The bytes that go over the line for a sample.
+    """Return the bytes on the wire for a sample.
 
     Args:
-        sample: sensor 0 is sent as a device that is alone, others with their bus id.
-        counter: packet counter, wraps at 65536; None sends none.
-        number_format: one of NUMBER_FORMATS; reals have to fit into the fixed-point ones.
-        frame: local frame of the orientation on the wire, one of FRAMES. With "NWU" the sample's own frame is
-            taken as NWU.
+        sample: sensor 0 is sent as a single device, others with their bus id.
+        counter: packet counter, wraps at 65536; None leaves it out.
+        number_format: one of NUMBER_FORMATS; numbers have to fit into the fixed-point formats.
+        frame: local frame of the orientation on the wire, one of FRAMES. With "NWU" the quaternion is sent
+            unchanged, as NWU.
         orientation: "quaternion", "matrix" or "euler".
 
     Raises:
         ValueError: unknown options, or a number that does not fit.
     """
     if number_format not in NUMBER_FORMATS or frame not in FRAMES:
-        raise ValueError(f"no number format {number_format!r} or no frame {frame!r}")
+        raise ValueError(f"unknown number format {number_format!r} or frame {frame!r}")
     low = NUMBER_FORMATS.index(number_format)
     if not 0 <= sample.sensor <= _MAX_BUS_ID:
         raise ValueError(f"sensor must be from 0 to {_MAX_BUS_ID}, not {sample.sensor}")
@@ -290,7 +290,7 @@ def encode_mtdata2(
         elif orientation == "euler":
             payload += _item(0x2030 | code, tuple(map(degrees, to_yaw_pitch_roll(quat)[::-1])))
         else:
-            raise ValueError(f"no orientation {orientation!r}")
+            raise ValueError(f"unknown orientation {orientation!r}")
     for kind, values in ((0x4020, sample.acc), (0x8020, sample.gyr), (0xC020, sample.mag)):
         if values is not None:
             payload += _item(kind | low, values)

@@ -1,4 +1,4 @@
-"""Xsens / Movella MTi-600 on CAN: one message a quantity.
+"""Xsens / Movella MTi-600 on CAN: one message per quantity.
 
 Layouts are in docs/xsens.md.
 """
@@ -41,39 +41,41 @@ _CAN_LAYOUTS = {
     "temperature": ("h", 2**-8),
 }
 
-# A sample is complete when all of these that its predecessors had are there.
+# A sample is complete when it has all of these that its predecessors had.
 _AWAITED = ("time", "counter", "quat", "euler", "gyr", "acc")
-_MEMORY = 8  # samples after which a message that no longer comes is no longer waited for
+_MEMORY = 8  # samples without a message after which it is not waited for any more
 
 
 class _Group:
-    """The messages of one sensor that belong together."""
+    """The messages of one sensor that belong to one sample."""
 
     def __init__(self) -> None:
         self.items: dict[str, Any] = {}
         self.late: dict[str, Any] = {}
-        self.given = False  # the sample is out, what comes yet is late
-        self.number = 0
-        self.seen: dict[str, int] = {}  # number of the last group that had the message
+        self.emitted = False  # whether the sample has been returned; further messages are late
+        self.number = 0  # of the sample
+        self.seen: dict[str, int] = {}  # number of the last sample that had the message
         self.opener: tuple[str, ...] = ()
 
     def opens(self, kind: str) -> bool:
-        """If a message is the first of the next sample."""
+        """Return whether a message is the first of the next sample."""
         if kind in self.items:
             return True
         return kind in self.opener and any(other not in self.opener for other in self.items)
 
-    def learn(self, kind: str) -> None:
+    def record(self, kind: str) -> None:
+        """Note that the sensor sends a message, and update which ones open a sample."""
         if kind not in self.seen:
             kinds = (*self.seen, kind)
-            # Time and counter come first. Without them it is the lowest id that is sent.
+            # Time and counter come first. Without them, the message with the lowest id does.
             self.opener = tuple(k for k in ("time", "counter") if k in kinds) or next(
                 ((k,) for k in _AWAITED if k in kinds), ()
             )
         self.seen[kind] = self.number
 
     def complete(self) -> bool:
-        # The first groups only show which messages there are.
+        """Return whether the sample has all messages that recent ones had."""
+        # The first samples only show which messages the sensor sends.
         return self.number >= 2 and all(
             kind in self.items
             for kind, number in self.seen.items()
@@ -82,11 +84,11 @@ class _Group:
 
 
 class Mti600CanDecoder(Receiver):
-    """Samples out of the CAN messages of MTi-600 sensors on one bus. Experimental: no capture was at hand.
+    """Decoder for the CAN messages of MTi-600 sensors on one bus. Experimental: no capture was available.
 
-    The messages of a sample are put together from one sample time or group counter to the next, and given as
-    soon as all are there that the samples before had. Without time and counter, the quaternion (or the lowest
-    id that is sent) opens a sample.
+    A sample extends from one sample time or group counter to the next. It is returned as soon as it has all
+    messages that the previous samples had. Without time and counter, the quaternion (or the lowest id that is
+    sent) opens a sample.
     """
 
     WRAP_US = (1 << 32) * TICK_US
@@ -100,22 +102,22 @@ class Mti600CanDecoder(Receiver):
         extended: bool = False,
         frame: str = "ENU",
     ) -> None:
-        """Start with nothing seen.
+        """Create the decoder.
 
         Args:
-            byte_order: "big" or "little"; sources of this format do not settle it.
+            byte_order: "big" or "little"; the sources of this format are inconclusive.
             time_unit_us: one tick of the sample time, microseconds.
-            ids: the CAN ids of each sensor, named as in MTI600_IDS; None is one sensor, 0, with those.
-            extended: if all ids are 29 bit ones; ids above 0x7FF always are.
+            ids: the CAN ids of each sensor, named as in MTI600_IDS; None means one sensor, 0, with those.
+            extended: whether all ids have 29 bits; ids above 0x7FF always do.
             frame: local frame of the orientations, one of FRAMES.
 
         Raises:
             ValueError: unknown options, or two messages with one id.
         """
         if byte_order not in ("big", "little") or frame not in FRAMES:
-            raise ValueError(f"no byte order {byte_order!r} or no frame {frame!r}")
-        sign = ">" if byte_order == "big" else "<"
-        layouts = {kind: (struct.Struct(sign + f), scale) for kind, (f, scale) in _CAN_LAYOUTS.items()}
+            raise ValueError(f"unknown byte order {byte_order!r} or frame {frame!r}")
+        order = ">" if byte_order == "big" else "<"
+        layouts = {kind: (struct.Struct(order + f), scale) for kind, (f, scale) in _CAN_LAYOUTS.items()}
         super().__init__()
         self.WRAP_US = (1 << 32) * time_unit_us
         self._tick_us = time_unit_us
@@ -127,14 +129,14 @@ class Mti600CanDecoder(Receiver):
             self._groups[sensor] = _Group()
             for kind, can_id in kinds.items():
                 if kind not in layouts:
-                    raise ValueError(f"no message {kind!r}, only {', '.join(layouts)}")
+                    raise ValueError(f"message must be one of {', '.join(layouts)}, not {kind!r}")
                 key = (can_id, extended or can_id > 0x7FF)
                 if key in self._ids:
                     raise ValueError(f"CAN id 0x{can_id:X} is used twice")
                 self._ids[key] = (sensor, kind, *layouts[kind])
 
     def feed(self, can_id: int, data: bytes, extended: bool = False) -> list[Sample]:
-        """Samples completed by one CAN message; messages with other ids are skipped."""
+        """Return the samples completed by one CAN message; messages with other ids are skipped."""
         self.counters.bytes += len(data)
         entry = self._ids.get((can_id, extended))
         if entry is None:
@@ -162,21 +164,21 @@ class Mti600CanDecoder(Receiver):
         group = self._groups[sensor]
         samples: list[Sample] = []
         if group.opens(kind):
-            if not group.given:
+            if not group.emitted:
                 self._close(sensor, group, samples)
             group.items = {}
-            group.given = False
+            group.emitted = False
             group.number += 1
-        group.learn(kind)
-        if group.given:
-            # Too late for its sample. The successors wait for it, or a slow quantity goes with the next one.
+        group.record(kind)
+        if group.emitted:
+            # Too late for its sample. Later samples wait for it, or take along a slow quantity.
             if kind not in _AWAITED:
                 group.late[kind] = value
             return samples
         group.items[kind] = value
         if group.complete():
             self._close(sensor, group, samples)
-            group.given = True
+            group.emitted = True
         return samples
 
     def _close(self, sensor: int, group: _Group, samples: list[Sample]) -> None:
@@ -204,11 +206,11 @@ def encode_mti600(
     euler: bool = False,
     frame: str = "ENU",
 ) -> list[tuple[int, bytes]]:
-    """CAN ids and data of the messages of a sample, in the order a device sends them.
+    """Return CAN ids and data of the messages of a sample, in the order in which a device sends them.
 
     Args:
-        sample: what is out of the range of int16 is held at its ends.
-        counter: group counter, wraps at 65536; None sends none.
+        sample: its quantities are clamped to the range of int16.
+        counter: group counter, wraps at 65536; None leaves it out.
         byte_order: "big" or "little".
         time_unit_us: one tick of the sample time, microseconds.
         ids: the sensor's CAN ids; quantities without one are not sent.
@@ -219,8 +221,8 @@ def encode_mti600(
         ValueError: unknown options, NaN or infinity.
     """
     if byte_order not in ("big", "little") or frame not in FRAMES:
-        raise ValueError(f"no byte order {byte_order!r} or no frame {frame!r}")
-    sign = ">" if byte_order == "big" else "<"
+        raise ValueError(f"unknown byte order {byte_order!r} or frame {frame!r}")
+    order = ">" if byte_order == "big" else "<"
     quat = z_up(sample.quat) if sample.quat is not None and frame == "NED" else sample.quat
     values: dict[str, tuple[float, ...] | None] = {
         "time": None if sample.time_us is None else (sample.time_us // time_unit_us & 0xFFFFFFFF,),
@@ -238,7 +240,7 @@ def encode_mti600(
             continue
         layout, scale = _CAN_LAYOUTS[kind]
         raw = numbers if kind in ("time", "counter") else [int16(value / scale) for value in numbers]
-        messages.append((ids[kind], struct.pack(sign + layout, *raw)))
+        messages.append((ids[kind], struct.pack(order + layout, *raw)))
     return messages
 
 
@@ -246,9 +248,9 @@ _ID_STEP = 0x100
 
 
 def _six_ids() -> dict[int, dict[str, int]]:
-    """CAN ids of six devices: those as delivered, plus 0x100 for each sensor before.
+    """Return the CAN ids of six devices: those as delivered, plus 0x100 times the sensor id.
 
-    All fit in 11 bits and stay clear of CANopen's process data of low node ids.
+    All fit in 11 bits and avoid CANopen's process data of low node ids.
     """
     return {
         sensor: {kind: can_id + _ID_STEP * sensor for kind, can_id in MTI600_IDS.items()}

@@ -1,4 +1,4 @@
-"""A wire format and an output that a package of your own adds to edgepose; its pyproject.toml names both.
+"""A package that adds a wire format and an output to edgepose; its pyproject.toml registers both.
 
 pip install ./examples/plugin
 edgepose check --port /dev/ttyUSB0 --protocol example-lines
@@ -16,19 +16,19 @@ from firmware_protocols.sample import Counters, Sample
 
 
 class ExampleDecoder(Decoder):
-    """Lines `E,id,time_us,qw,qx,qy,qz,ax,ay,az`."""
+    """Decoder for lines `E,id,time_us,qw,qx,qy,qz,ax,ay,az`."""
 
     WRAP_US = 1 << 32
 
     def __init__(self) -> None:
-        """Start with nothing seen."""
+        """Create the decoder."""
         self.counters = Counters()
         self._rest = b""
 
     def feed(self, data: bytes) -> list[Sample]:
-        """Samples of the lines that are complete; a line that is none counts as bad."""
+        """Return the samples of the complete lines; invalid lines count as bad."""
         *lines, self._rest = (self._rest + data).split(b"\n")
-        self._rest = self._rest[-1000:]  # noise without line breaks does not fill the memory
+        self._rest = self._rest[-1000:]  # noise without line breaks must not fill the memory
         samples = [sample for line in lines if (sample := _parse(line)) is not None]
         self.counters.packets += len(samples)
         self.counters.bad += len(lines) - len(samples)
@@ -57,7 +57,7 @@ PROTOCOL = Protocol(
 
 
 class CountSink(Sink):
-    """Writes the number of poses into a file at the end."""
+    """Writes the number of poses to a file at the end."""
 
     def __init__(self, path: str) -> None:
         """Count from zero."""
@@ -74,5 +74,5 @@ class CountSink(Sink):
 
 
 def open_count(target: str, context: SinkContext) -> Sink:
-    """A `CountSink`; the entry point of `--sink example-count=FILE`."""
+    """Open a `CountSink`: the entry point for `--sink example-count=FILE`."""
     return CountSink(target)

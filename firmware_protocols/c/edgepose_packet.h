@@ -1,8 +1,8 @@
-/* Native packets of edgepose for firmware, over a serial line, CAN 2.0 and CAN FD: C99 or C++, header only, no heap, nothing but
- * the standard integer types.
+/* Encoder for edgepose's native packets, for firmware: serial lines, CAN 2.0 and CAN FD. C99 or C++, header only, no heap; needs
+ * nothing but the standard integer types and memcpy.
  *
- * Layouts are in firmware_protocols/README.md. Numbers are taken apart as integers, so the bytes are the same on every board,
- * whatever its byte order, its floating-point unit and the compiler's optimisation flags; `float` must be IEEE 754 binary32.
+ * Layouts are in firmware_protocols/README.md. Numbers are converted with integer arithmetic, so the bytes are the same on every
+ * board, whatever its byte order, floating-point unit and compiler flags; `float` must be IEEE 754 binary32.
  *
  *     edgepose_packet p = {0};
  *     uint8_t wire[EDGEPOSE_MAX_WIRE];
@@ -19,7 +19,7 @@
 #include <stdint.h>
 #include <string.h>
 
-/* Field mask. Choose for each vector either the int16 form or the _F32 form, not both. */
+/* Field mask. For each vector choose either the int16 or the _F32 form, not both. */
 #define EDGEPOSE_QUAT 0x001u
 #define EDGEPOSE_ACC 0x002u
 #define EDGEPOSE_GYR 0x004u
@@ -45,7 +45,7 @@
 
 typedef struct {
     uint8_t sensor_id;
-    uint16_t seq;  /* one more with each packet of this sensor, wraps */
+    uint16_t seq;  /* increases by one with each packet of this sensor, wraps */
     uint32_t t_us; /* time of the measurement, microseconds, wraps */
     uint16_t fields;
     float quat[4]; /* w, x, y, z, unit length, sensor to inertial frame */
@@ -54,14 +54,14 @@ typedef struct {
     float mag[3];  /* sensor frame, uT */
     float temperature;       /* degC */
     uint8_t battery_percent; /* above 100 is sent as 100 */
-    uint8_t battery_status;  /* bits of your own */
+    uint8_t battery_status;  /* bits for your own use */
 } edgepose_packet;
 
 typedef struct {
     uint8_t sensor_id;
     uint8_t segment;      /* SMPL joint 0..23 whose bone carries the sensor, or EDGEPOSE_NO_SEGMENT */
     uint8_t frame;        /* EDGEPOSE_FRAME_... */
-    uint16_t rate_dhz;    /* packets in ten seconds (100 Hz is 1000), 0 if unknown */
+    uint16_t rate_dhz;    /* packets per second times 10 (100 Hz is 1000), 0 if unknown */
     const char *firmware; /* printable ASCII, at most EDGEPOSE_MAX_FIRMWARE characters */
 } edgepose_info;
 
@@ -78,8 +78,8 @@ static inline uint8_t *edgepose_put32(uint8_t *out, uint32_t value) {
     return edgepose_put16(out, (uint16_t)(value >> 16));
 }
 
-/* The value times scale (at most 32767) as int16 in two's complement: rounded to the nearest, halves away from zero, held at the
- * ends of the range. `bits` is a finite binary32. */
+/* Returns a value times scale (at most 32767) as int16 in two's complement: rounded to the nearest, halves away from zero,
+ * clamped. `bits` is a finite binary32. */
 static inline uint16_t edgepose_fixed(uint32_t bits, uint16_t scale) {
     const int negative = (bits >> 31) != 0;
     const int exponent = (int)((bits >> 23) & 0xFFu); /* value = mantissa * 2^(exponent - 150) */
@@ -98,7 +98,7 @@ static inline uint16_t edgepose_fixed(uint32_t bits, uint16_t scale) {
     return (uint16_t)((negative ? 0x10000u - size : size) & 0xFFFFu);
 }
 
-/* n floats, as binary32 if scale is 0; returns the end of the output, or NULL if one is NaN or infinite. */
+/* Writes n floats, as binary32 if scale is 0, else as int16; returns the end of the output, or NULL if one is NaN or infinite. */
 static inline uint8_t *edgepose_put_floats(uint8_t *out, const float *values, size_t n, uint16_t scale) {
     size_t i;
     for (i = 0; i < n; i++) {
@@ -113,7 +113,7 @@ static inline uint8_t *edgepose_put_floats(uint8_t *out, const float *values, si
 
 /* --- packets ----------------------------------------------------------------------------------------------------------- */
 
-/* CRC-16, polynomial 0x1021, initial value 0xFFFF; "123456789" gives 0x29B1. */
+/* Returns the CRC-16 with polynomial 0x1021 and initial value 0xFFFF; that of "123456789" is 0x29B1. */
 static inline uint16_t edgepose_crc16(const uint8_t *data, size_t n) {
     uint16_t crc = 0xFFFFu;
     size_t i;
@@ -125,7 +125,7 @@ static inline uint16_t edgepose_crc16(const uint8_t *data, size_t n) {
     return crc;
 }
 
-/* COBS without the closing 00. Writes at most n + n / 254 + 1 bytes and returns their number. */
+/* Writes the COBS encoding of data, without the closing 00: at most n + n / 254 + 1 bytes. Returns their number. */
 static inline size_t edgepose_cobs(const uint8_t *data, size_t n, uint8_t *out) {
     size_t code_at = 0, end = 1, i;
     uint8_t code = 1;
@@ -144,8 +144,8 @@ static inline size_t edgepose_cobs(const uint8_t *data, size_t n, uint8_t *out) 
     return end;
 }
 
-/* Body of a measurement, without CRC and framing (CAN FD carries it like this). `out` holds EDGEPOSE_MAX_BODY bytes.
- * Returns its length, or 0 if the mask is not legal or a number is NaN or infinite. */
+/* Writes the body of a measurement, without CRC and framing, as CAN FD carries it. `out` holds EDGEPOSE_MAX_BODY bytes.
+ * Returns its length, or 0 if the mask is illegal or a number is NaN or infinite. */
 static inline size_t edgepose_encode_body(const edgepose_packet *p, uint8_t *out) {
     uint8_t *end = out;
     if ((p->fields & ~0x3FFu) || (p->fields & (p->fields >> 5) & 0xFu)) return 0;
@@ -171,7 +171,7 @@ static inline size_t edgepose_encode_body(const edgepose_packet *p, uint8_t *out
     return (size_t)(end - out);
 }
 
-/* Body of an INFO packet. Returns its length, or 0 if a member is outside of what is allowed. */
+/* Writes the body of an INFO packet. Returns its length, or 0 if a member is out of range. */
 static inline size_t edgepose_encode_info_body(const edgepose_info *info, uint8_t *out) {
     size_t n = 0;
     for (; info->firmware[n]; n++) {
@@ -188,8 +188,8 @@ static inline size_t edgepose_encode_info_body(const edgepose_info *info, uint8_
     return n + 7;
 }
 
-/* What goes over the line for a body: CRC, COBS, closing 00. `wire` holds EDGEPOSE_MAX_WIRE bytes. Returns its length, or 0 if
- * the body is empty or too long. */
+/* Writes the bytes on the wire for a body: CRC, COBS, closing 00. `wire` holds EDGEPOSE_MAX_WIRE bytes. Returns their number, or
+ * 0 if the body is empty or too long. */
 static inline size_t edgepose_frame_body(const uint8_t *body, size_t n, uint8_t *wire) {
     uint8_t data[EDGEPOSE_MAX_BODY + 2];
     size_t end;
@@ -201,13 +201,13 @@ static inline size_t edgepose_frame_body(const uint8_t *body, size_t n, uint8_t 
     return end + 1;
 }
 
-/* A measurement as it goes over the line. `wire` holds EDGEPOSE_MAX_WIRE bytes. Returns its length, or 0 as above. */
+/* Writes the bytes on the wire for a measurement. `wire` holds EDGEPOSE_MAX_WIRE bytes. Returns their number, or 0 as above. */
 static inline size_t edgepose_encode(const edgepose_packet *p, uint8_t *wire) {
     uint8_t body[EDGEPOSE_MAX_BODY];
     return edgepose_frame_body(body, edgepose_encode_body(p, body), wire);
 }
 
-/* An INFO packet as it goes over the line. Send one at the start and every few seconds. */
+/* Writes the bytes on the wire for an INFO packet. Send one at the start and then every few seconds. */
 static inline size_t edgepose_encode_info(const edgepose_info *info, uint8_t *wire) {
     uint8_t body[EDGEPOSE_MAX_BODY];
     return edgepose_frame_body(body, edgepose_encode_info_body(info, body), wire);
@@ -215,7 +215,7 @@ static inline size_t edgepose_encode_info(const edgepose_info *info, uint8_t *wi
 
 /* --- CAN --------------------------------------------------------------------------------------------------------------- */
 
-#define EDGEPOSE_CAN_BASE 0x400u  /* usual base: identifiers 0x400..0x47F, 11 bits; above 0x780 all identifiers have 29 bits */
+#define EDGEPOSE_CAN_BASE 0x400u  /* default: identifiers 0x400..0x47F, 11 bits; above 0x780 all identifiers have 29 bits */
 #define EDGEPOSE_CAN_SYNC 0x080u  /* 11 bits */
 #define EDGEPOSE_CAN_MAX_FRAMES 4u
 #define EDGEPOSE_CANFD_MAX 64u
@@ -226,13 +226,13 @@ typedef struct {
     uint8_t data[8];
 } edgepose_can_frame;
 
-/* Identifier of a message of a sensor 0..31: 0 ACC or a CAN FD packet, 1 QUAT, 2 GYR, 3 MAG. */
+/* Returns the identifier of a message of sensor 0..31. Messages: 0 ACC or a CAN FD packet, 1 QUAT, 2 GYR, 3 MAG. */
 static inline uint32_t edgepose_can_id(uint32_t base, uint8_t message, uint8_t sensor_id) {
     return base + (((uint32_t)message << 5) | sensor_id);
 }
 
-/* The 100 us time of CAN 2.0 frames from a microsecond clock, without a jump where that wraps. One for each sensor, zeros at
- * first; call it with each of its t_us, at least once in 71 minutes. */
+/* State for deriving the 100 us time of CAN 2.0 frames from a microsecond clock, without a jump where that clock wraps. Keep one
+ * per sensor, initialised with zeros, and call edgepose_can_ticks with each t_us, at least once in 71 minutes. */
 typedef struct {
     uint32_t last_us;
     uint32_t rest_us;
@@ -247,9 +247,9 @@ static inline uint16_t edgepose_can_ticks(edgepose_can_clock *clock, uint32_t t_
     return clock->ticks;
 }
 
-/* The CAN 2.0 frames of a measurement: ACC, then GYR and MAG if it has them, then QUAT, which is empty if it has no quaternion.
+/* Writes the CAN 2.0 frames of a measurement: ACC, then GYR and MAG if present, then QUAT, which is empty without a quaternion.
  * Send them in this order (no mailboxes that go by identifier), all of one sample before the next of the same sensor. Vectors
- * go as int16 whichever form the mask has; sequence number, temperature and battery are left out. `frames` holds
+ * are sent as int16 whichever form the mask has; sequence number, temperature and battery are left out. `frames` holds
  * EDGEPOSE_CAN_MAX_FRAMES. Returns their number, or 0 if the sensor id is above 31, there is no acceleration, or a number is NaN
  * or infinite. */
 static inline size_t edgepose_can_encode(const edgepose_packet *p, uint32_t base, uint16_t ticks, edgepose_can_frame *frames) {
@@ -280,15 +280,15 @@ static inline size_t edgepose_can_encode(const edgepose_packet *p, uint32_t base
     return n + 1;
 }
 
-/* SYNC: the sender's time for other nodes to set their clocks to. */
+/* Writes a SYNC frame: the sender's time, by which other nodes set their clocks. */
 static inline void edgepose_can_sync(uint32_t t_us, edgepose_can_frame *frame) {
     frame->id = EDGEPOSE_CAN_SYNC;
     frame->length = 4;
     edgepose_put32(frame->data, t_us);
 }
 
-/* Makes the data of a CAN FD frame (message 0) of a body of edgepose_encode_body or edgepose_encode_info_body: fills it with
- * zeros up to a length that CAN FD has. `body` holds EDGEPOSE_MAX_BODY bytes. Returns the length, or 0 if n is 0 or above 64. */
+/* Turns a body of edgepose_encode_body or edgepose_encode_info_body into the data of a CAN FD frame (message 0): pads it with
+ * zeros to a legal length. `body` holds EDGEPOSE_MAX_BODY bytes. Returns the length, or 0 if n is 0 or above 64. */
 static inline size_t edgepose_canfd_pad(uint8_t *body, size_t n) {
     static const uint8_t lengths[8] = {8, 12, 16, 20, 24, 32, 48, 64};
     size_t i;

@@ -184,7 +184,7 @@ def test_impossible_angles_are_bad():
     "sample", [Sample(0), Sample(0, None, (1.0, 0.0, 0.0, 0.0)), Sample(0, acc=(0.0, 0.0, 1.0))]
 )
 def test_what_cannot_be_sent(sample):
-    with pytest.raises(ValueError, match="has both"):
+    with pytest.raises(ValueError, match="needs both"):
         encode(sample, 0)
 
 

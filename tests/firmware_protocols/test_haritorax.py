@@ -146,5 +146,5 @@ def test_random_bytes_never_raise(chunks):
 def test_what_cannot_be_sent():
     with pytest.raises(ValueError, match="slots"):
         encode(stream(1)[0]._replace(sensor=8))
-    with pytest.raises(ValueError, match="has both"):
+    with pytest.raises(ValueError, match="needs both"):
         encode(Sample(0, None, (1.0, 0.0, 0.0, 0.0)))

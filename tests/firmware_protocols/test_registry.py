@@ -174,8 +174,8 @@ def test_a_protocol_of_another_package_that_cannot_be_used_costs_only_itself(ins
         "native": "the name is taken",
         "hats": "No module named 'no_such_module'",
         "gloves": "GLOVES",
-        "socks": "is no Protocol of that name",
-        "shoes": "is no Protocol of that name",
+        "socks": "is not a Protocol of that name",
+        "shoes": "is not a Protocol of that name",
     }.items():
         (line,) = [line for line in caplog.messages if line.startswith(f"protocol {name!r} of boots ")]
         assert why in line

@@ -335,7 +335,7 @@ def test_names_are_checked():
         TextDecoder("csv")
     with pytest.raises(ValueError, match="pattern must be one of"):
         encode(Sample(0), "csv")
-    with pytest.raises(ValueError, match="have an orientation"):
+    with pytest.raises(ValueError, match="need an orientation"):
         encode(Sample(0), "razor")
-    with pytest.raises(ValueError, match="have time, force and rate"):
+    with pytest.raises(ValueError, match="need time, acceleration and angular rate"):
         encode(Sample(0), "artemis")

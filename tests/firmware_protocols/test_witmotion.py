@@ -313,7 +313,7 @@ def test_modbus_bad_line():
 def test_modbus_refuses():
     with pytest.raises(ValueError, match="count"):
         WitModbusDecoder(count=13)
-    with pytest.raises(ValueError, match="needs"):
+    with pytest.raises(ValueError, match="quaternion, acceleration and angular rate are required"):
         witmotion_modbus.encode_modbus(Sample(0x50))
     zero = witmotion_modbus.encode_modbus(
         stream(1, sensor=1)[0]._replace(quat=(0.0, 0.0, 0.0, 0.0)), count=33

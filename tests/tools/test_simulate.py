@@ -187,7 +187,7 @@ def one_instant(sensors):
         (
             drop_orientation,
             ["--protocol", "hipnuc"],
-            "head: hipnuc cannot hold its samples: needs quaternion",
+            "head: hipnuc cannot hold its samples: quaternion, acceleration and angular rate are required",
         ),
         (one_instant, [], "left_forearm: it needs two instants or more"),
     ],

@@ -1,9 +1,9 @@
-/* Sends native packets of six sensors that lie still, each turned another way: a first try of a line without any sensor, and a
- * pattern for firmware.
+/* Sends native packets of six sensors at rest in different orientations: for trying a line without sensors, and as an example for
+ * firmware.
  *
  *     cc -I ../../c send_packets.c -o send_packets
  *     ./send_packets 500 > still.bin         a capture of 5 s, written at once
- * *     ./send_packets 0 /dev/ttyS0            100 times a second until stopped; set the line to 230400 bit/s or more before (stty)
+ *     ./send_packets 0 /dev/ttyS0            100 times a second until stopped; set the line to 230400 bit/s or more before (stty)
  */
 #define _POSIX_C_SOURCE 199309L
 
@@ -17,10 +17,10 @@
 #define RATE_HZ 100
 #define INFO_EVERY (2 * RATE_HZ)
 
-/* Where the sensors sit (SMPL joints): left and right forearm, left and right lower leg, head, pelvis. */
+/* SMPL joints whose bones carry the sensors: left and right forearm, left and right lower leg, head, pelvis. */
 static const uint8_t segments[SENSORS] = {18, 19, 4, 5, 15, 0};
 
-/* Sensor to inertial frame, and which way is up for the sensor: the third row of the rotation matrix. */
+/* Orientation sensor to inertial frame, and the up direction in the sensor frame: the third row of the rotation matrix. */
 static const struct {
     float quat[4], up[3];
 } poses[SENSORS] = {
@@ -58,7 +58,7 @@ static int send_sample(FILE *line, uint8_t sensor, unsigned long number) {
     return put(line, wire, edgepose_encode(&p, wire));
 }
 
-/* Waits until a sample is due, counted from a start so that no error adds up. */
+/* Waits until a sample is due, counted from the start so that errors do not accumulate. */
 static void wait_for(const struct timespec *start, unsigned long number) {
     struct timespec now, rest;
     long long left;
@@ -78,7 +78,7 @@ int main(int argc, char **argv) {
     unsigned long number;
     FILE *line = stdout;
     if (argc < 2 || argc > 3 || (!live && samples == 0)) {
-        fprintf(stderr, "usage: send_packets SAMPLES [DEVICE]; with a device 0 samples go on for ever\n");
+        fprintf(stderr, "usage: send_packets SAMPLES [DEVICE]; with a device, 0 samples means until stopped\n");
         return 2;
     }
     if (live && (line = fopen(argv[2], "wb")) == NULL) {

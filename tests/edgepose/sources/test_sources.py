@@ -523,7 +523,7 @@ def test_lines_of_text_as_a_file_describes_them(tmp_path):
     assert len(got) == 300
     assert got[-1].sensor == 5
     assert got[-1].time_s - got[0].time_s == pytest.approx(0.49)
-    with pytest.raises(ValueError, match=r"mine\.toml is only read"):
+    with pytest.raises(ValueError, match=r"mine\.toml can only be decoded"):
         protocol_named(str(pattern)).encode(Sample(0), 0)
     pattern.write_text("regexp = 'x'\n")
     with pytest.raises(EdgeposeError, match=r"mine\.toml: unknown key 'regexp'"):

@@ -1,20 +1,20 @@
-/* Native packets of edgepose from an Arduino board.
+/* Sends edgepose's native packets from an Arduino board.
  *
  *   1. Copy edgepose_packet.h (firmware_protocols/c) into the folder of this sketch.
- *   2. Choose SENSOR and LINK below; fill in SENSOR_OWN's two functions for a sensor of your own.
- *   3. edgepose wants six sensors, ids 0 to 5: left forearm, right forearm, left lower leg, right lower leg, head, pelvis.
- *      All on one board: SENSOR_COUNT 6 and a serial link. One a board: FIRST_ID 0 to 5 and a CAN bus.
+ *   2. Choose SENSOR and LINK below; for a sensor of your own, fill in the two functions of SENSOR_OWN.
+ *   3. edgepose needs six sensors, ids 0 to 5: left forearm, right forearm, left lower leg, right lower leg, head, pelvis.
+ *      All on one board: SENSOR_COUNT 6 and a serial link. One per board: FIRST_ID 0 to 5 and a CAN bus.
  *
- * The project's tests compile and run this against stand-ins of the libraries. It has not been run on a board.
+ * The project's tests compile and run this with stand-ins for the libraries. It has not been run on a board.
  */
 #include <Arduino.h>
 
 #include "edgepose_packet.h"
 
-#define SENSOR_OWN 0    /* your own code; as it comes, a level sensor at rest, made up */
-#define SENSOR_BNO085 1 /* Adafruit_BNO08x on I2C; that library drives one sensor a board */
+#define SENSOR_OWN 0    /* your own code; as delivered, made-up data of a level sensor at rest */
+#define SENSOR_BNO085 1 /* Adafruit_BNO08x on I2C; that library supports one sensor per board */
 #define LINK_SERIAL 0   /* USB or UART */
-#define LINK_ESP32_CAN 1 /* CAN 2.0, 1 Mbit/s, by the ESP32's own controller and a transceiver */
+#define LINK_ESP32_CAN 1 /* CAN 2.0, 1 Mbit/s, with the ESP32's own controller and a transceiver */
 
 #ifndef SENSOR
 #define SENSOR SENSOR_OWN
@@ -47,7 +47,7 @@ static Adafruit_BNO08x bno(-1);
 static float acc[3], gyr[3];
 static uint32_t accTime, gyrTime;
 
-static void wantReports() {
+static void enableReports() {
     accTime = gyrTime = micros() - 2 * PERIOD_US; /* none yet */
     bno.enableReport(SH2_ACCELEROMETER, PERIOD_US);
     bno.enableReport(SH2_GYROSCOPE_CALIBRATED, PERIOD_US);
@@ -56,15 +56,15 @@ static void wantReports() {
 
 static bool beginSensor(uint8_t) {
     if (!bno.begin_I2C()) return false;
-    wantReports();
+    enableReports();
     return true;
 }
 
-/* The three reports come one by one; an orientation takes along the latest two others that are not too old. */
+/* The three reports arrive one by one; an orientation is sent with the latest two others, unless they are too old. */
 static bool readSensor(uint8_t, edgepose_packet *p) {
     sh2_SensorValue_t value;
     const uint32_t now = micros();
-    if (bno.wasReset()) wantReports();
+    if (bno.wasReset()) enableReports();
     if (!bno.getSensorEvent(&value)) return false;
     if (value.sensorId == SH2_ACCELEROMETER) {
         accTime = now;
@@ -144,7 +144,7 @@ static void sendPacket(const edgepose_packet *p) {
         message.identifier = frames[i].id;
         message.data_length_code = frames[i].length;
         memcpy(message.data, frames[i].data, frames[i].length);
-        twai_transmit(&message, 0); /* a full queue loses the frame; the receiver sees that */
+        twai_transmit(&message, 0); /* a full queue loses the frame; the receiver detects that */
     }
 }
 
@@ -154,7 +154,7 @@ static void sendInfo(const edgepose_info *) {} /* CAN 2.0 has no INFO */
 
 static void beginLine() {
     Serial.begin(BAUD);
-    Serial.write((uint8_t)0); /* ends whatever the line has picked up */
+    Serial.write((uint8_t)0); /* ends any noise that the line has picked up */
 }
 
 static void sendPacket(const edgepose_packet *p) {
