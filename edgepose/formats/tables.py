@@ -75,7 +75,7 @@ def open_table(path: Path, fits: Callable[[Sequence[str]], bool], wanted: str) -
     Args:
         path: the file.
         fits: whether cells are the names of the columns.
-        wanted: what the columns are, for the message.
+        wanted: the first of these columns, for the message.
 
     Raises:
         FileFormatError: no line has these columns, or a line is longer than MAX_LINE.
@@ -85,16 +85,17 @@ def open_table(path: Path, fits: Callable[[Sequence[str]], bool], wanted: str) -
         lines = _Lines(path, file)
         head: list[str] = []
         for line in lines:
-            for separator in SEPARATORS:
-                names = _trimmed(next(csv.reader([line], delimiter=separator)))
-                if fits(names):
-                    yield Table(head, names, _rows(path, lines, separator, len(names)))
-                    return
+            split = {mark: _trimmed(next(csv.reader([line], delimiter=mark))) for mark in SEPARATORS}
+            separator = max(SEPARATORS, key=lambda mark: len(split[mark]))
+            if fits(split[separator]):
+                names = split[separator]
+                yield Table(head, names, _rows(path, lines, separator, len(names)))
+                return
             head.append(line.strip())
             if len(head) == HEAD_LINES:
                 break
         first = next((line for line in head if line), "")
-        raise FileFormatError(f"{path}: no line has the columns {wanted}; it starts with {first[:60]!r}")
+        raise FileFormatError(f"{path}: starts with {first[:40]!r} and not with {wanted!r}")
 
 
 class _Lines:

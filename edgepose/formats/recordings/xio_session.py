@@ -9,6 +9,7 @@ from pathlib import Path
 
 from edgepose.errors import FileFormatError
 from edgepose.formats.recordings.base import RecordingFormat, recording_from_samples
+from edgepose.formats.tables import open_table
 from edgepose.imu import ImuSample, Recording
 from edgepose.placements import PLACEMENTS
 from firmware_protocols.sample import Sample
@@ -17,7 +18,10 @@ from firmware_protocols.ximu3 import Ximu3Decoder
 MAIN_FILE = "Inertial.csv"
 """The file that makes a folder one of a sensor."""
 
-_LETTERS = {"Inertial.csv": "I", "Quaternion.csv": "Q", "Magnetometer.csv": "M"}
+_LETTERS = {"Inertial.csv": "I", "Magnetometer.csv": "M"}
+_ORIENTATIONS = {"Quaternion.csv": "Q", "RotationMatrix.csv": "R", "EulerAngles.csv": "A"}
+"""The first of these files that is there is read."""
+
 _TIME = "Timestamp (us)"
 _SERIAL_NUMBER = re.compile(r"(?<![0-9A-Za-z])[0-9A-Fa-f]{8}(?![0-9A-Za-z])")
 _CHUNK = 1000  # lines
@@ -110,8 +114,11 @@ def _samples(index: int, folder: Path, problems: list[str]) -> Iterator[ImuSampl
     A line of a file is a message as the device sends it, but for the letter at its start.
     """
     decoder = Ximu3Decoder()
+    orientation = [(name, letter) for name, letter in _ORIENTATIONS.items() if (folder / name).exists()]
     files = [
-        _messages(folder / name, letter) for name, letter in _LETTERS.items() if (folder / name).exists()
+        _messages(folder / name, letter)
+        for name, letter in [*_LETTERS.items(), *orientation[:1]]
+        if (folder / name).exists()
     ]
     lines = (line for _, line in heapq.merge(*files))
     for data in _chunks(lines):
@@ -130,15 +137,13 @@ def _messages(path: Path, letter: str) -> Iterator[tuple[int, bytes]]:
     """Time and message of each row; one without a time has that of the row before."""
     time_us = 0
     try:
-        with path.open("rb") as file:
-            header = file.readline(4096).decode("utf-8-sig", "replace")
-            if not header.startswith(_TIME):
-                raise FileFormatError(f"{path}: starts with {header.strip()[:40]!r} and not with {_TIME!r}")
-            for line in file:
-                number = line.partition(b",")[0]
-                time_us = int(number) if number.isdigit() and len(number) < 20 else time_us
-                # Digits of a row without an end may be missing; the decoder has no number to read then.
-                yield time_us, letter.encode() + b"," + (line if line.endswith(b"\n") else b"\n")
+        with open_table(path, lambda names: names[0].startswith(_TIME), _TIME) as table:
+            for row in table.rows:
+                number = row.cells[0]
+                time_us = int(number) if number.isdecimal() and len(number) < 20 else time_us
+                # Without a line end digits may be missing; a message without numbers counts as bad.
+                cells = row.cells if row.ended else []
+                yield time_us, ",".join([letter, *cells]).encode() + b"\n"
     except OSError as error:
         raise FileFormatError(f"{path}: cannot read it: {error.strerror}") from None
 

@@ -27,6 +27,7 @@ from firmware_protocols.sample import STANDARD_G
 
 Array = NDArray[np.float64]
 
+_ENDINGS = (".txt", ".csv")
 _COUNTER, _TICKS = "PacketCounter", "SampleTimeFine"
 _RATE = re.compile(r"(?:Update Rate|OutputRate)\W*([0-9]+(?:\.[0-9]+)?)\s*Hz", re.IGNORECASE)
 _DOT = ("DeviceTag", "Quat_W", "Euler_X")
@@ -78,7 +79,7 @@ class _Sensor(NamedTuple):
 
 def is_sensor(path: Path) -> bool:
     """Whether a file is the table of one sensor."""
-    if path.suffix.lower() not in (".txt", ".csv"):
+    if path.suffix.lower() not in _ENDINGS or not path.is_file():  # a pipe could be waited for in vain
         return False
     with suppress(OSError, FileFormatError), open_table(path, _fits, _COUNTER):
         return True
@@ -87,12 +88,12 @@ def is_sensor(path: Path) -> bool:
 
 def is_session(folder: Path) -> bool:
     """Whether a folder holds tables of Xsens sensors."""
-    return any(map(is_sensor, _tables(folder)))
+    return bool(_sensors(folder))
 
 
-def _tables(folder: Path) -> list[Path]:
+def _sensors(folder: Path) -> list[Path]:
     with suppress(OSError):
-        return sorted(path for path in folder.iterdir() if path.suffix.lower() in (".txt", ".csv"))
+        return sorted(filter(is_sensor, folder.iterdir()))
     return []
 
 
@@ -111,7 +112,7 @@ def read_session(folder: Path, ids: Mapping[int, str] | None = None) -> Recordin
     Raises:
         FileFormatError: no file is of a placement, two are of one, or a file lacks columns.
     """
-    places = by_placement(folder, [path for path in _tables(folder) if is_sensor(path)], ids)
+    places = by_placement(folder, _sensors(folder), ids)
     damage: list[str] = []
     sensors = {name: _read(path, damage) for name, path in places.items()}
     sensors = {name: sensor for name, sensor in sensors.items() if len(sensor.time)}

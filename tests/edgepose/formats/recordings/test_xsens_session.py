@@ -244,7 +244,5 @@ def test_decimal_commas_between_commas(tmp_path):
     folder = write(
         tmp_path / "walk", HEAD, names, lambda i, row: [i, i, *row.acc, *row.quat], separator=",", point=","
     )
-    with pytest.raises(
-        EdgeposeError, match="row 6 has 16 cells for 9 columns: its numbers have decimal"
-    ):
+    with pytest.raises(EdgeposeError, match="row 6 has 16 cells for 9 columns: its numbers have decimal"):
         read_recording(folder)
