@@ -19,6 +19,7 @@ READERS = {
     "totalcapture": "edgepose.formats.recordings.totalcapture:FORMAT",
     "xsens-session": "edgepose.formats.recordings.xsens_session:FORMAT",
     "xio-session": "edgepose.formats.recordings.xio_session:FORMAT",
+    "packed-session": "edgepose.formats.recordings.packed_session:FORMAT",
 }
 """Where each `RecordingFormat` is; modules are imported in this order until one fits a file."""
 
