@@ -495,7 +495,7 @@ def test_impossible_plans(tmp_path, monkeypatch, inputs, out, says):
         ("REAL --to csv --out o --sensors nowhere.toml", 1, "nowhere.toml: cannot read it"),
         ("nowhere.csv --to csv --out o", 1, "no such file or folder"),
         ("note.md --to csv --out o", 1, "unknown kind of file"),
-        ("noise.bin --to csv --out o", 1, "not one known packet in 5000 bytes"),
+        ("noise.bin --to csv --out o", 1, "no known packet in 5000 bytes"),
         ("REAL --to csv --out note.md", 2, "--out"),
     ],
 )

@@ -350,7 +350,7 @@ def test_a_run_without_poses_leaves_the_take_before(wearer, tmp_path):
     os.close(master)
     os.close(slave)
     assert result.returncode == 1
-    assert "nothing came for 5 s" in result.stderr
+    assert "no data for 5 s" in result.stderr
     assert (tmp_path / "take.csv").read_bytes() == OLD
     assert [path.name for path in tmp_path.iterdir()] == ["take.csv"]
 

@@ -356,13 +356,13 @@ def test_no_room_for_the_whole_file_leaves_its_journal(tmp_path):
 
 
 def test_nothing_came(tmp_path, monkeypatch):
-    monkeypatch.setattr("edgepose.sources.live.SILENCE_S", 0.2)
+    monkeypatch.setattr("edgepose.sources.line_checks.SILENCE_S", 0.2)
     for name in ("walk.csv", "walk.npz", "walk.bin"):
         with Rig() as rig:
             rig.silent = set(range(6))
             with open_source(port=rig.port) as source:
                 summary = record(source, open_output(str(tmp_path / name), {}))
-        assert "nothing came" in str(summary.error)
+        assert "no data for" in str(summary.error)
     assert list(tmp_path.iterdir()) == []
 
 

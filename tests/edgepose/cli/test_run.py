@@ -490,7 +490,7 @@ def test_a_line_that_is_unplugged_and_comes_back(wearer, tmp_path, monkeypatch, 
             link.unlink()
             first.unplug()
             assert run.stderr.readline().startswith("running rnn")
-            assert run.stderr.readline() == f"{name}: gone; the run goes on and waits for it\n"
+            assert run.stderr.readline() == f"{name}: disconnected; the run continues and waits for it\n"
             listener.wait_for(f"held {' '.join(PLACEMENTS)}", 30)
             with Rig(wearer.recording, wire) as second:
                 link.symlink_to(second.port)
@@ -535,9 +535,9 @@ def test_silence_a_wrong_speed_and_a_sensor_that_never_reports(wearer, tmp_path)
                 run.stderr.close()
     assert codes == (1, 1, 1)
     told = [last_line(text) for text in texts]
-    assert re.match(rf"edgepose: {quiet.port}: nothing came for \d+ s; check --port", told[0])
+    assert re.match(rf"edgepose: {quiet.port}: no data for \d+ s; check --port", told[0])
     assert re.match(
-        rf"edgepose: {noisy.port}: \d+ bytes in \d+ s and not one valid packet; check --baud \(now 115200\)",
+        rf"edgepose: {noisy.port}: \d+ bytes in \d+ s but no valid packet; check --baud \(now 115200\)",
         told[1],
     )
     assert "no samples of left_lower_leg in the first" in told[2]
@@ -552,4 +552,4 @@ def test_an_empty_capture(command, wearer, tmp_path):
         *("--csv", tmp_path / "poses.csv"),
     )
     assert result.returncode == 1
-    assert f"{file}: not one known packet in 0 bytes" in last_line(result.stderr)
+    assert f"{file}: no known packet in 0 bytes" in last_line(result.stderr)

@@ -313,7 +313,7 @@ def test_a_wearer_whose_input_is_broken_costs_only_his_own(command, wearer, rig,
     rigs = [rig("ben", file="empty.bin"), rig(), rig("cleo", file="damaged.csv")]
     result = command("run", *words(*rigs), "--model", "rnn")
     assert result.returncode == 1
-    assert f"ben: ended: {tmp_path}/empty.bin: not one known packet in 0 bytes" in result.stderr
+    assert f"ben: ended: {tmp_path}/empty.bin: no known packet in 0 bytes" in result.stderr
     told = result.stderr.splitlines()[-1]
     assert told.startswith("edgepose: 2 of 3 wearers failed: ben: ")
     assert f"; cleo: {damaged}: row 902 is cut off" in told
@@ -355,7 +355,7 @@ def test_a_port_that_is_unplugged_and_comes_back_costs_only_its_wearer(wearer, r
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 0
     told = log.read_text()
-    assert f"{link}: gone; the run goes on and waits for it" in told
+    assert f"{link}: disconnected; the run continues and waits for it" in told
     assert f"{link}: back after " in told
     poses = {name: read_poses(tmp_path / f"{name}.csv") for name in ("anna", "ben")}
     for name, own in poses.items():

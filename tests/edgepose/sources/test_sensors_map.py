@@ -71,7 +71,10 @@ def test_two_hubs_and_a_bus(read):
     ]
     assert "--bitrate (now 1000000)" in found[2].check[0]
     assert [protocol.name for protocol in found[2].protocols] == ["native-can"]
-    with pytest.raises(EdgeposeError, match=r"left_lower_leg: b is none of a, virtual:x"):
+    with pytest.raises(
+        EdgeposeError,
+        match=r"left_lower_leg: b is not one of the lines given with --port and --can: a, virtual:x",
+    ):
         line_specs("a", None, "virtual:x", None, False, "auto", rig)
 
 
@@ -88,7 +91,7 @@ def test_two_hubs_and_a_bus(read):
         (PORTS.replace('port = "/dev/ttyUSB1"', 'port = "/dev/ttyUSB0", id = 3'), "are the same device"),
         (PORTS.replace('port = "/dev/ttyUSB1"', 'prot = "x"'), "right_forearm: unknown key 'prot'; keys are"),
         (PORTS.replace('{ port = "/dev/ttyUSB1" }', "1"), "right_forearm: must be a table"),
-        (PORTS.replace('port = "/dev/ttyUSB1"', ""), "right_forearm: say where its samples come from"),
+        (PORTS.replace('port = "/dev/ttyUSB1"', ""), "right_forearm: no device named; give its port, can or id"),
         (PORTS.replace('"/dev/ttyUSB1"', "1"), "right_forearm: port must be text in quotes, not 1"),
         (IDS.replace("21", '"21"'), "right_forearm: id must be a whole number, not '21'"),
         (IDS.replace("21", "true"), "right_forearm: id must be a whole number, not True"),
@@ -203,7 +206,7 @@ def test_a_capture_does_not_say_of_which_port_it_is(read, tmp_path):
     rig = read(PORTS)
     with (
         open_source(file=capture(tmp_path / "a.bin", [0]), sensors=rig.path) as source,
-        pytest.raises(EdgeposeError, match="tells sensors apart by their ports"),
+        pytest.raises(EdgeposeError, match="distinguishes sensors by port"),
     ):
         list(source)
 
