@@ -297,7 +297,7 @@ def test_fifty_files_one_of_them_broken_by_two_processes(command, tmp_path):
     os.utime(out / "3.npz", (1, 1))
     result = command("convert", folder, "--to", "npz", "--out", out, "--jobs", 2, "--skip-existing")
     assert result.returncode == 1
-    assert result.stdout.count("skipped, there already") == 49
+    assert result.stdout.count("skipped, already exists") == 49
     assert (out / "3.npz").stat().st_mtime == 1
 
 

@@ -155,7 +155,7 @@ def umask() -> int:
 def test_existing(case):
     out, words = case
     out.write_bytes(OLD)
-    assert "there already" in fails(words)
+    assert "already exists" in fails(words)
     assert out.read_bytes() == OLD
     assert [path.name for path in out.parent.iterdir()] == [out.name]
 
@@ -209,7 +209,7 @@ def test_link(case):
     end = out.parent / f"end{out.suffix}"
     end.write_bytes(OLD)
     out.symlink_to(end.name)
-    assert "there already" in fails(words)
+    assert "already exists" in fails(words)
     assert end.read_bytes() == OLD
     succeeds([*words, "--overwrite"])
     assert out.is_symlink()
@@ -249,7 +249,7 @@ def test_a_name_of_another_kind(name, wearer, files, tmp_path):
     out.write_bytes(OLD)
     for flags in ([], ["--overwrite"]):
         message = fails([str(word) for word in [*words(wearer, files, out), *flags]])
-        assert "is of another kind of file" in message
+        assert "is the ending of another kind of file" in message
         assert out.read_bytes() == OLD
 
 

@@ -112,7 +112,7 @@ def test_addresses_and_lines_are_read_as_flags(rig):
         ({"file": None}, "give one source: port PORT"),
         ({"port": "/dev/ttyUSB0"}, "give one source: port PORT"),
         ({"csv": None}, "give at least one output, such as csv FILE"),
-        ({"control": "127.0.0.1:9"}, "control needs sensors that send, or realtime"),
+        ({"control": "127.0.0.1:9"}, "control needs live sensors, or realtime"),
         ({"name": 3}, "name must be text in quotes on one line, not 3"),
         ({"name": " "}, "name must be text"),
         ({"name": "a\nb"}, "name must be text"),
@@ -141,7 +141,7 @@ def test_a_rig_file_that_is_not_there_or_not_toml(rig, tmp_path):
     with pytest.raises(EdgeposeError, match=r"anna\.toml: not valid TOML"):
         read_rigs([file])
     file.write_text("file = " + "[" * 100_000)
-    with pytest.raises(EdgeposeError, match=r"anna\.toml: not valid TOML: brackets within brackets"):
+    with pytest.raises(EdgeposeError, match=r"anna\.toml: not valid TOML: brackets are nested too deeply"):
         read_rigs([file])
 
 

@@ -153,13 +153,13 @@ def test_what_nobody_has_foreseen_in_an_output_ends_only_its_wearer(wearer, join
         run_together(wearers, engine, 0.0)
     assert len(good.notes) == 180
     assert wearers[0].pipeline.summary.error is None
-    assert "an unexpected fault (KeyError: 'a fault'); please report it" in str(
+    assert "unexpected error (KeyError: 'a fault'); please report it" in str(
         wearers[1].pipeline.summary.error
     )
     assert bad.closed.is_set()
     if where == "write":
         assert len(bad.notes) == 20
-        assert told[0].startswith("ended: an unexpected fault")
+        assert told[0].startswith("ended: unexpected error")
 
 
 @pytest.mark.parametrize("place", ["clock", "headings", "orient"])

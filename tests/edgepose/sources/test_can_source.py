@@ -192,7 +192,7 @@ def test_a_bus_that_goes_and_comes_back(tmp_path, monkeypatch, caplog):
         with Devices(adapter.send, "hipnuc-canopen"):
             before = collect(batches, 100)
         adapter.close()
-        while "gone" not in caplog.text or len(gap) < 5:
+        while "disconnected" not in caplog.text or len(gap) < 5:
             now_s, samples, *_ = next(batches)
             before += samples
             gap.append(now_s)

@@ -125,7 +125,7 @@ def test_a_source_that_does_not_wait(port, caplog):
         with Device(port, chunks(300)):
             look_until(lambda: len(got) > 300)
         port.unplug()
-        look_until(lambda: "gone; the run goes on" in caplog.text)
+        look_until(lambda: "disconnected; the run continues" in caplog.text)
     assert {s.sensor for s in got} == set(range(6))
     for sensor in range(6):
         assert all(b > a for a, b in pairwise(s.time_s for s in got if s.sensor == sensor))
@@ -289,7 +289,7 @@ def test_a_port_that_goes_and_comes_back(link, caplog):
             while len(before) < 200:
                 before += next(batches)[1]
         link.unplug()
-        while "gone" not in caplog.text or len(gap) < 10:
+        while "disconnected" not in caplog.text or len(gap) < 10:
             now_s, batch, *_ = next(batches)
             before += batch
             gap.append(now_s)

@@ -69,7 +69,7 @@ def test_a_part_file_that_goes_during_a_run_is_told(tmp_path):
 
 def test_a_part_file_that_is_a_link_is_not_followed(tmp_path):
     (tmp_path / "a.part.csv").symlink_to(tmp_path / "elsewhere.csv")
-    with pytest.raises(EdgeposeError, match="is there already"):
+    with pytest.raises(EdgeposeError, match="already exists"):
         NpzSink(tmp_path / "a.npz")
     assert not (tmp_path / "elsewhere.csv").exists()
 
