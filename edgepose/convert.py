@@ -129,41 +129,41 @@ def plan(inputs: Sequence[Path], to: str, out: Path) -> list[Job]:
     return list(jobs.values())
 
 
-def _expand(given: Path, out: Path) -> Iterator[tuple[Path, Path]]:
+def _expand(source: Path, out: Path) -> Iterator[tuple[Path, Path]]:
     """Yield the recordings that an input stands for, and their relative paths in the output folder."""
-    if given.is_dir():
+    if source.is_dir():
         endings = _endings()
         try:
-            found = sorted(_find_recordings(given, out.resolve(), endings))
+            found = sorted(_find_recordings(source, out.resolve(), endings))
         except OSError as error:
-            raise EdgeposeError(f"{error.filename}: cannot look into it: {error.strerror}") from None
+            raise EdgeposeError(f"{error.filename}: cannot list it: {error.strerror}") from None
         if not found:
             raise EdgeposeError(
-                f"{given}: no recording in this folder; names end in {', '.join(endings)}, or .gz of a log"
+                f"{source}: no recording in this folder; names end in {', '.join(endings)}, or .gz of a log"
             )
         for path in found:
             # A session folder given by itself keeps its own name.
-            yield path, Path(given.resolve().name) if path == given else path.relative_to(given)
-    elif str(given) == "-":
+            yield path, Path(source.resolve().name) if path == source else path.relative_to(source)
+    elif str(source) == "-":
         if sys.stdin is None:
             raise EdgeposeError("-: there is no standard input; name a file")
-        yield given, Path("stdin")
-    elif given.exists():
-        if not given.is_file():
+        yield source, Path("stdin")
+    elif source.exists():
+        if not source.is_file():
             raise EdgeposeError(
-                f"{given}: not a regular file; convert its output from standard input: convert - < {given}"
+                f"{source}: not a regular file; convert its output from standard input: convert - < {source}"
             )
-        yield given, Path(given.name)
-    elif any(mark in str(given) for mark in "*?["):
+        yield source, Path(source.name)
+    elif any(mark in str(source) for mark in "*?["):
         # A pattern that the shell has not expanded: it was quoted, or the shell is that of Windows.
-        root = Path(given.anchor or ".")
-        found = sorted(root.glob(str(given.relative_to(given.anchor) if given.anchor else given)))
+        root = Path(source.anchor or ".")
+        found = sorted(root.glob(str(source.relative_to(source.anchor) if source.anchor else source)))
         if not found:
-            raise EdgeposeError(f"{given}: no file matches this pattern")
+            raise EdgeposeError(f"{source}: no file matches this pattern")
         for path in found:
             yield from _expand(path, out)
     else:
-        raise EdgeposeError(f"{given}: no such file or folder")
+        raise EdgeposeError(f"{source}: no such file or folder")
 
 
 def _find_recordings(folder: Path, out: Path, endings: tuple[str, ...]) -> Iterator[Path]:

@@ -31,7 +31,7 @@ _BINARY = struct.Struct("<4sBBBBdI96f")
 
 
 def encode_json(pose: PoseFrame) -> bytes:
-    """Encode a pose as a line of JSON: frame, time_s, status, pose (72 axis-angle numbers, SMPL order, rad)."""
+    """Encode a pose as a line of JSON: frame, time_s, status, pose (72 axis-angle numbers, SMPL order)."""
     numbers = matrix_to_rotvec(pose.rotations).ravel().tolist()
     status = _quoted(format_status(pose.held, pose.warming_up))
     return (_JSON % (pose.index, pose.time_s, status, *numbers)).encode()

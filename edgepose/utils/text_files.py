@@ -33,9 +33,7 @@ def read_text(path: Path, most: int = MOST_BYTES) -> str:
     with path.open("rb") as file:
         data = file.read(most + 1)
     if len(data) > most:
-        raise ConfigError(
-            f"{path}: larger than {most >> 10} kB, too large for this kind of file; check the name"
-        )
+        raise ConfigError(f"{path}: larger than {most >> 10} kB, too large for such a file; check the name")
     return data.decode()
 
 

@@ -467,7 +467,7 @@ def test_no_place_to_write_and_no_standard_input(command, tmp_path):
     ("inputs", "out", "says"),
     [
         (["nothing.csv"], "out", "nothing.csv: no such file or folder"),
-        (["no*.csv"], "out", "no*.csv: no file fits this pattern"),
+        (["no*.csv"], "out", "no*.csv: no file matches this pattern"),
         (["empty"], "out", "empty: no recording in this folder; names end in .csv, .npz, .bin"),
         (["a.csv", "a.npz"], "out", "a.csv and a.npz would both become out/a.csv; convert them apart"),
         (["a.csv"], ".", "a.csv would be written over an input; choose another --out"),
