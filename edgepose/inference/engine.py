@@ -219,18 +219,18 @@ class MultiWearerEngine:
                     self.push(dict.fromkeys(range(count), at_rest))
             self._streams = [_StreamState(module.start(1, future)) for _ in range(wearers)]
 
-    def push(self, bodies: Mapping[int, EngineInput]) -> dict[int, list[EngineOutput]]:
+    def push(self, inputs: Mapping[int, EngineInput]) -> dict[int, list[EngineOutput]]:
         """Process the next frame of some wearers; return the poses that are ready, by wearer."""
         groups: defaultdict[Any, list[int]] = defaultdict(list)
-        for wearer, body in bodies.items():
+        for wearer, engine_input in inputs.items():
             stream = self._streams[wearer]
-            stream.tags.append(body.frame)
+            stream.tags.append(engine_input.frame)
             shapes = tuple(tensor.shape for tensor in stream.state)
             groups[(wearer, *shapes) if self._isolate else shapes].append(wearer)
         outputs = {}
         with torch.inference_mode():
             for wearers in groups.values():
-                outputs.update(self._step(wearers, bodies))
+                outputs.update(self._step(wearers, inputs))
         return outputs
 
     def finish(self, wearer: int) -> list[EngineOutput]:
@@ -240,11 +240,11 @@ class MultiWearerEngine:
             rotations, std = self._module.drain(stream.state)
         return stream.outputs(rotations[0].numpy(), std[0].numpy(), self._past)
 
-    def _step(self, wearers: list[int], bodies: Mapping[int, EngineInput]) -> dict[int, list[EngineOutput]]:
+    def _step(self, wearers: list[int], inputs: Mapping[int, EngineInput]) -> dict[int, list[EngineOutput]]:
         """Run one pass for wearers whose states have the same shape; return their poses."""
         streams = [self._streams[wearer] for wearer in wearers]
-        orientation = _tensor(np.array([bodies[wearer].orientation for wearer in wearers]))
-        acceleration = _tensor(np.array([bodies[wearer].acceleration for wearer in wearers]))
+        orientation = _tensor(np.array([inputs[wearer].orientation for wearer in wearers]))
+        acceleration = _tensor(np.array([inputs[wearer].acceleration for wearer in wearers]))
         state = [
             torch.cat(column) if has_rows else column[0]
             for column, has_rows in zip(

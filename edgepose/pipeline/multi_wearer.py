@@ -25,7 +25,7 @@ POLL_S = 0.004
 
 
 class _Waiting(NamedTuple):
-    body: EngineInput
+    engine_input: EngineInput
     arrived: float  # see `WearerPipeline.arrived`
 
 
@@ -93,8 +93,8 @@ class Wearer:
         except Exception as error:
             self.pipeline.end(as_edgepose_error(error))
 
-    def _enqueue(self, bodies: Iterable[EngineInput]) -> None:
-        self.waiting += (_Waiting(body, self.pipeline.arrived) for body in bodies)
+    def _enqueue(self, engine_inputs: Iterable[EngineInput]) -> None:
+        self.waiting += (_Waiting(engine_input, self.pipeline.arrived) for engine_input in engine_inputs)
 
     def _fail(self, error: Exception) -> None:
         reported = as_edgepose_error(error)
@@ -151,7 +151,7 @@ def run_together(
 
 def _step(engine: MultiWearerEngine, frames: dict[int, _Waiting], wearers: dict[int, Wearer]) -> None:
     """Run the network on one frame of each wearer who has one, and write the poses."""
-    for i, outputs in engine.push({i: waiting.body for i, waiting in frames.items()}).items():
+    for i, outputs in engine.push({i: waiting.engine_input for i, waiting in frames.items()}).items():
         wearers[i].write(outputs, frames[i].arrived)
 
 

@@ -84,13 +84,13 @@ class Pipeline:
         failure: EdgeposeError | None = None
         try:
             for batch in source:
-                for body in pipeline.process(Batch(*batch)):
-                    pipeline.emit(engine.push(*body), pipeline.arrived)
+                for engine_input in pipeline.process(Batch(*batch)):
+                    pipeline.emit(engine.push(*engine_input), pipeline.arrived)
                 yield from buffer.take()
         except EdgeposeError as error:
             failure = error  # raised once all poses before it have been yielded
-        for body in pipeline.flush():
-            pipeline.emit(engine.push(*body), pipeline.arrived)
+        for engine_input in pipeline.flush():
+            pipeline.emit(engine.push(*engine_input), pipeline.arrived)
         pipeline.emit(engine.finish(), pipeline.arrived)
         pipeline.end(failure)
         yield from buffer.take()

@@ -28,7 +28,7 @@ def run(
         stopped: called after each batch; true ends the run. An interrupt would lose the frame in progress.
     """
 
-    def bodies() -> Iterator[EngineInput]:
+    def engine_inputs() -> Iterator[EngineInput]:
         """Yield all network inputs; after an error of the source or the clock, those before it."""
         try:
             for batch in source:
@@ -40,8 +40,8 @@ def run(
         yield from pipeline.flush()
 
     try:
-        for body in bodies():
-            pipeline.emit(engine.push(*body), pipeline.arrived)
+        for engine_input in engine_inputs():
+            pipeline.emit(engine.push(*engine_input), pipeline.arrived)
         pipeline.emit(engine.finish(), pipeline.arrived)
         pipeline.end()
     except Exception as error:

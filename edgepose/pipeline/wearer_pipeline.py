@@ -116,11 +116,11 @@ class WearerPipeline:
         self.arrived = time.perf_counter() - batch.backlog_s
         if batch.samples:
             self.clock.push(self._orient(batch.samples), batch.now_s)
-        return self._bodies(self.clock.frames(batch.now_s))
+        return self._engine_inputs(self.clock.frames(batch.now_s))
 
     def flush(self) -> Iterator[EngineInput]:
         """Yield the network inputs of the last frames."""
-        yield from self._bodies(self.clock.flush())
+        yield from self._engine_inputs(self.clock.flush())
         if self._misfits is not None:
             for line in self._misfits.at_end():
                 self._warn(line)
@@ -154,7 +154,7 @@ class WearerPipeline:
             except Exception as error:
                 self.summary.error = self.summary.error or as_edgepose_error(error)
 
-    def _bodies(self, frames: list[ImuFrame]) -> Iterator[EngineInput]:
+    def _engine_inputs(self, frames: list[ImuFrame]) -> Iterator[EngineInput]:
         for frame in frames:
             for line in self._dropouts.update(frame):
                 self._notify(line)
