@@ -260,7 +260,7 @@ def test_code_of_a_stranger_is_not_run(tmp_path, made):
 def test_inspection_needs_no_torch(made):
     program = (
         "import sys; from pathlib import Path; from edgepose.inference import archive; "
-        "info = archive.inspect(Path(sys.argv[1])); archive.trust(Path(sys.argv[1])); "
+        "info = archive.read_info(Path(sys.argv[1])); archive.trust(Path(sys.argv[1])); "
         "print(info.metadata['name'], 'torch' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", program, made], capture_output=True, text=True, check=False)

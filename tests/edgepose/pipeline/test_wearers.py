@@ -178,7 +178,7 @@ def test_what_nobody_has_foreseen_on_the_way_ends_only_its_wearer(wearer, join, 
         if place == "clock":
             monkeypatch.setattr(pipeline.clock, "push", fail)
         elif place == "headings":
-            monkeypatch.setattr(pipeline._headings, "at", fail)
+            monkeypatch.setattr(pipeline._headings, "calibration_for", fail)
         else:
             monkeypatch.setattr(pipeline, "_orient", fail)
         run_together(wearers, engine, 0.0)

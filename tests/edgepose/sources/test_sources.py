@@ -547,7 +547,7 @@ def test_what_came_before_an_error_is_in_a_batch(port, monkeypatch):
     def refuse(*_):
         raise DeviceError("nobody can tell")
 
-    monkeypatch.setattr("edgepose.sources.line_decoder.Stream.feed", refuse)
+    monkeypatch.setattr("edgepose.sources.line_decoder.LineDecoder.feed", refuse)
     raw = []
     with (
         open_source(port=port.name) as source,

@@ -38,10 +38,10 @@ def test_names_of_open_files(tmp_path):
 def test_a_file_made_meanwhile_is_not_taken(tmp_path):
     output = GrowingFile(tmp_path / "a.csv", "poses", overwrite=False)
     (tmp_path / "a.csv").write_bytes(OLD)
-    with pytest.raises(EdgeposeError, match="made by another program meanwhile"):
+    with pytest.raises(EdgeposeError, match="another program has just created it"):
         output.start()
     output.discard()
-    with pytest.raises(EdgeposeError, match="made by another program meanwhile"):
+    with pytest.raises(EdgeposeError, match="another program has just created it"):
         write_whole(tmp_path / "a.csv", "new", "text", overwrite=False)
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [OLD]
 
