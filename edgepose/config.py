@@ -1,4 +1,4 @@
-"""What a run is asked to do: one configuration, filled from flags, from a TOML file or from Python.
+"""Configuration of a run, filled from flags, from a TOML file or from Python.
 
 WearerConfig(source=SourceConfig(port="/dev/ttyUSB0"), calibration=Path("calib.json"),
              outputs=OutputConfig(csv="poses.csv"))
@@ -24,10 +24,10 @@ ONE_SOURCE = "give one source: --port PORT, --can INTERFACE:CHANNEL or --file PA
 
 
 def parse_host_and_port(text: str) -> tuple[str, int]:
-    """Host and port of a text that is nothing else.
+    """Parse a text that is exactly HOST:PORT.
 
     Raises:
-        ConfigError: it is not.
+        ConfigError: the text is something else.
     """
     if "," in text:
         raise ConfigError(f"{text!r} is more than HOST:PORT")
@@ -35,26 +35,26 @@ def parse_host_and_port(text: str) -> tuple[str, int]:
 
 
 FILE_OUTPUTS = ("csv", "npz", "bvh")
-"""Outputs to a file with that ending: it is never the input, nor replaced unasked."""
+"""Outputs to a file with that ending. It must not be an input, and is replaced only with --overwrite."""
 
 NETWORK_OUTPUTS: dict[str, Callable[[str], Any]] = {
     "udp": parse_destination,
     "osc": parse_host_and_port,
     "tcp": parse_host_and_port,
 }
-"""Outputs to an address, and what reads its text."""
+"""Outputs to an address, with the parser of the address."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SourceConfig:
-    """Where samples come from; the fields are the arguments of `edgepose.sources.open_source`.
+    """The source of samples; the fields are the arguments of `edgepose.sources.open_source`.
 
     Attributes:
         port: serial ports, separated by commas.
-        baud: their speed, bit/s; None is the protocol's usual one.
+        baud: speed of the ports, bit/s; None means the protocol's usual speed.
         can: CAN bus, INTERFACE:CHANNEL.
-        bitrate: its speed, bit/s; None is the protocol's usual one.
-        fd: take CAN FD frames too.
+        bitrate: speed of the bus, bit/s; None means the protocol's usual speed.
+        fd: receive CAN FD frames too.
         file: recording, raw serial capture or log of a CAN bus; "-" is standard input.
         realtime: replay the file at its own pace.
         protocol: name of a wire format, a TOML file that describes text lines, or "auto".
@@ -72,7 +72,7 @@ class SourceConfig:
     sensors: Path | None = None
 
     def __post_init__(self) -> None:
-        """Raises ConfigError unless the fields name one source and are in their ranges."""
+        """Raise ConfigError unless the fields name exactly one source and are in their ranges."""
         for name in ("file", "sensors"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, Path(getattr(self, name)))
@@ -86,38 +86,38 @@ class SourceConfig:
 
     @property
     def live(self) -> bool:
-        """Whether samples come at their own pace."""
+        """Whether samples come in real time."""
         return self.file is None or self.realtime
 
     @property
     def name(self) -> str:
-        """The source, for people."""
+        """Name of the source for messages and metadata."""
         return ",".join(
             str(name) for name in (self.file, self.port, self.can, self.sensors) if name is not None
         )
 
     def arguments(self) -> dict[str, Any]:
-        """The arguments of `edgepose.sources.open_source`."""
+        """Return the arguments for `edgepose.sources.open_source`."""
         return {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
 
 
 @dataclass(frozen=True, kw_only=True)
 class OutputConfig:
-    """Where poses go; outputs that are None or false are not written.
+    """The outputs of a run; those that are None or false are not written.
 
     Attributes:
-        csv: file; "-" is standard output.
+        csv: CSV file; "-" is standard output.
         rotations: representation of rotations in the CSV.
         std: add the network's standard deviations to the CSV.
-        npz: file.
-        bvh: file.
-        udp: where datagrams go.
+        npz: NPZ file.
+        bvh: BVH file.
+        udp: destination of datagrams.
         osc: host and port of a VMC receiver.
-        tcp: address to listen at for viewers.
+        tcp: address to listen on for viewers.
         view: show a figure in the browser.
         height: the wearer's stature, metres.
-        overwrite: replace files that exist.
-        sinks: targets of outputs that other packages add (entry points `edgepose.sinks`), by their name.
+        overwrite: replace existing files.
+        sinks: targets of outputs from other packages (entry points `edgepose.sinks`), by output name.
     """
 
     csv: str | None = None
@@ -134,7 +134,7 @@ class OutputConfig:
     sinks: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Raises ConfigError for an unknown representation of rotations."""
+        """Raise ConfigError for an unknown representation of rotations."""
         if self.rotations not in ROTATION_FORMATS:
             raise ConfigError(
                 f"rotations: {self.rotations!r} is not one of {', '.join(map(repr, ROTATION_FORMATS))}"
@@ -142,20 +142,20 @@ class OutputConfig:
 
     @property
     def any(self) -> bool:
-        """Whether there is an output at all."""
+        """Whether there is any output."""
         targets = (getattr(self, name) for name in (*FILE_OUTPUTS, *NETWORK_OUTPUTS))
         return self.view or bool(self.sinks) or any(target is not None for target in targets)
 
     @property
     def files(self) -> dict[str, str | None]:
         """The files that are written, by flag."""
-        # While a run goes on, poses for an NPZ file are in a CSV file beside it.
+        # During a run, the poses for an NPZ file are in a CSV file next to it.
         growing = None if self.npz is None or is_stream(self.npz) else str(part_path(self.npz))
-        named = {f"--{name}": getattr(self, name) for name in FILE_OUTPUTS}
-        return named | {"--npz (while it grows)": growing}
+        by_flag = {f"--{name}": getattr(self, name) for name in FILE_OUTPUTS}
+        return by_flag | {"--npz (while it grows)": growing}
 
     def check(self) -> None:
-        """Make sure that no file is lost by what is asked for.
+        """Check that no existing file would be lost.
 
         Raises:
             EdgeposeError: a file exists already, or cannot be written.
@@ -171,14 +171,14 @@ class WearerConfig:
     """One wearer of a run.
 
     Attributes:
-        source: where samples come from.
-        calibration: file that `edgepose calibrate` wrote.
-        outputs: where poses go.
-        filter: what makes orientations, one of `edgepose.imu.FILTERS`.
-        no_mag: leave magnetometers out of the filter.
-        control: address to listen at for re-zero requests.
-        name: what messages call the wearer; empty for a single one.
-        path: the TOML file that this came from, if it did.
+        source: the source of samples.
+        calibration: file written by `edgepose calibrate`.
+        outputs: the outputs for poses.
+        filter: orientation filter, one of `edgepose.imu.FILTERS`.
+        no_mag: do not use magnetometers in the filter.
+        control: address to listen on for re-zero requests.
+        name: the wearer's name in messages; empty for a single wearer.
+        path: the TOML file that the configuration was read from, if any.
     """
 
     source: SourceConfig
@@ -191,20 +191,20 @@ class WearerConfig:
     path: Path | None = None
 
     def __post_init__(self) -> None:
-        """Raises ConfigError where fields do not go together."""
+        """Raise ConfigError if fields contradict each other."""
         object.__setattr__(self, "calibration", Path(self.calibration))
         if self.filter not in FILTERS:
             raise ConfigError(f"filter: {self.filter!r} is not one of {', '.join(map(repr, FILTERS))}")
         if not self.outputs.any:
             raise ConfigError(ANY_OUTPUT)
         if self.control is not None and not self.source.live:
-            raise ConfigError("--control needs sensors that send, or --realtime")
+            raise ConfigError("--control needs live sensors, or --realtime")
 
     @classmethod
     def from_toml(cls, path: Path) -> WearerConfig:
-        """The wearer of a TOML file, whose keys are the names of `edgepose run`'s flags.
+        """Read a wearer's configuration from a TOML file, whose keys are the flags of `edgepose run`.
 
-        Files are relative to the folder of the TOML file.
+        File names in it are relative to the folder of the TOML file.
 
         Raises:
             ConfigError: the file cannot be read, or a key or value is not valid.
@@ -219,24 +219,25 @@ class WearerConfig:
             }
             return cls.from_values(values, name=name, path=path)
         except EdgeposeError as error:
-            # Keys are the flags without their hyphens.
+            # Messages name flags; the keys of the file are the flags without hyphens.
             raise ConfigError(f"{path}: {str(error).replace('--', '')}") from None
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any], **more: Any) -> WearerConfig:
-        """The wearer of flat values, by the names of the fields of all three classes.
+        """Build a wearer's configuration from values by field name, for the fields of all three classes.
 
         Raises:
-            ConfigError: a value is not valid, or the calibration is missing.
+            ConfigError: a value is invalid, or the calibration is missing.
         """
         values = dict(values)
 
-        def own(kind: type) -> dict[str, Any]:
+        def take_fields(kind: type) -> dict[str, Any]:
             return {
                 each.name: values.pop(each.name) for each in dataclasses.fields(kind) if each.name in values
             }
 
-        source, outputs = SourceConfig(**own(SourceConfig)), OutputConfig(**own(OutputConfig))
+        source = SourceConfig(**take_fields(SourceConfig))
+        outputs = OutputConfig(**take_fields(OutputConfig))
         if values.get("calibration") is None:
             raise ConfigError("calibration is missing")
         return cls(source=source, outputs=outputs, **values, **more)
@@ -249,7 +250,7 @@ _TEXT, _SWITCH, _WHOLE, _NUMBER = "text in quotes", "true or false", "a whole nu
 _TYPES: dict[str, tuple[type, ...]] = {_TEXT: (str,), _SWITCH: (bool,), _WHOLE: (int,), _NUMBER: (int, float)}
 
 _FILES = ("file", "sensors", "calibration", *FILE_OUTPUTS)
-"""Keys whose values are files, relative to the TOML file; `protocol` may be one."""
+"""Keys whose values are files, relative to the TOML file; that of `protocol` may be one too."""
 
 _KEYS = {
     "port": _TEXT,
@@ -275,17 +276,17 @@ _KEYS = {
 
 
 def _value(key: str, value: object, folder: Path) -> Any:
-    """A value of the TOML file as the configuration has it.
+    """Convert a value of the TOML file to that of the configuration.
 
     Raises:
-        ConfigError: there is no such key, or the value is of another type or not valid.
+        ConfigError: there is no such key, or the value has the wrong type or is invalid.
     """
-    if key == "sinks" and isinstance(value, dict) and all(isinstance(own, str) for own in value.values()):
+    if key == "sinks" and isinstance(value, dict) and all(isinstance(item, str) for item in value.values()):
         return value
     what = _KEYS.get(key)
     if what is None:
         raise ConfigError(f"unknown key {key!r}; keys are name, {', '.join([*_KEYS, 'sinks'])}")
-    if type(value) not in _TYPES[what]:  # a bool is an int to isinstance
+    if type(value) not in _TYPES[what]:  # not isinstance, to which a bool is an int
         raise ConfigError(f"{key} must be {what}, not {value!r}")
     if not isinstance(value, str):
         return float(value) if what == _NUMBER and isinstance(value, int | float) else value
@@ -313,7 +314,7 @@ def _text(key: str, value: str, folder: Path) -> Any:
 
 
 def checked_protocol(name: str) -> str:
-    """The name of a wire format, "auto", or of a TOML file, which is read later.
+    """Return a name if it is "auto", that of a wire format, or that of a TOML file, which is read later.
 
     Raises:
         ConfigError: there is no such wire format.

@@ -1,4 +1,4 @@
-"""Recordings and poses of any kind to other kinds of files, many at once; a broken one costs only itself."""
+"""Conversion of recordings and poses between formats, many at once; a bad file does not stop the rest."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ from edgepose.sources.sensor_map import read_map
 from edgepose.utils.durable_files import replace_file
 
 WRITERS: dict[str, Callable[[Path, Recording], None]] = {"csv": write_csv, "npz": write_npz}
-"""What is written, by ending."""
+"""Writers of recordings, by ending."""
 
 
 def _endings() -> tuple[str, ...]:
-    """Endings of the files that are looked for in a folder."""
+    """Return the endings of the files to look for in a folder."""
     return tuple(
         dict.fromkeys([".csv", ".npz", *CAPTURES, *CAN_LOGS, *recording_suffixes(), *pose_suffixes()])
     )
@@ -58,14 +58,14 @@ class Job(NamedTuple):
 
 
 class Options(NamedTuple):
-    """How recordings are converted.
+    """Options of a conversion.
 
     Attributes:
-        protocol: what raw captures and CAN logs speak.
+        protocol: protocol of raw captures and CAN logs.
         sensors: map of devices to placements, for captures, CAN logs and sessions.
-        filter: what makes orientations, see `orient_recording`; "none" leaves them as they are.
+        filter: orientation filter, see `orient_recording`; "none" keeps the file's orientations.
         height_m: the wearer's stature, for the bones of BVH files, metres.
-        overwrite: whether a recording may take the place of a file.
+        overwrite: replace existing files.
     """
 
     protocol: str = "auto"
@@ -79,15 +79,15 @@ _DEFAULTS = Options()
 
 
 class Result(NamedTuple):
-    """What became of a recording.
+    """The result of one conversion.
 
     Attributes:
-        job: the recording.
-        samples: written, or poses.
-        seconds: from the first sample to the last.
-        problem: one line for the user if it could not be read, or not all of it; None if all is well.
-        sensors: of which there are samples, if it is a recording.
-        skipped: the target was there already.
+        job: the conversion.
+        samples: number of samples or poses written.
+        seconds: time from the first sample to the last.
+        problem: one line for the user if all or part of the source could not be read; None otherwise.
+        sensors: number of sensors with samples, if it is a recording.
+        skipped: the target existed already.
     """
 
     job: Job
@@ -99,28 +99,28 @@ class Result(NamedTuple):
 
 
 def plan(inputs: Sequence[Path], to: str, out: Path) -> list[Job]:
-    """What is to be converted.
+    """Return the conversions for the user's inputs.
 
     Args:
-        inputs: files ("-" is CSV on standard input), folders of them at any depth, and x-io sessions; names
-            with `*`, `?` or `[` that are no file are patterns.
-        to: ending of what is to be written.
-        out: folder to write to; what is in an input folder keeps its place in that.
+        inputs: files ("-" is CSV on standard input), folders that hold them at any depth, and x-io sessions;
+            a name with `*`, `?` or `[` that is not a file is a pattern.
+        to: ending of the files to write.
+        out: folder to write to; files in an input folder keep their relative paths in it.
 
     Raises:
-        EdgeposeError: an input is not there or empty, or a file would be written twice or over an input.
+        EdgeposeError: an input is missing or empty, or a file would be written twice or over an input.
     """
     jobs: dict[Path, Job] = {}
-    for given in inputs:
-        for source, place in _expand(given, out):
-            # With its folder: an x-io session has no ending, though there may be dots in its name.
-            name = place.name if source.is_dir() else place.stem
-            job = Job(source, out / place.parent / f"{name}.{to}")
+    for input_path in inputs:
+        for source, relative in _expand(input_path, out):
+            # The whole name of a folder: an x-io session has no ending, but there may be dots in its name.
+            name = relative.name if source.is_dir() else relative.stem
+            job = Job(source, out / relative.parent / f"{name}.{to}")
             other = jobs.setdefault(job.target, job)
             if other.source != source:
                 raise EdgeposeError(
-                    f"{other.source} and {source} would both become {job.target}; convert them apart, each "
-                    "with an --out of its own"
+                    f"{other.source} and {source} would both become {job.target}; convert them separately, "
+                    "each with its own --out"
                 )
     sources = {job.source.resolve() for job in jobs.values()}
     for job in jobs.values():
@@ -129,66 +129,66 @@ def plan(inputs: Sequence[Path], to: str, out: Path) -> list[Job]:
     return list(jobs.values())
 
 
-def _expand(given: Path, out: Path) -> Iterator[tuple[Path, Path]]:
-    """Recordings that an input stands for, and their places below the output folder."""
-    if given.is_dir():
+def _expand(source: Path, out: Path) -> Iterator[tuple[Path, Path]]:
+    """Yield the recordings that an input stands for, and their relative paths in the output folder."""
+    if source.is_dir():
         endings = _endings()
         try:
-            found = sorted(_walk(given, out.resolve(), endings))
+            found = sorted(_find_recordings(source, out.resolve(), endings))
         except OSError as error:
-            raise EdgeposeError(f"{error.filename}: cannot look into it: {error.strerror}") from None
+            raise EdgeposeError(f"{error.filename}: cannot list it: {error.strerror}") from None
         if not found:
             raise EdgeposeError(
-                f"{given}: no recording in this folder; names end in {', '.join(endings)}, or .gz of a log"
+                f"{source}: no recording in this folder; names end in {', '.join(endings)}, or .gz of a log"
             )
         for path in found:
-            # The session that is itself given has its own name.
-            yield path, Path(given.resolve().name) if path == given else path.relative_to(given)
-    elif str(given) == "-":
+            # A session folder given by itself keeps its own name.
+            yield path, Path(source.resolve().name) if path == source else path.relative_to(source)
+    elif str(source) == "-":
         if sys.stdin is None:
             raise EdgeposeError("-: there is no standard input; name a file")
-        yield given, Path("stdin")
-    elif given.exists():
-        if not given.is_file():
+        yield source, Path("stdin")
+    elif source.exists():
+        if not source.is_file():
             raise EdgeposeError(
-                f"{given}: not a file; convert what comes out of it as -: convert - < {given}"
+                f"{source}: not a regular file; convert its output from standard input: convert - < {source}"
             )
-        yield given, Path(given.name)
-    elif any(mark in str(given) for mark in "*?["):
-        # The shell has left it alone: it is quoted, or the shell is that of Windows.
-        root = Path(given.anchor or ".")
-        found = sorted(root.glob(str(given.relative_to(given.anchor) if given.anchor else given)))
+        yield source, Path(source.name)
+    elif any(mark in str(source) for mark in "*?["):
+        # A pattern that the shell has not expanded: it was quoted, or the shell is that of Windows.
+        root = Path(source.anchor or ".")
+        found = sorted(root.glob(str(source.relative_to(source.anchor) if source.anchor else source)))
         if not found:
-            raise EdgeposeError(f"{given}: no file fits this pattern")
+            raise EdgeposeError(f"{source}: no file matches this pattern")
         for path in found:
             yield from _expand(path, out)
     else:
-        raise EdgeposeError(f"{given}: no such file or folder")
+        raise EdgeposeError(f"{source}: no such file or folder")
 
 
-def _walk(folder: Path, out: Path, endings: tuple[str, ...]) -> Iterator[Path]:
-    """Recordings in a folder, save those of an earlier conversion."""
+def _find_recordings(folder: Path, out: Path, endings: tuple[str, ...]) -> Iterator[Path]:
+    """Yield the recordings in a folder, except those in the output folder."""
     if find_format(folder) is not None:
         yield folder
     elif xio_session.is_sensor(folder):
         raise EdgeposeError(f"{folder}: one sensor of an x-io session; give the folder above it")
     for path in folder.iterdir():
         if path.is_dir():
-            of_session = xio_session.is_sensor(path)
-            if not of_session and not path.is_symlink() and path.resolve() != out:
-                yield from _walk(path, out, endings)
-        # A pipe could be waited for in vain.
+            in_session = xio_session.is_sensor(path)
+            if not in_session and not path.is_symlink() and path.resolve() != out:
+                yield from _find_recordings(path, out, endings)
+        # Reading a pipe could block forever.
         elif not path.is_fifo() and (path.suffix.lower() in endings or is_can_log(path)):
             yield path
 
 
 def convert(job: Job, options: Options = _DEFAULTS) -> Result:
-    """Write what is good in a recording."""
+    """Convert one file, keeping its good part if it is damaged."""
     try:
         if job.target.suffix == ".bvh" or is_poses(job.source):
             if options.filter != "none":
                 raise EdgeposeError(f"{job.source}: --filter is for recordings, not for poses; leave it out")
-            _make(job.target.parent)
+            _make_folder(job.target.parent)
             return Result(job, *convert_poses(job.source, job.target, options.height_m, options.overwrite))
         recording = _read(job.source, options.protocol, options.sensors)
         data = recording.sensors.values()
@@ -198,7 +198,7 @@ def convert(job: Job, options: Options = _DEFAULTS) -> Result:
             from edgepose.orientation.offline import orient_recording
 
             recording = orient_recording(recording, options.filter, name=str(job.source))
-        _make(job.target.parent)
+        _make_folder(job.target.parent)
         write = WRITERS[job.target.suffix[1:]]
         replace_file(
             job.target, lambda path: write(path, recording), "recording", overwrite=options.overwrite
@@ -209,7 +209,7 @@ def convert(job: Job, options: Options = _DEFAULTS) -> Result:
         return Result(job, problem=f"{job.source}: not enough memory; convert it with fewer --jobs")
     except OSError as error:
         return Result(job, problem=f"{error.filename or job.target}: {error.strerror or error}")
-    except Exception as error:  # a fault of ours, which must not cost the other files
+    except Exception as error:  # a bug, which must not stop the other files
         return Result(job, problem=f"{job.source}: cannot be converted, please report it: {error!r}")
     return Result(
         job,
@@ -220,7 +220,7 @@ def convert(job: Job, options: Options = _DEFAULTS) -> Result:
     )
 
 
-def _make(folder: Path) -> None:
+def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -233,7 +233,7 @@ def _read(path: Path, protocol: str, sensors: Path | None) -> Recording:
         return salvage_recording(path, None if sensors is None else read_map(sensors).serial_numbers())
     problems: list[str] = []
     rows = list(_samples(path, protocol, sensors, problems))
-    # Names need not be text.
+    # File names need not be valid text.
     name = os.fsencode(path.name).decode(errors="replace")
     recording = recording_from_samples(rows, {"source": name}, name=str(path), salvage=True)
     problems += [recording.damage] if recording.damage else []
@@ -241,7 +241,7 @@ def _read(path: Path, protocol: str, sensors: Path | None) -> Recording:
 
 
 def _samples(path: Path, protocol: str, sensors: Path | None, problems: list[str]) -> Iterator[ImuSample]:
-    """Samples of a capture or a log; an error ends them and is added to the problems."""
+    """Yield the samples of a capture or a log; an error ends them and is added to the problems."""
     with open_source(file=path, protocol=protocol, sensors=sensors) as source:
         try:
             yield from chain.from_iterable(batch.samples for batch in source)
@@ -252,24 +252,24 @@ def _samples(path: Path, protocol: str, sensors: Path | None, problems: list[str
 
 
 def convert_all(jobs: Sequence[Job], options: Options = _DEFAULTS, workers: int = 1) -> Iterator[Result]:
-    """Results as they come.
+    """Run conversions, and yield their results as they finish.
 
     Args:
-        jobs: recordings.
-        options: of all of them.
-        workers: processes; one works in this process.
+        jobs: the conversions.
+        options: options of all of them.
+        workers: number of processes; 1 works in this process.
     """
     work = partial(convert, options=options)
-    # Other processes have no standard input.
+    # Worker processes have no standard input.
     yield from map(work, (job for job in jobs if str(job.source) == "-"))
     jobs = [job for job in jobs if str(job.source) != "-"]
     if workers == 1 or len(jobs) < 2:
         yield from map(work, jobs)
         return
-    # A fork of a process with threads may hang; a process of its own is the same on every system.
+    # Forking a process with threads may hang; spawned processes behave alike on every system.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(workers, len(jobs)), context, _ignore_interrupts) as pool:
-        # A new process ignores Ctrl-C from its first moment on where this one does.
+        # Worker processes inherit this, and so ignore Ctrl-C from the start.
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)
         try:
             futures: dict[Future[Result], Job] = {pool.submit(work, job): job for job in jobs}
@@ -281,15 +281,15 @@ def convert_all(jobs: Sequence[Job], options: Options = _DEFAULTS, workers: int 
                     yield future.result()
                 except BrokenProcessPool:
                     job = futures[future]
-                    why = "its process was ended, perhaps for want of memory; use fewer --jobs"
-                    yield Result(job, problem=f"{job.source}: {why}")
+                    problem = "its process was killed, perhaps for lack of memory; use fewer --jobs"
+                    yield Result(job, problem=f"{job.source}: {problem}")
         finally:
-            # After an interrupt: what is under way is finished, so that no file is left half.
+            # After an interrupt, conversions in progress are finished, so that no file is left incomplete.
             pool.shutdown(cancel_futures=True)
 
 
 def _ignore_interrupts() -> None:
-    """Ctrl-C goes to all processes of a terminal; the one that started the others handles it for them."""
+    """Ignore Ctrl-C, which a terminal sends to all processes: the main process handles it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
@@ -313,19 +313,19 @@ def _write_poses(path: Path, poses: PoseSequence, height_m: float) -> None:
 def convert_poses(
     source: Path, target: Path, height_m: float, overwrite: bool = True
 ) -> tuple[int, float, str | None]:
-    """Write what is good in a file of poses; the target appears when it is whole.
+    """Convert the good part of a file of poses; the target appears once it is complete.
 
     Args:
         source: file that `edgepose.formats.poses.registry.read_poses` reads.
         target: .csv, .npz or .bvh file.
         height_m: the wearer's stature, for the bones of a BVH file, metres.
-        overwrite: whether it may take the place of a file.
+        overwrite: replace an existing file.
 
     Returns:
-        Number of poses, seconds from the first to the last, and one line on what was not good.
+        Number of poses, seconds from the first to the last, and one line about the bad part, if any.
 
     Raises:
-        EdgeposeError: nothing is good, or it cannot be written.
+        EdgeposeError: no part of the source is good, or the target cannot be written.
     """
     poses, damage = salvage_poses(source)
     replace_file(target, lambda path: _write_poses(path, poses, height_m), "poses", overwrite=overwrite)
@@ -333,9 +333,9 @@ def convert_poses(
 
 
 def describe(result: Result) -> str:
-    """What became of a recording, in a few words and its problem."""
+    """Describe the result of a conversion in a few words, with its problem."""
     if result.skipped:
-        return "skipped, there already"
+        return "skipped, already exists"
     if not result.samples:
         return f"failed: {result.problem}"
     few = "" if result.sensors == len(PLACEMENTS) else f", {result.sensors} of {len(PLACEMENTS)} sensors"

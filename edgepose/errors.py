@@ -1,4 +1,4 @@
-"""Kinds of error. The command line turns each into one line on standard error and an exit code."""
+"""Exceptions. The command line turns each into one line on standard error and an exit code."""
 
 from __future__ import annotations
 
@@ -9,53 +9,53 @@ from contextlib import contextmanager
 class EdgeposeError(Exception):
     """Bad input or a broken device.
 
-    The message is for the user: what is wrong, where (file, row, sensor, byte), and what to do. It has no
-    trailing full stop and no line break.
+    The message is written for the user: what is wrong, where (file, row, sensor, byte), and what to do. It
+    has no trailing full stop and no line break.
     """
 
 
 class ConfigError(EdgeposeError):
-    """A flag, a key or a value of the configuration is missing, unknown or not valid."""
+    """A flag, key or value of the configuration is missing, unknown or invalid."""
 
 
 class DeviceError(EdgeposeError):
-    """A port, bus or address cannot be opened, or a device says nothing usable."""
+    """A port, bus or address cannot be opened, or a device sends nothing usable."""
 
 
 class FileFormatError(EdgeposeError):
-    """A file is damaged, or not of the kind that it should be."""
+    """A file is damaged or of the wrong kind."""
 
 
 class CalibrationError(EdgeposeError):
-    """A wearer cannot be calibrated from what the sensors say, or a calibration does not fit."""
+    """A wearer cannot be calibrated from the sensors' data, or a calibration does not fit."""
 
 
 class ModelError(EdgeposeError):
-    """A model archive is missing, damaged, not trusted, or cannot run here."""
+    """A model archive is missing, damaged, not trusted, or cannot run on this machine."""
 
 
 def as_edgepose_error(error: Exception) -> EdgeposeError:
-    """An error as the user is told of it; what nobody has foreseen is the cause of what it becomes."""
+    """Return an error in the form shown to the user, with an unexpected exception as its cause."""
     if isinstance(error, EdgeposeError):
         return error
     text = (str(error).splitlines() or [""])[0]
     if isinstance(error, MemoryError):
-        told = EdgeposeError("not enough memory; give it a shorter file")
+        reported = EdgeposeError("not enough memory; use a shorter file")
     else:
-        told = EdgeposeError(
-            f"an unexpected fault ({type(error).__name__}: {text}); please report it, with what "
-            "edgepose --debug shows"
+        reported = EdgeposeError(
+            f"unexpected error ({type(error).__name__}: {text}); please report it, with the output of "
+            "edgepose --debug"
         )
-    told.__cause__ = error
-    return told
+    reported.__cause__ = error
+    return reported
 
 
 @contextmanager
-def prefix_errors(whose: str) -> Iterator[None]:
-    """Errors say whose they are, if there is a name."""
+def prefix_errors(name: str) -> Iterator[None]:
+    """Prefix errors with a name, such as the wearer's, unless it is empty."""
     try:
         yield
     except EdgeposeError as error:
-        if not whose:
+        if not name:
             raise
-        raise EdgeposeError(f"{whose}: {error}") from error
+        raise EdgeposeError(f"{name}: {error}") from error

@@ -1,4 +1,4 @@
-"""Measurements of IMUs: one sample, one frame of six sensors, and whole recordings."""
+"""IMU measurements: one sample, one frame of six sensors, and whole recordings."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
 FILTERS = ("none", "kalman", "vqf")
-"""What makes orientations of samples: the devices themselves, or a filter here."""
+"""Orientation filters; "none" uses the orientations that the devices send."""
 
 
 GRAVITY = 9.81
-"""What a sensor at rest measures, m/s^2; in I along +Z."""
+"""Specific force measured by a sensor at rest, m/s^2; in I along +Z."""
 
 GAP_S = 60.0
-"""Where all sensors are silent for longer, frames restart afterwards; a minute of repeats helps nobody."""
+"""Silence of all sensors after which frames restart instead of repeating the last values, seconds."""
 
 
 class ImuSample(NamedTuple):
@@ -29,8 +29,8 @@ class ImuSample(NamedTuple):
         sensor: index into `edgepose.placements.PLACEMENTS`.
         time_s: time of the measurement on the source's clock, seconds. Live sources map device clocks to Unix
             time; files keep their own times.
-        quat: unit quaternion w, x, y, z, sensor frame to inertial frame I (Z up); None where the device
-            measures no orientation.
+        quat: unit quaternion w, x, y, z, sensor frame to inertial frame I (Z up); None if the device measures
+            no orientation.
         acc: specific force in the sensor frame, m/s^2 (a level sensor at rest reads +9.81 on its up axis);
             None if absent.
         gyr: angular rate in the sensor frame, rad/s; None if absent.
@@ -54,12 +54,11 @@ class ImuFrame(NamedTuple):
         orientation: (6, 4) unit quaternions w, x, y, z, sensor to inertial (R_IS), in the order of
             PLACEMENTS.
         force: (6, 3) specific force averaged over the frame, inertial frame, m/s^2: (0, 0, 9.81) at rest.
-        held: (6,) bool, True where a sensor had nothing new and its last values are repeated.
-        ready_s: time on the source's clock at which the frame's last packet had arrived (for latency),
-            seconds.
+        held: (6,) bool, True for a sensor without new data, whose last values are repeated.
+        ready_s: time on the source's clock at which the last packet for the frame arrived, seconds.
     """
 
-    index: int  # type: ignore[assignment]  # hides tuple.index, which nobody wants here
+    index: int  # type: ignore[assignment]  # hides tuple.index, which is not needed here
     time_s: float
     orientation: NDArray[np.float64]
     force: NDArray[np.float64]
@@ -68,7 +67,7 @@ class ImuFrame(NamedTuple):
 
 
 class SensorData(NamedTuple):
-    """Samples of one sensor.
+    """All samples of one sensor.
 
     Attributes:
         time_s: (N,) times, never decreasing, seconds.
@@ -77,7 +76,7 @@ class SensorData(NamedTuple):
         gyr: (N, 3) angular rate, sensor frame, rad/s; None if not measured.
         mag: (N, 3) magnetic field, sensor frame, uT; None if not measured.
 
-    A row of NaN means not measured at that time (a magnetometer slower than the rest).
+    A row of NaN means not measured at that time, such as by a magnetometer slower than the other sensors.
     """
 
     time_s: Array
@@ -88,13 +87,12 @@ class SensorData(NamedTuple):
 
 
 class Recording(NamedTuple):
-    """What six sensors measured.
+    """A recording of six sensors.
 
     Attributes:
         sensors: data by placement name, in the order of PLACEMENTS.
-        metadata: rate, frame, units, placements and what else the file says about itself.
-        damage: one line for the user if a part of the file is no good (file, row, what to do); the rest is
-            here.
+        metadata: rate, frame, units, placements and other information from the file.
+        damage: one line for the user (file, row, what to do) if part of the file was bad; the rest is here.
     """
 
     sensors: dict[str, SensorData]

@@ -1,4 +1,4 @@
-"""Where the six sensors sit, in the one order that the whole program uses."""
+"""Placements of the six sensors, in the order used throughout the program."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ PLACEMENTS = ("left_forearm", "right_forearm", "left_lower_leg", "right_lower_le
 """Placement names; index i of any (6, ...) array is the sensor at PLACEMENTS[i]."""
 
 BONES = (18, 19, 4, 5, 15, 0)
-"""SMPL joint whose bone carries the sensor, in the order of PLACEMENTS."""
+"""SMPL joint whose segment carries the sensor, in the order of PLACEMENTS."""
 
 ROOT = PLACEMENTS.index("pelvis")
 """Index of the root sensor."""
@@ -17,5 +17,7 @@ SITES = {
     "left_hand": 20, "right_hand": 21, "left_upper_leg": 1, "right_upper_leg": 2, "left_foot": 7,
     "right_foot": 8,
 }  # fmt: skip
-"""All bones that a sensor can be named by and the SMPL joints that turn them; only `edgepose solve` takes
-more than the six."""
+"""Names of all segments that can carry a sensor, and the SMPL joints that move them.
+
+Only `edgepose solve` accepts more than the six placements.
+"""

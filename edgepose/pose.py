@@ -1,4 +1,4 @@
-"""Poses of the body: one at an instant, and all of a file."""
+"""Poses of the body: a single pose, and a sequence from a file."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ class PoseFrame(NamedTuple):
     """A pose of SMPL's 24 joints.
 
     Attributes:
-        index: frame number, that of the `ImuFrame` it belongs to.
+        index: frame number, that of the pose's `ImuFrame`.
         time_s: time of the frame on the source's clock, seconds (live: Unix time).
-        rotations: (24, 3, 3) rotation of each joint against its parent, joint 0 against the body frame T.
-        std: (24,) standard deviation that the network gives for each joint, radians; 0 for measured and
-            resting joints.
-        translation: (3,) place of the pelvis in T, metres, where something estimates it.
-        held: placements or sites of sensors that had nothing new; their last values were repeated.
+        rotations: (24, 3, 3) rotation of each joint relative to its parent, joint 0 relative to body frame T.
+        std: (24,) standard deviation of each joint, predicted by the network, radians; 0 for joints that are
+            measured or fixed.
+        translation: (3,) position of the pelvis in T, metres, if it is estimated.
+        held: placements or sites of sensors without new data, whose last values were repeated.
         warming_up: the network has seen fewer frames than its window holds.
     """
 
-    index: int  # type: ignore[assignment]  # hides tuple.index, which nobody wants here
+    index: int  # type: ignore[assignment]  # hides tuple.index, which is not needed here
     time_s: float
     rotations: NDArray[np.float32]
     std: NDArray[np.float32]
@@ -41,18 +41,20 @@ class PoseFrame(NamedTuple):
 
     @property
     def status(self) -> str:
-        """`held` and `warming_up` in text, see `format_status`."""
+        """`held` and `warming_up` as text, see `format_status`."""
         return format_status(self.held, self.warming_up)
 
 
 _HELD, _WARMING_UP, _OK = "held", "filling window", "ok"
-_LONGEST = 1000  # characters of a text that are read; of all sites it is shorter
+_LONGEST = 1000  # characters that are parsed; a status with all sites is shorter
 
 
 @lru_cache(maxsize=256)
 def format_status(held: frozenset[str], warming_up: bool) -> str:
-    """What a pose's `held` and `warming_up` are in text: "ok"; or, joined by "; ", "held NAME [NAME ...]" and
-    "filling window". Names are in the order of SITES, after any that are not of them.
+    """Format a pose's `held` and `warming_up` as text.
+
+    The text is "ok", or "held NAME [NAME ...]" and "filling window" joined by "; ". Names are in the order of
+    SITES, after any unknown ones.
     """
     names = sorted(held, key=lambda name: (_ORDER.get(name, -1), name))
     parts = [" ".join([_HELD, *names])] if names else []
@@ -62,34 +64,34 @@ def format_status(held: frozenset[str], warming_up: bool) -> str:
 
 @lru_cache(maxsize=256)
 def parse_status(text: str) -> tuple[frozenset[str], bool]:
-    """`held` and `warming_up` of a text of `format_status`; what it does not know it leaves out."""
+    """Parse a text of `format_status` to `held` and `warming_up`, ignoring unknown parts."""
     parts = text[:_LONGEST].split("; ")
     held = [name for part in parts if part.startswith(_HELD + " ") for name in part.split()[1:]]
     return frozenset(held), _WARMING_UP in parts
 
 
 def held_sensors(held: Sequence[Set[str]]) -> NDArray[np.bool_]:
-    """Whether each sensor is held, (T, 6) in the order of PLACEMENTS, of the `held` of T poses."""
+    """Return whether each sensor is held, (T, 6) in the order of PLACEMENTS, from the `held` of T poses."""
     flags = [[name in names for name in PLACEMENTS] for names in held]
     return np.array(flags, bool).reshape(-1, len(PLACEMENTS))
 
 
 def longest_holds(held: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Most poses in a row (6,) in which each sensor is held, of `held` (T, 6)."""
+    """Return the longest run of poses (6,) in which each sensor is held, from `held` (T, 6)."""
     edges = np.diff(np.pad(held.astype(int), ((1, 1), (0, 0))), axis=0).T
     return np.array([np.max(np.flatnonzero(e < 0) - np.flatnonzero(e > 0), initial=0) for e in edges])
 
 
 class PoseSequence(NamedTuple):
-    """Poses of one file.
+    """The poses of a file.
 
     Attributes:
-        frames: (T,) numbers of the frames, rising.
-        time_s: (T,) on the source's clock, seconds.
-        rotations: (T, 24, 3, 3) local rotations, joint 0 against T.
-        translation: (T, 3) place of the pelvis in T, metres, if the file has it.
+        frames: (T,) frame numbers, increasing.
+        time_s: (T,) times on the source's clock, seconds.
+        rotations: (T, 24, 3, 3) local rotations, joint 0 relative to T.
+        translation: (T, 3) position of the pelvis in T, metres, if the file has it.
         held: T sets, see `PoseFrame`.
-        warming_up: T, see `PoseFrame`.
+        warming_up: T flags, see `PoseFrame`.
     """
 
     frames: NDArray[np.int64]
@@ -101,32 +103,32 @@ class PoseSequence(NamedTuple):
 
     @property
     def status(self) -> list[str]:
-        """T texts, see `format_status`."""
+        """Status texts of the T poses, see `format_status`."""
         return [format_status(*state) for state in zip(self.held, self.warming_up, strict=True)]
 
     @property
     def frame_time(self) -> float:
-        """Seconds from a frame to the next; 1/60 where there is but one."""
+        """Seconds from one frame to the next; 1/60 if there is only one frame."""
         steps = np.diff(self.frames)
-        # The median, because time leaps where all sensors were silent for long.
+        # The median, because time jumps where all sensors were silent for long.
         return float(np.median(np.diff(self.time_s) / steps)) if len(steps) else 1.0 / 60.0
 
     @property
     def rate(self) -> float:
-        """Frames per second; 60 where there is but one frame."""
+        """Frames per second; 60 if there is only one frame."""
         return tidy_rate(self.frame_time)
 
     def pose_frames(self) -> Iterator[PoseFrame]:
-        """The poses one by one, as a sink takes them; files hold no standard deviations of joints here."""
-        unknown = np.full(len(JOINTS), np.nan, np.float32)
+        """Yield the poses one by one, as sinks take them; their `std` is NaN, because it is not kept here."""
+        unknown_std = np.full(len(JOINTS), np.nan, np.float32)
         for i, (frame, time_s) in enumerate(zip(self.frames.tolist(), self.time_s.tolist(), strict=True)):
-            where = None if self.translation is None else self.translation[i]
+            translation = None if self.translation is None else self.translation[i]
             state = self.held[i], self.warming_up[i]
-            yield PoseFrame(frame, time_s, self.rotations[i], unknown, where, *state)
+            yield PoseFrame(frame, time_s, self.rotations[i], unknown_std, translation, *state)
 
 
 def tidy_rate(frame_time: float) -> float:
-    """Frames per second of a frame time in seconds that was printed with few digits: .0083333 is 120 Hz."""
+    """Return the rate, Hz, of a frame time, seconds, that was printed with few digits: .0083333 is 120 Hz."""
     rate = 1.0 / frame_time
     whole = round(rate)
     return float(whole) if abs(rate - whole) < 1e-4 * rate else rate

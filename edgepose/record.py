@@ -1,7 +1,7 @@
-"""Live samples, bytes or CAN frames to a file, so that at most the last second is lost when the power goes.
+"""Recording of live samples, bytes or CAN frames to a file; a power cut loses at most the last second.
 
-What cannot be written bit by bit goes through a journal next to it that can: `walk.npz` through
-`walk.part.csv`, `walk.blf` through `walk.part.log`. Both are recordings that everything else reads.
+Formats that cannot be written piece by piece are written to a journal next to the file first: `walk.npz` to
+`walk.part.csv`, `walk.blf` to `walk.part.log`. A journal is itself a recording that all commands read.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from edgepose.utils.growing_files import DurableAppender
 from edgepose.utils.output_targets import check_output
 
 CAN_LOGS = (".asc", ".blf", ".log")
-"""Endings of the CAN logs that are written; of .trc, python-can's writer would drop the CAN FD frames."""
+"""Endings of the CAN logs that can be written; .trc is missing: python-can would drop the CAN FD frames."""
 
 _JOURNALS = {".npz": ".part.csv", ".asc": ".part.log", ".blf": ".part.log"}
 
 
 class Output(NamedTuple):
-    """A recording under way.
+    """A recording in progress.
 
     Attributes:
-        files: that grow.
-        samples: takes those that came together.
-        raw: takes what came together on a line: arrival in Unix time, seconds, and bytes or CAN messages.
-        finish: called when the files are closed and something is in them.
+        files: the growing files.
+        samples: writes the samples of a batch.
+        raw: writes data of a line: arrival in Unix time, seconds, and bytes or a CAN message.
+        finish: called once the files are closed, if anything was written.
     """
 
     files: list[DurableAppender]
@@ -53,9 +53,9 @@ class RecordSummary:
     """Counts of a recording.
 
     Attributes:
-        samples: of each sensor, in the order of PLACEMENTS.
-        seconds: on the source's clock, from the first sample on.
-        error: what ended it early, if anything did.
+        samples: number of samples of each sensor, in the order of PLACEMENTS.
+        seconds: time on the source's clock since the first sample.
+        error: the error that ended the recording early, if any.
     """
 
     samples: list[int] = field(default_factory=lambda: [0] * len(PLACEMENTS))
@@ -64,7 +64,7 @@ class RecordSummary:
 
 
 def kind(path: str) -> Literal["samples", "port", "bus"]:
-    """What a recording of this name takes: samples, what comes from a port, or what comes over a bus.
+    """Return what a recording of this name holds: samples, or the raw data of a port or of a bus.
 
     Raises:
         EdgeposeError: unknown ending.
@@ -83,32 +83,32 @@ def kind(path: str) -> Literal["samples", "port", "bus"]:
 
 
 def growing(path: str) -> Path | None:
-    """The file that grows beside a recording until it is whole, if it is another."""
+    """Return the journal of a recording; None if the recording itself grows."""
     journal = None if path == "-" else _journal(Path(path))
     return None if journal == Path(path) else journal
 
 
 def check_free(path: str, overwrite: bool) -> None:
-    """Make sure that no recording is lost.
+    """Check that no existing recording would be lost.
 
     Args:
-        path: of the new one.
-        overwrite: whether one that is there already may be replaced.
+        path: the new recording.
+        overwrite: whether an existing recording may be replaced.
 
     Raises:
-        EdgeposeError: one is there, whole or its journal, or it cannot be written.
+        EdgeposeError: the recording or its journal exists already, or cannot be written.
     """
     if path == "-":
         return
-    there, journal = Path(path), _journal(Path(path))
-    beside = [times_path(there)] if kind(path) == "port" else []
-    for file in (there, *beside):
+    target, journal = Path(path), _journal(Path(path))
+    companions = [times_path(target)] if kind(path) == "port" else []
+    for file in (target, *companions):
         check_output(file, "the recording", (*CAPTURES, *CAN_LOGS, ".csv", ".npz", ".times"), overwrite)
-    if journal != there and os.path.lexists(journal) and not overwrite:
-        to = "npz" if there.suffix.lower() == ".npz" else "csv"
+    if journal != target and os.path.lexists(journal) and not overwrite:
+        to = "npz" if target.suffix.lower() == ".npz" else "csv"
         raise EdgeposeError(
-            f"{journal} is of a recording that was cut short; keep it with  edgepose convert {journal} "
-            f"--to {to} --out DIR  and delete it, or give --overwrite"
+            f"{journal} is left from a recording that was cut short; convert it with  edgepose convert "
+            f"{journal} --to {to} --out DIR  and delete it, or give --overwrite"
         )
 
 
@@ -116,19 +116,19 @@ def open_output(path: str, metadata: Mapping[str, str], overwrite: bool = True) 
     """Start a recording; its file appears with the first samples.
 
     Args:
-        path: its name says what it takes, see `kind`; "-" is CSV on standard output.
-        metadata: goes into it, where it has a place for that.
-        overwrite: whether it may take the place of one that is there already.
+        path: file to write, whose name determines the content, see `kind`; "-" is CSV on standard output.
+        metadata: written to the file if the format can hold it.
+        overwrite: whether an existing recording may be replaced.
 
     Raises:
-        EdgeposeError: it cannot be written.
+        EdgeposeError: the file cannot be written.
     """
-    takes = kind(path)
-    if takes == "port":
-        return _capture(Path(path), metadata, overwrite)
-    if takes == "bus":
-        return _can_log(Path(path), overwrite)
-    return _samples(path, metadata, overwrite)
+    content = kind(path)
+    if content == "port":
+        return _open_capture(Path(path), metadata, overwrite)
+    if content == "bus":
+        return _open_can_log(Path(path), overwrite)
+    return _open_samples(path, metadata, overwrite)
 
 
 def record(
@@ -138,24 +138,24 @@ def record(
     on_batch: Callable[[RecordSummary], None] = lambda summary: None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> RecordSummary:
-    """Write what a source gives, to its end, for some seconds, or until `stopped`.
+    """Record a source to its end, for some seconds, or until `stopped`.
 
-    What came before an error or the stop is written. An error is kept in the summary for the caller to
+    Everything that came before an error or the stop is written. The summary keeps an error for the caller to
     report.
 
     Args:
-        source: the source.
-        output: where to; closed at the end. Nothing appears, and nothing is replaced, if nothing came.
+        source: the source to record.
+        output: the recording, closed at the end. If no data came, no file appears and none is replaced.
         seconds: length of the recording on the source's clock.
         on_batch: called after each batch.
-        stopped: asked after each batch whether to end.
+        stopped: called after each batch; true ends the recording.
     """
     summary = RecordSummary()
     start_s = None
-    something = False
+    written = False
     try:
         for batch in source:
-            something |= _write(output, batch)
+            written |= _write(output, batch)
             for sample in batch.samples:
                 summary.samples[sample.sensor] += 1
             if start_s is None and batch.samples:
@@ -172,7 +172,7 @@ def record(
                 file.close()
             except EdgeposeError as error:
                 summary.error = summary.error or error
-    if not something:
+    if not written:
         return summary
     try:
         output.finish()
@@ -182,7 +182,7 @@ def record(
 
 
 def _write(output: Output, batch: Batch) -> bool:
-    """Write a batch, and whether there was something to keep in it."""
+    """Write a batch; return whether it held anything to write."""
     if batch.samples:
         output.samples(batch.samples)
     for arrival_s, piece in batch.raw:
@@ -190,27 +190,27 @@ def _write(output: Output, batch: Batch) -> bool:
     return bool(batch.samples or (batch.raw and output.raw is not _ignore))
 
 
-# --- kinds --------------------------------------------------------------------------------------------------
+# --- kinds of recordings ------------------------------------------------------------------------------------
 
 
-def _samples(path: str, metadata: Mapping[str, str], overwrite: bool) -> Output:
+def _open_samples(path: str, metadata: Mapping[str, str], overwrite: bool) -> Output:
     journal = path if path == "-" else str(_journal(Path(path)))
     header = csv_header(metadata).encode()
     file = DurableAppender(journal, "samples", header, overwrite=overwrite, follow=journal == path)
 
-    def take(samples: list[ImuSample]) -> None:
+    def write(samples: list[ImuSample]) -> None:
         file.add("".join(map(csv_row, samples)).encode())
 
     def finish() -> None:
         if journal != path:
-            _finish(
+            _convert_journal(
                 Path(path), Path(journal), lambda part: write_npz(part, salvage_recording(journal)), overwrite
             )
 
-    return Output([file], take, _ignore, finish)
+    return Output([file], write, _ignore, finish)
 
 
-def _capture(path: Path, metadata: Mapping[str, str], overwrite: bool) -> Output:
+def _open_capture(path: Path, metadata: Mapping[str, str], overwrite: bool) -> Output:
     times = times_path(path)
     bytes_file = DurableAppender(str(path), "bytes", b"", end=b"", overwrite=overwrite)
     try:
@@ -221,24 +221,24 @@ def _capture(path: Path, metadata: Mapping[str, str], overwrite: bool) -> Output
         raise
     end = 0
 
-    def take(arrival_s: float, data: bytes) -> None:
+    def write(arrival_s: float, data: bytes) -> None:
         nonlocal end
         end += len(data)
         bytes_file.add(data)
         times_file.add(times_row(arrival_s, end).encode())
 
-    return Output([bytes_file, times_file], _ignore, take, lambda: None)
+    return Output([bytes_file, times_file], _ignore, write, lambda: None)
 
 
-def _can_log(path: Path, overwrite: bool) -> Output:
+def _open_can_log(path: Path, overwrite: bool) -> Output:
     import can
 
     journal = _journal(path)
     file = DurableAppender(str(journal), "CAN frames", b"", overwrite=overwrite, follow=journal == path)
     writer = can.CanutilsLogWriter(cast(TextIO, _TextFile(file)))
 
-    def take(arrival_s: float, message: can.Message) -> None:
-        # The adapter's own clock may start anywhere; decoding it again has to give the same times.
+    def write(arrival_s: float, message: can.Message) -> None:
+        # Arrival instead of the adapter's clock, which may start anywhere: replays must yield the same times.
         message.timestamp = arrival_s
         writer.on_message_received(message)
 
@@ -249,19 +249,19 @@ def _can_log(path: Path, overwrite: bool) -> Output:
                     log.on_message_received(message)
         except OSError:
             raise
-        # The writers of the formats fail in many ways.
+        # python-can's writers raise arbitrary exceptions.
         except Exception as error:
             raise EdgeposeError(f"{path}: python-can cannot write it: {error}") from None
 
     def finish() -> None:
         if journal != path:
-            _finish(path, journal, convert, overwrite)
+            _convert_journal(path, journal, convert, overwrite)
 
-    return Output([file], _ignore, take, finish)
+    return Output([file], _ignore, write, finish)
 
 
 class _TextFile:
-    """As much of a text file as python-can's writer of logs needs."""
+    """The part of the text file interface that python-can's log writer uses."""
 
     def __init__(self, file: DurableAppender) -> None:
         self._file = file
@@ -270,26 +270,26 @@ class _TextFile:
         self._file.add(text.encode())
 
     def flush(self) -> None:
-        """The file does that itself."""
+        """Do nothing: the file flushes itself."""
 
 
 def _ignore(*_: Any) -> None:
-    """What this kind does not keep."""
+    """Discard data that this kind of recording does not hold."""
 
 
-def _finish(path: Path, journal: Path, write: Callable[[Path], None], overwrite: bool) -> None:
-    """Make the recording of its journal."""
+def _convert_journal(path: Path, journal: Path, write: Callable[[Path], None], overwrite: bool) -> None:
+    """Convert a journal to the recording, and delete it."""
     try:
         replace_file(path, write, "recording", overwrite=overwrite)
     except (EdgeposeError, MemoryError) as error:
-        why = str(error) or f"{path}: not enough memory"
+        problem = str(error) or f"{path}: not enough memory"
         raise EdgeposeError(
-            f"{why}; the recording is whole in {journal}, edgepose convert reads it"
+            f"{problem}; the complete recording is in {journal}, which edgepose convert reads"
         ) from None
     journal.unlink()
 
 
 def _journal(path: Path) -> Path:
-    """The file that grows while this one is recorded; often itself."""
+    """Return the file that grows during a recording: a journal, or the recording itself."""
     ending = _JOURNALS.get(path.suffix.lower())
     return path if ending is None else path.with_suffix(ending)

@@ -1,4 +1,4 @@
-"""All rotation arithmetic, on numpy arrays with any leading dimensions.
+"""Rotation arithmetic on numpy arrays with any leading dimensions.
 
 Quaternions are w, x, y, z. `R_AB` maps vectors from frame B to frame A: `v_A = R_AB @ v_B`. Angles are
 radians.
@@ -23,7 +23,7 @@ def _unit(v: Array) -> Array:
 
 
 def quat_multiply(p: ArrayLike, q: ArrayLike) -> Array:
-    """Hamilton product (..., 4): first q, then p."""
+    """Hamilton product (..., 4): the rotation q followed by p."""
     pw, px, py, pz = np.moveaxis(np.asarray(p, float), -1, 0)
     qw, qx, qy, qz = np.moveaxis(np.asarray(q, float), -1, 0)
     return np.stack(
@@ -43,7 +43,7 @@ def quat_conjugate(q: ArrayLike) -> Array:
 
 
 def quat_rotate(q: ArrayLike, v: ArrayLike) -> Array:
-    """Vectors (..., 3) turned by unit quaternions (..., 4)."""
+    """Rotate vectors (..., 3) by unit quaternions (..., 4)."""
     q, v = np.asarray(q, float), np.asarray(v, float)
     u = q[..., 1:]
     t = 2.0 * np.cross(u, v)
@@ -51,9 +51,9 @@ def quat_rotate(q: ArrayLike, v: ArrayLike) -> Array:
 
 
 def integrate_rotvec(q: tuple[float, ...], x: float, y: float, z: float) -> tuple[float, float, float, float]:
-    """Unit quaternion q (4,) after a turn by an axis-angle vector in its own frame, radians.
+    """Rotate unit quaternion q (4,) by an axis-angle vector in its own frame, radians.
 
-    Plain floats, for loops over single samples, in which arrays take twenty times longer.
+    Uses plain floats: in loops over single samples, arrays take twenty times longer.
     """
     angle = sqrt(x * x + y * y + z * z)
     half = sin(0.5 * angle) / angle if angle > 1e-9 else 0.5
@@ -68,15 +68,16 @@ def integrate_rotvec(q: tuple[float, ...], x: float, y: float, z: float) -> tupl
 
 
 def quat_continuous(q: ArrayLike) -> Array:
-    """The same rotations (T, ..., 4), signs chosen so that neighbours in time are near each other."""
+    """Flip signs of quaternions (T, ..., 4) so that successive ones are close; rotations stay the same."""
     q = np.asarray(q, float)
     flips = np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=-1, keepdims=True) < 0, -1.0, 1.0), axis=0)
     return np.concatenate([q[:1], q[1:] * flips])
 
 
 def slerp(q0: ArrayLike, q1: ArrayLike, t: ArrayLike) -> Array:
-    """Spherical interpolation from q0 (..., 4) at t = 0 to q1 at t = 1 along the shorter arc; t broadcasts
-    over (...).
+    """Interpolate on the sphere from q0 (..., 4) at t = 0 to q1 at t = 1, along the shorter arc.
+
+    t broadcasts over (...).
     """
     q0 = np.asarray(q0, float)
     return quat_multiply(
@@ -95,20 +96,20 @@ def mean_rotation(quats: ArrayLike) -> Array:
 
 
 def yaw_of_quat(q: ArrayLike) -> Array:
-    """Angle (...) of the part of unit quaternions (..., 4) that turns about Z, up (swing-twist split)."""
+    """Angle (...) of the rotation about Z, up, in unit quaternions (..., 4) (swing-twist decomposition)."""
     q = np.asarray(q, float)
     return 2.0 * np.arctan2(q[..., 3], q[..., 0])
 
 
 def yaw_of_matrix(r: ArrayLike) -> Array:
-    """Angle (...), radians, of the part of rotation matrices (..., 3, 3) that turns about Y, up in T."""
+    """Angle (...), radians, of the rotation about Y, up in T, in rotation matrices (..., 3, 3)."""
     r = np.asarray(r, float)
     angle: Array = np.arctan2(r[..., 0, 2] - r[..., 2, 0], r[..., 0, 0] + r[..., 2, 2])
     return angle
 
 
 def quat_about_z(angle: ArrayLike) -> Array:
-    """Unit quaternions (..., 4) of turns about Z."""
+    """Unit quaternions (..., 4) of rotations about Z."""
     half = np.asarray(angle, float) / 2.0
     zero = np.zeros_like(half)
     return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)
@@ -143,7 +144,7 @@ def _four_outer(r: Array) -> Array:
     )
 
 
-# The same as one product, which takes half the time: but for ones on its diagonal it is linear in the matrix.
+# `_four_outer` as a matrix product, in half the time: apart from the ones on its diagonal it is linear.
 _ONES = np.eye(4).ravel()
 _BY_ENTRY = _four_outer(np.eye(9).reshape(9, 3, 3)).reshape(9, 16) - _ONES
 
@@ -186,20 +187,18 @@ def matrix_to_rotvec(r: ArrayLike) -> Array:
 
 
 def rotation_about_axis(axis: str, angle: ArrayLike) -> Array:
-    """Rotation matrices (..., 3, 3) of turns about one coordinate axis, `axis` one of "x", "y", "z"."""
+    """Rotation matrices (..., 3, 3) about one coordinate axis, "x", "y" or "z"."""
     direction = np.zeros(3)
     direction["xyz".index(axis)] = 1.0
     return rotvec_to_matrix(np.asarray(angle, float)[..., None] * direction)
 
 
 Z_UP_TO_T = rotation_about_axis("x", -np.pi / 2)
-"""Turns a world with Z up, such as that of AMASS, into the body frame T, Y up."""
+"""Rotation from a world frame with Z up, such as that of AMASS, to the body frame T with Y up."""
 
 
 def euler_to_matrix(angles: ArrayLike, order: str) -> Array:
-    """Rotation matrices (..., 3, 3) of angles (..., len(order)) multiplied in the written order: "zyx" is Rz
-    Ry Rx.
-    """
+    """Rotation matrices (..., 3, 3) of Euler angles (..., len(order)); order "zyx" is Rz Ry Rx."""
     angles = np.asarray(angles, float)
     result = rotation_about_axis(order[0], angles[..., 0])
     for i, axis in enumerate(order[1:], start=1):
@@ -212,8 +211,8 @@ def matrix_to_euler_zxy(r: ArrayLike) -> Array:
     r = np.asarray(r, float)
     z = np.arctan2(-r[..., 0, 1], r[..., 1, 1])
     c, s = np.cos(z), np.sin(z)
-    # What is left after undoing z is Rx Ry. Taking x and y from it, not from R, stays exact where x is near
-    # +-pi/2 and z by itself means little.
+    # Rx Ry remains after removing z. Taking x and y from it instead of from R stays exact near x = +-pi/2,
+    # where z alone is ill-defined.
     x = np.arctan2(r[..., 2, 1], c * r[..., 1, 1] - s * r[..., 0, 1])
     y = np.arctan2(c * r[..., 0, 2] + s * r[..., 1, 2], c * r[..., 0, 0] + s * r[..., 1, 0])
     return np.stack([z, x, y], axis=-1)
@@ -236,17 +235,17 @@ def geodesic_angle(a: ArrayLike, b: ArrayLike) -> Array:
 
 
 def nearest_rotation(m: ArrayLike) -> Array:
-    """Rotation matrices (..., 3, 3), determinant +1, nearest to any matrices in the Frobenius norm (SVD)."""
+    """Nearest rotation matrices (..., 3, 3), determinant +1, to any matrices in the Frobenius norm (SVD)."""
     u, _, vt = np.linalg.svd(np.asarray(m, float))
     u[..., :, -1] *= np.sign(np.linalg.det(u @ vt))[..., None]
     return u @ vt
 
 
 def minimal_rotation(a: ArrayLike, b: ArrayLike) -> Array:
-    """Rotation matrices (..., 3, 3) with the smallest angle that turn directions a (..., 3) to b.
+    """Rotation matrices (..., 3, 3) with the smallest angle that rotate directions a (..., 3) to b.
 
     Raises:
-        ValueError: a and b point in opposite directions, where the smallest turn is not unique.
+        ValueError: a and b point in opposite directions, so that the smallest rotation is not unique.
     """
     a, b = _unit(np.asarray(a, float)), _unit(np.asarray(b, float))
     w = 1.0 + np.sum(a * b, axis=-1, keepdims=True)
@@ -259,7 +258,7 @@ def minimal_rotation(a: ArrayLike, b: ArrayLike) -> Array:
 
 
 def cross_matrix(v: ArrayLike) -> Array:
-    """Matrices (..., 3, 3) that turn w into v x w, of vectors (..., 3)."""
+    """Matrices (..., 3, 3) of the map w -> v x w, for vectors v (..., 3)."""
     x, y, z = np.moveaxis(np.asarray(v, float), -1, 0)
     zero = np.zeros_like(x)
     rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
@@ -267,11 +266,11 @@ def cross_matrix(v: ArrayLike) -> Array:
 
 
 def left_jacobian(v: ArrayLike) -> Array:
-    """(..., 3, 3) J with exp(v + d) = exp(J d) exp(v) for small d, of axis-angle vectors v (..., 3)."""
+    """Matrices J (..., 3, 3) with exp(v + d) = exp(J d) exp(v) for small d; axis-angle vectors v (..., 3)."""
     v = np.asarray(v, float)
     square = np.sum(v * v, axis=-1)[..., None, None]
     angle = np.sqrt(square)
-    small = angle < 1e-3  # where the quotients lose digits, three terms of the series are exact
+    small = angle < 1e-3  # the quotients lose digits there; two terms of each series suffice
     safe = np.where(small, 1.0, square)
     a = np.where(small, 0.5 - square / 24.0, (1.0 - np.cos(angle)) / safe)
     b = np.where(small, 1.0 / 6.0 - square / 120.0, (1.0 - np.sinc(angle / np.pi)) / safe)

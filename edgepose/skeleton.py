@@ -1,4 +1,4 @@
-"""The body that is posed: SMPL's 24 joints, a default body from a wearer's height, forward kinematics.
+"""The body model: SMPL's 24 joints, a default body from a wearer's height, forward kinematics.
 
 Body frame T is SMPL's: X to the wearer's left, Y up, Z forward. In the zero pose (T-pose) every bone frame
 equals T.
@@ -27,19 +27,19 @@ JOINTS = (
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
 
 PREDICTED = (1, 2, 3, 4, 5, 6, 9, 12, 13, 14, 15, 16, 17, 18, 19)
-"""Joints that a network predicts (DIP 3.4); feet, toes, wrists, hands stay at rest, joint 0 is measured."""
+"""Joints predicted by the network (DIP 3.4); joint 0 is measured, feet, toes, wrists, hands are at rest."""
 
 UNOBSERVED = (1, 2, 3, 6, 9, 12, 13, 14, 16, 17)
-"""Predicted joints whose bones carry no sensor."""
+"""Predicted joints whose segments carry no sensor."""
 
 
 def forward_kinematics(
     local: ArrayLike, offsets: ArrayLike, translation: ArrayLike | None = None
 ) -> tuple[Array, Array]:
-    """Global joint rotations and positions of a posed body.
+    """Compute the global joint rotations and positions of a posed body.
 
     Args:
-        local: (..., 24, 3, 3) rotation of each joint against its parent; joint 0 against the body frame T.
+        local: (..., 24, 3, 3) rotation of each joint relative to its parent; joint 0 relative to T.
         offsets: (24, 3) joint position minus its parent's in the zero pose, metres; row 0 the pelvis itself.
         translation: (..., 3) added to all positions, metres.
 
@@ -58,7 +58,7 @@ def forward_kinematics(
 
 
 def local_from_global(rotations: ArrayLike) -> Array:
-    """Local rotations (..., 24, 3, 3) of global ones: undoes the rotations of `forward_kinematics`."""
+    """Return the local rotations (..., 24, 3, 3) for global ones: the inverse of `forward_kinematics`."""
     rotations = np.asarray(rotations, float)
     local = np.swapaxes(rotations[..., list(PARENTS), :, :], -1, -2) @ rotations
     local[..., 0, :, :] = rotations[..., 0, :, :]
@@ -66,7 +66,7 @@ def local_from_global(rotations: ArrayLike) -> Array:
 
 
 def standing_pelvis_position(offsets: ArrayLike) -> Array:
-    """Place of the pelvis (3,) above the ground of someone who stands straight, metres; offsets (24, 3)."""
+    """Return the pelvis position (3,) above ground of a body standing straight, metres; offsets (24, 3)."""
     _, joints = forward_kinematics(np.tile(np.eye(3), (len(JOINTS), 1, 1)), offsets)
     return np.array([0.0, joints[0, 1] - joints[:, 1].min(), 0.0])
 
@@ -74,7 +74,7 @@ def standing_pelvis_position(offsets: ArrayLike) -> Array:
 # --- the default body ------------------------------------------------------------------------------------
 
 MIN_HEIGHT, MAX_HEIGHT = 0.8, 2.5
-"""Statures, metres, that `default_body` believes; others are slips, mostly centimetres given for metres."""
+"""Range of statures that `default_body` accepts, metres; others are mistakes, mostly centimetres."""
 
 
 class Body(NamedTuple):
@@ -83,7 +83,7 @@ class Body(NamedTuple):
     offsets: Array
     """(24, 3) joint position minus its parent's in the zero pose, axes of T; row 0, the pelvis, is zero."""
     sensors: Array
-    """(6, 3) sensor position minus the carrying joint's, in that bone's frame, in the order of PLACEMENTS."""
+    """(6, 3) sensor position minus the segment's joint's, in the segment's frame, in order of PLACEMENTS."""
     height_m: float
     """Stature, crown to sole, metres."""
 
@@ -96,12 +96,12 @@ def _table() -> dict[str, Any]:
 
 
 def default_body(height_m: float = 1.75, sex: str = "neutral") -> Body:
-    """An average body of a stature in metres; `sex` is "neutral", "male" or "female".
+    """Return an average body for a stature in metres; `sex` is "neutral", "male" or "female".
 
-    Linear between the statures of `body.json`, scaled in proportion beyond them.
+    Interpolated linearly between the statures of `body.json`, scaled in proportion beyond them.
 
     Raises:
-        EdgeposeError: a stature that no wearer has, or an unknown sex.
+        EdgeposeError: an impossible stature, or an unknown sex.
     """
     table = _table()
     if sex not in table["sexes"]:
@@ -112,13 +112,13 @@ def default_body(height_m: float = 1.75, sex: str = "neutral") -> Body:
             f"height {height_m:g} m is not between {limits}: give the wearer's height in metres"
         )
     statures = np.array(table["statures"], float)
-    inside = float(np.clip(height_m, statures[0], statures[-1]))
-    i = int(np.clip(np.searchsorted(statures, inside) - 1, 0, len(statures) - 2))
-    t = (inside - statures[i]) / (statures[i + 1] - statures[i])
+    clipped_m = float(np.clip(height_m, statures[0], statures[-1]))
+    i = int(np.clip(np.searchsorted(statures, clipped_m) - 1, 0, len(statures) - 2))
+    t = (clipped_m - statures[i]) / (statures[i + 1] - statures[i])
 
     def at(rows: Any) -> Array:
         low, high = np.array(rows[i], float), np.array(rows[i + 1], float)
-        blend: Array = ((1 - t) * low + t * high) * (height_m / inside)
+        blend: Array = ((1 - t) * low + t * high) * (height_m / clipped_m)
         return blend
 
     body = table["sexes"][sex]

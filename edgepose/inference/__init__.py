@@ -1,1 +1,1 @@
-"""From calibrated frames to poses: features, model archives and the engines that run them."""
+"""Pose estimation from calibrated frames: features, model archives and the engines that run them."""

@@ -1,8 +1,8 @@
-"""Model archives: find, check and describe them without running anything; load them once they are trusted.
+"""Model archives: finding, checking and describing them without running code, loading them once trusted.
 
-An archive is a TorchScript file, and loading one runs the code in it. So a file is loaded only when its
-SHA-256 sum is known: from `SHA256SUMS` beside the shipped archives, or from the user's own list, or when the
-user says so for this once.
+An archive is a TorchScript file, and loading it runs the code in it. So a file is loaded only if its SHA-256
+checksum is listed in `SHA256SUMS` next to the bundled archives or in the user's own list, or if the user
+trusts it explicitly for this once.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ _MOST_FRAMES = 1000
 
 
 class ArchiveInfo(NamedTuple):
-    """What is known of an archive before it is loaded.
+    """Information about an archive, available before it is loaded.
 
     Attributes:
-        path: of the file.
-        sha256: its sum, hexadecimal.
-        trusted: the sum is that of a shipped archive or on the user's own list.
+        path: the file.
+        sha256: its checksum, hexadecimal.
+        trusted: the checksum is that of a bundled archive or on the user's own list.
         metadata: the archive's own JSON description.
     """
 
@@ -50,20 +50,20 @@ class ArchiveInfo(NamedTuple):
 
 
 def _settings() -> str:
-    """The folder of the user's settings; with "~" in front where the user has no home."""
+    """Return the folder of the user's settings; it starts with "~" if the user has no home folder."""
     return os.path.expanduser(os.environ.get("XDG_CONFIG_HOME") or "~/.config")  # noqa: PTH111 - never raises
 
 
 def has_home() -> bool:
-    """Whether the user can have a list of trusted sums; under any number in a container, maybe not."""
+    """Whether the user has a home folder for a list of trusted checksums; some users in containers do not."""
     return not _settings().startswith("~")
 
 
 def trust_file() -> Path:
-    """The user's own list of trusted sums, in the format of `sha256sum`.
+    """Return the path of the user's own list of trusted checksums, in the format of `sha256sum`.
 
     Raises:
-        ModelError: the user has no home.
+        ModelError: the user has no home folder.
     """
     if not has_home():
         raise ModelError("you have no home folder for a list of trusted archives: set XDG_CONFIG_HOME")
@@ -71,12 +71,12 @@ def trust_file() -> Path:
 
 
 def bundled_archives() -> list[Path]:
-    """Archives that come with the package, those trained on everything first."""
+    """Return the archives that come with the package, those trained on all data first."""
     return sorted(MODELS.glob("*.pt"), key=lambda path: ("-" in path.stem, path.stem))
 
 
 def find_archive(name: str) -> Path:
-    """The shipped archive of that name, or the file at that path.
+    """Return the path of the bundled archive of that name, or of the file at that path.
 
     Raises:
         ModelError: there is neither.
@@ -87,10 +87,10 @@ def find_archive(name: str) -> Path:
     if Path(name).is_file():
         return Path(name)
     names = ", ".join(path.stem for path in bundled_archives()) or "none"
-    raise ModelError(f"{name}: no such model; shipped are {names}, anything else is the path of an archive")
+    raise ModelError(f"{name}: no such model; give one of {names}, or the path of an archive")
 
 
-def _sums(path: Path) -> set[str]:
+def _read_checksums(path: Path) -> set[str]:
     try:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
         return {line.split()[0].lower() for line in lines if line.strip()}
@@ -101,10 +101,10 @@ def _sums(path: Path) -> set[str]:
 
 
 def read_info(path: Path) -> ArchiveInfo:
-    """Reads an archive's metadata and sum; runs nothing of it.
+    """Read an archive's metadata and checksum, without running any of its code.
 
     Raises:
-        ModelError: not an archive of edgepose, damaged, or of a newer format.
+        ModelError: the file is not an edgepose archive, is damaged, or has a newer format.
     """
     try:
         content = path.read_bytes()
@@ -122,18 +122,18 @@ def read_info(path: Path) -> ArchiveInfo:
         ) from error
     except OSError as error:
         raise ModelError(f"{path}: {error.strerror or error}") from error
-    # zipfile gives RuntimeError for passwords, NotImplementedError for odd compression, json RecursionError.
+    # RuntimeError covers zipfile's for passwords and unknown compression, and json's RecursionError.
     except (ValueError, RuntimeError, zlib.error) as error:
         raise ModelError(f"{path}: the archive's metadata cannot be read ({error})") from error
-    _check(path, metadata)
+    _check_metadata(path, metadata)
     sha256 = hashlib.sha256(content).hexdigest()
-    known = _sums(MODELS / "SHA256SUMS")
+    trusted = _read_checksums(MODELS / "SHA256SUMS")
     if has_home():
-        known |= _sums(trust_file())
-    return ArchiveInfo(path, sha256, sha256 in known, metadata)
+        trusted |= _read_checksums(trust_file())
+    return ArchiveInfo(path, sha256, sha256 in trusted, metadata)
 
 
-def _check(path: Path, metadata: Any) -> None:
+def _check_metadata(path: Path, metadata: Any) -> None:
     if not isinstance(metadata, dict) or not isinstance(metadata.get("format"), int):
         raise ModelError(f"{path}: the archive's metadata is not what edgepose export writes")
     if metadata["format"] > FORMAT:
@@ -150,24 +150,24 @@ def _check(path: Path, metadata: Any) -> None:
     for name in ("past", "future"):
         frames = metadata.get(name)
         if type(frames) is not int or not 0 <= frames <= _MOST_FRAMES:
-            raise ModelError(f"{path}: the archive's number of {name} frames {frames!r} is not a number")
+            raise ModelError(f"{path}: the archive's number of {name} frames {frames!r} is not valid")
 
 
 def load(info: ArchiveInfo, trust: bool = False) -> torch.jit.ScriptModule:
-    """Loads a trusted archive for the CPU, ready to run on one thread.
+    """Load a trusted archive for the CPU, ready to run on one thread.
 
     Args:
-        info: from `read_info`.
-        trust: the user vouches for the file.
+        info: the archive, from `read_info`.
+        trust: load the archive although its checksum is unknown.
 
     Raises:
-        ModelError: the sum is not known and the user does not vouch, or torch cannot load the file.
+        ModelError: the archive is not trusted, or torch cannot load it.
     """
     if not (info.trusted or trust):
         raise ModelError(
-            f"{info.path}: loading a model archive runs its code, and this one's SHA-256 sum "
-            f"{info.sha256[:16]}... is not known; if you made it or know who did, run with --trust, or once: "
-            "edgepose models --trust PATH"
+            f"{info.path}: loading a model archive runs its code, and this one's SHA-256 checksum "
+            f"{info.sha256[:16]}... is not known; if you made it or trust its author, run with --trust, or "
+            "once: edgepose models --trust PATH"
         )
     import torch
 
@@ -189,17 +189,17 @@ def load(info: ArchiveInfo, trust: bool = False) -> torch.jit.ScriptModule:
 
 
 def trust(path: Path) -> ArchiveInfo:
-    """Adds an archive's sum to the user's own list.
+    """Add an archive's checksum to the user's own list.
 
     Raises:
-        ModelError: not an archive, or the list cannot be written.
+        ModelError: the file is not an archive, or the list cannot be written.
     """
     info = read_info(path)
     if not info.trusted:
         try:
             trust_file().parent.mkdir(parents=True, exist_ok=True)
             with trust_file().open("a") as file:
-                # The line break in front is for a list that was edited and does not end in one.
+                # The leading line break is for a list that was edited and does not end in one.
                 file.write(f"\n{info.sha256}  {' '.join(path.name.split())}\n")
         except OSError as error:
             raise ModelError(f"{trust_file()}: {error.strerror}") from error

@@ -1,7 +1,7 @@
-"""Runs a model archive frame by frame: window, stream or step (DIP 3.4, 5.1.3, 5.1.4).
+"""Engines that run a model archive frame by frame: windowed, streaming or batched (DIP 3.4, 5.1.3, 5.1.4).
 
-Every frame that goes in comes out, in order: the first ones seen with the past that there is, the last ones,
-at `finish`, with the future that there is.
+There is one pose for every frame, in order. The first frames are processed with the past available so far,
+the last ones, at `finish`, with the future that is left.
 """
 
 from __future__ import annotations
@@ -18,19 +18,17 @@ Array = NDArray[np.float32]
 Input = NDArray[np.floating[Any]]
 
 WARM_UP = 5
-"""Frames run through a module before the first real one; TorchScript compiles and specialises during its
-first calls.
-"""
+"""Frames run through a module before the first real one: TorchScript compiles in its first calls."""
 
 
 class EngineOutput(NamedTuple):
     """The pose of one frame.
 
     Attributes:
-        tag: what `push` was given with that frame.
-        rotations: (24, 3, 3) local rotations, joint 0 against T.
+        frame: the `tag` passed to `push` with that frame.
+        rotations: (24, 3, 3) local rotations, joint 0 relative to T.
         std: (24,) standard deviations, radians.
-        filling: fewer frames have been seen than the network's past asks for.
+        warming_up: fewer frames have been seen than the network's past needs.
     """
 
     frame: Any
@@ -40,7 +38,7 @@ class EngineOutput(NamedTuple):
 
 
 class EngineInput(NamedTuple):
-    """What goes into an engine: the arguments of `Engine.push`."""
+    """The arguments of `Engine.push` for one frame."""
 
     frame: Any
     orientation: Input
@@ -48,22 +46,26 @@ class EngineInput(NamedTuple):
 
 
 class Engine(Protocol):
-    """What `WindowEngine` and `StreamEngine` are."""
+    """The interface of engines for one wearer, such as `WindowEngine` and `StreamEngine`."""
 
     def push(self, tag: Any, orientation: Input, acceleration: Input) -> list[EngineOutput]:
-        """Takes a frame ((6, 3, 3) R_TB, (6, 3) m/s^2 in T without gravity) and gives the poses that are
-        due.
+        """Process a frame, and return the poses that are ready.
+
+        Args:
+            tag: returned with the frame's pose.
+            orientation: (6, 3, 3) R_TB.
+            acceleration: (6, 3) accelerations in T without gravity, m/s^2.
         """
 
     def finish(self) -> list[EngineOutput]:
-        """Gives the poses of the frames that still wait for their future."""
+        """Return the poses of the frames that still wait for their future."""
 
 
 class WindowEngine:
-    """For each frame the network runs over `past` frames before it, itself and `future` frames after it."""
+    """Runs the network for each frame over `past` frames before it, itself and `future` frames after it."""
 
     def __init__(self, module: torch.jit.ScriptModule, past: int, future: int) -> None:
-        """Warms the module up; past and future are numbers of frames, 0 or more."""
+        """Warm the module up; past and future are numbers of frames, 0 or more."""
         self._module, self._past, self._future = module, past, future
         self._tags: deque[Any] = deque()
         self._seen = 0
@@ -92,7 +94,7 @@ class WindowEngine:
         return [self._oldest(future) for future in range(len(self._tags) - 1, -1, -1)]
 
     def _oldest(self, future: int) -> EngineOutput:
-        """Pose of the oldest frame that has no pose yet, `future` frames behind the newest."""
+        """Return the pose of the oldest frame without one, `future` frames behind the newest."""
         length = self._orientation.shape[1]
         index = length - 1 - future
         first = max(0, index - self._past)
@@ -104,7 +106,7 @@ class WindowEngine:
 
 
 class _StreamState:
-    """The stream of one wearer: its state, and what waits for a pose."""
+    """One wearer's network state, and the tags of the frames that wait for poses."""
 
     def __init__(self, state: list[torch.Tensor]) -> None:
         self.state = state
@@ -112,7 +114,7 @@ class _StreamState:
         self.done = 0
 
     def outputs(self, rotations: Array, std: Array, past: int) -> list[EngineOutput]:
-        """The next poses of this wearer, (T, 24, 3, 3) and (T, 24)."""
+        """Return the wearer's next poses, from rotations (T, 24, 3, 3) and deviations (T, 24)."""
         outputs = []
         for pose, deviation in zip(rotations, std, strict=True):
             outputs.append(EngineOutput(self.tags.popleft(), pose, deviation, self.done < past))
@@ -121,34 +123,34 @@ class _StreamState:
 
 
 class StreamEngine:
-    """Each frame once, with carried state; `future` is 0 for a unidirectional network."""
+    """Runs the network on each frame once, carrying its state; `future` is 0 for a unidirectional network."""
 
     def __init__(
         self, module: torch.jit.ScriptModule, past: int, future: int, frames_per_step: int = 1
     ) -> None:
-        """Warms the module up.
+        """Warm the module up.
 
         Args:
-            module: an archive.
-            past: as many first poses are marked as filling.
-            future: frames that a pose waits for.
-            frames_per_step: frames that are gathered and run at once, where nobody waits for poses.
+            module: a loaded archive.
+            past: number of first poses that are marked as `warming_up`.
+            future: number of frames that a pose waits for.
+            frames_per_step: number of frames run at once, if poses need not come frame by frame.
         """
-        self._module, self._past, self._together = module, past, frames_per_step
+        self._module, self._past, self._frames_per_step = module, past, frames_per_step
         self._frames: list[tuple[torch.Tensor, torch.Tensor]] = []
         with torch.inference_mode():
-            self._row = _StreamState(module.start(1, future))
-            still = (torch.eye(3).expand(6, 3, 3), torch.zeros(6, 3))
+            self._stream = _StreamState(module.start(1, future))
+            at_rest = (torch.eye(3).expand(6, 3, 3), torch.zeros(6, 3))
             for _ in range(WARM_UP + future):
-                self._frames = [still] * frames_per_step
+                self._frames = [at_rest] * frames_per_step
                 self._run()
-            self._row = _StreamState(module.start(1, future))
+            self._stream = _StreamState(module.start(1, future))
 
     def push(self, tag: Any, orientation: Input, acceleration: Input) -> list[EngineOutput]:
-        """See `Engine.push`; with several frames together, the poses of all of them at once."""
-        self._row.tags.append(tag)
+        """See `Engine.push`; with several frames per step, their poses come all at once."""
+        self._stream.tags.append(tag)
         self._frames.append((_tensor(orientation), _tensor(acceleration)))
-        if len(self._frames) < self._together:
+        if len(self._frames) < self._frames_per_step:
             return []
         with torch.inference_mode():
             return self._outputs(*self._run())
@@ -157,33 +159,33 @@ class StreamEngine:
         """See `Engine.finish`."""
         with torch.inference_mode():
             outputs = self._outputs(*self._run()) if self._frames else []
-            return outputs + self._outputs(*self._module.drain(self._row.state))
+            return outputs + self._outputs(*self._module.drain(self._stream.state))
 
     def _run(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Poses that are due after the gathered frames."""
+        """Run the network on the collected frames; return the poses that are ready."""
         frames, self._frames = self._frames, []
         if len(frames) == 1:
             orientation, acceleration = frames[0]
-            rotations, std, self._row.state = self._module.stream(
-                orientation[None], acceleration[None], self._row.state
+            rotations, std, self._stream.state = self._module.stream(
+                orientation[None], acceleration[None], self._stream.state
             )
         else:
             orientations, accelerations = (torch.stack(column)[None] for column in zip(*frames, strict=True))
-            rotations, std, self._row.state = self._module.stream_many(
-                orientations, accelerations, self._row.state
+            rotations, std, self._stream.state = self._module.stream_many(
+                orientations, accelerations, self._stream.state
             )
         return rotations, std
 
     def _outputs(self, rotations: torch.Tensor, std: torch.Tensor) -> list[EngineOutput]:
-        return self._row.outputs(rotations[0].numpy(), std[0].numpy(), self._past)
+        return self._stream.outputs(rotations[0].numpy(), std[0].numpy(), self._past)
 
 
 class MultiWearerEngine:
-    """`StreamEngine` for any number of wearers: those that have a frame take their step together.
+    """A `StreamEngine` for any number of wearers, which batches the wearers that have a frame.
 
-    Each wearer has a state of its own and gets the poses that it would get alone, whenever the others begin,
-    pause or end. A step is one pass of the network for all whose states have one shape; only those of which
-    too few frames have come for their first pose have another.
+    Each wearer has a separate state and gets the same poses as alone, no matter when the others begin, pause
+    or end. One pass of the network serves all wearers whose states have the same shape; only wearers with too
+    few frames for a first pose have a different one.
     """
 
     def __init__(
@@ -194,70 +196,70 @@ class MultiWearerEngine:
         wearers: int,
         isolate_wearers: bool = False,
     ) -> None:
-        """Warms the module up.
+        """Warm the module up.
 
         Args:
-            module: an archive.
-            past: as many first poses of each wearer are marked as filling.
-            future: frames that a pose waits for.
-            wearers: how many there are; they are called 0, 1, 2 and so on.
-            isolate_wearers: run the network once for each wearer, where batching would change results.
+            module: a loaded archive.
+            past: number of each wearer's first poses that are marked as `warming_up`.
+            future: number of frames that a pose waits for.
+            wearers: number of wearers; they are numbered from 0.
+            isolate_wearers: run the network once per wearer, for models whose results batching would change.
         """
-        self._module, self._past, self._apart = module, past, isolate_wearers
+        self._module, self._past, self._isolate = module, past, isolate_wearers
         with torch.inference_mode():
-            # Which tensors of a state have a row for each wearer; the others are the same for all.
+            # Whether each tensor of a state has a row per wearer; the others are the same for all.
             self._has_rows = [
                 one.shape != two.shape
                 for one, two in zip(module.start(1, future), module.start(2, future), strict=True)
             ]
-            still = EngineInput(None, np.tile(np.eye(3), (6, 1, 1)), np.zeros((6, 3)))
+            at_rest = EngineInput(None, np.tile(np.eye(3), (6, 1, 1)), np.zeros((6, 3)))
             for count in {1, wearers}:
-                self._rows = [_StreamState(module.start(1, future)) for _ in range(count)]
+                self._streams = [_StreamState(module.start(1, future)) for _ in range(count)]
                 for _ in range(WARM_UP + future):
-                    self.push(dict.fromkeys(range(count), still))
-            self._rows = [_StreamState(module.start(1, future)) for _ in range(wearers)]
+                    self.push(dict.fromkeys(range(count), at_rest))
+            self._streams = [_StreamState(module.start(1, future)) for _ in range(wearers)]
 
-    def push(self, bodies: Mapping[int, EngineInput]) -> dict[int, list[EngineOutput]]:
-        """Takes the next frame of some wearers and gives the poses that are due, by wearer."""
+    def push(self, inputs: Mapping[int, EngineInput]) -> dict[int, list[EngineOutput]]:
+        """Process the next frame of some wearers; return the poses that are ready, by wearer."""
         groups: defaultdict[Any, list[int]] = defaultdict(list)
-        for wearer, body in bodies.items():
-            row = self._rows[wearer]
-            row.tags.append(body.frame)
-            shapes = tuple(tensor.shape for tensor in row.state)
-            groups[(wearer, *shapes) if self._apart else shapes].append(wearer)
+        for wearer, engine_input in inputs.items():
+            stream = self._streams[wearer]
+            stream.tags.append(engine_input.frame)
+            shapes = tuple(tensor.shape for tensor in stream.state)
+            groups[(wearer, *shapes) if self._isolate else shapes].append(wearer)
         outputs = {}
         with torch.inference_mode():
             for wearers in groups.values():
-                outputs.update(self._step(wearers, bodies))
+                outputs.update(self._step(wearers, inputs))
         return outputs
 
     def finish(self, wearer: int) -> list[EngineOutput]:
-        """Gives the poses of a wearer's frames that still wait for their future."""
-        row = self._rows[wearer]
+        """Return the poses of a wearer's frames that still wait for their future."""
+        stream = self._streams[wearer]
         with torch.inference_mode():
-            rotations, std = self._module.drain(row.state)
-        return row.outputs(rotations[0].numpy(), std[0].numpy(), self._past)
+            rotations, std = self._module.drain(stream.state)
+        return stream.outputs(rotations[0].numpy(), std[0].numpy(), self._past)
 
-    def _step(self, wearers: list[int], bodies: Mapping[int, EngineInput]) -> dict[int, list[EngineOutput]]:
-        """Poses after one pass for wearers whose states have one shape."""
-        rows = [self._rows[wearer] for wearer in wearers]
-        orientation = _tensor(np.array([bodies[wearer].orientation for wearer in wearers]))
-        acceleration = _tensor(np.array([bodies[wearer].acceleration for wearer in wearers]))
+    def _step(self, wearers: list[int], inputs: Mapping[int, EngineInput]) -> dict[int, list[EngineOutput]]:
+        """Run one pass for wearers whose states have the same shape; return their poses."""
+        streams = [self._streams[wearer] for wearer in wearers]
+        orientation = _tensor(np.array([inputs[wearer].orientation for wearer in wearers]))
+        acceleration = _tensor(np.array([inputs[wearer].acceleration for wearer in wearers]))
         state = [
             torch.cat(column) if has_rows else column[0]
             for column, has_rows in zip(
-                zip(*(row.state for row in rows), strict=True), self._has_rows, strict=True
+                zip(*(stream.state for stream in streams), strict=True), self._has_rows, strict=True
             )
         ]
         rotations, std, state = self._module.stream(orientation, acceleration, state)
         columns = [
-            tensor.split(1) if has_rows else [tensor] * len(rows)
+            tensor.split(1) if has_rows else [tensor] * len(streams)
             for tensor, has_rows in zip(state, self._has_rows, strict=True)
         ]
         poses, deviations, outputs = rotations.numpy(), std.numpy(), {}
-        for i, (wearer, row) in enumerate(zip(wearers, rows, strict=True)):
-            row.state = [column[i] for column in columns]
-            outputs[wearer] = row.outputs(poses[i], deviations[i], self._past)
+        for i, (wearer, stream) in enumerate(zip(wearers, streams, strict=True)):
+            stream.state = [column[i] for column in columns]
+            outputs[wearer] = stream.outputs(poses[i], deviations[i], self._past)
         return outputs
 
 

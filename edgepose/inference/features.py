@@ -1,8 +1,7 @@
-"""What a network is given and how its answer becomes a pose, in torch: one implementation for training and
-inside the archives.
+"""Network inputs, and poses from network outputs, in torch: one implementation for training and archives.
 
-All functions are scriptable and take any leading dimensions. Frames and names: T is the body frame, R_TB a
-bone's orientation in it, "root" the pelvis sensor.
+All functions are scriptable and take any leading dimensions. T is the body frame, R_TB a segment's
+orientation in it, and "root" the pelvis sensor.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from torch import Tensor
 from edgepose.placements import PLACEMENTS, ROOT
 
 INPUTS = 60
-"""Numbers a frame: five rotation matrices, then five accelerations."""
+"""Inputs per frame: five rotation matrices, then five accelerations."""
 
 ACCELERATIONS = 15
 
@@ -22,10 +21,10 @@ assert len(PLACEMENTS) - 1 == ROOT
 
 
 def root_relative(orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
-    """The five limb and head sensors seen from the root (DIP eq. 9 and 10).
+    """Orientations and accelerations of the limb and head sensors relative to the root (DIP eq. 9 and 10).
 
     Args:
-        orientation: (..., 6, 3, 3) bone orientations R_TB in the order of PLACEMENTS.
+        orientation: (..., 6, 3, 3) segment orientations R_TB in the order of PLACEMENTS.
         acceleration: (..., 6, 3) accelerations without gravity in T, m/s^2.
 
     Returns:
@@ -38,18 +37,18 @@ def root_relative(orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Te
 
 
 def network_input(orientation: Tensor, acceleration: Tensor) -> Tensor:
-    """The vector x_t (..., 60) of DIP 4.3: five row-major matrices, then five accelerations; not yet
-    z-scored.
+    """The vector x_t (..., 60) of DIP 4.3: five row-major matrices, five accelerations, not z-scored.
 
-    Shapes and frames of the arguments are those of `root_relative`.
+    The arguments are those of `root_relative`.
     """
     relative, difference = root_relative(orientation, acceleration)
     return torch.cat([relative.flatten(-3), difference.flatten(-2)], dim=-1)
 
 
 def rotation_from_6d(x: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) whose first two columns are the orthonormalised halves of x (..., 6)
-    (Zhou et al. 2019).
+    """Rotation matrices (..., 3, 3) from 6D vectors x (..., 6) (Zhou et al. 2019).
+
+    The halves of x, orthonormalised, are the first two columns.
     """
     first = torch.nn.functional.normalize(x[..., :3], dim=-1)
     second = x[..., 3:]
@@ -64,7 +63,7 @@ def rotation_to_6d(r: Tensor) -> Tensor:
 
 
 def nearest_rotation(m: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) nearest to any matrices in the Frobenius norm, determinant +1."""
+    """Nearest rotation matrices (..., 3, 3), determinant +1, to any matrices in the Frobenius norm."""
     u, _, vt = torch.linalg.svd(m)
     sign = torch.det(torch.matmul(u, vt)).sign()
     u = torch.cat([u[..., :2], u[..., 2:] * sign[..., None, None]], dim=-1)
@@ -72,11 +71,11 @@ def nearest_rotation(m: Tensor) -> Tensor:
 
 
 def local_rotations(relative: Tensor, root: Tensor, parents: Tensor) -> Tensor:
-    """Local rotations (..., 24, 3, 3) of joint rotations seen from the root.
+    """Local rotations (..., 24, 3, 3) from joint rotations relative to the root.
 
     Args:
         relative: (..., 24, 3, 3) global joint rotations in the root's frame; joint 0 is the identity.
-        root: (..., 3, 3) the root's own orientation R_TB, which becomes joint 0.
+        root: (..., 3, 3) the root's orientation R_TB, which becomes joint 0.
         parents: (23,) parents of the joints 1 to 23.
     """
     above = relative.index_select(-3, parents).transpose(-1, -2)

@@ -1,4 +1,4 @@
-"""A model archive as an object: poses of arrays, without a run around it."""
+"""Models as objects: poses from arrays, without a run."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from edgepose.inference.engine import Engine, StreamEngine
 from edgepose.inference.quantisation import quantise_weights
 
 FRAMES_PER_STEP = 64
-"""Frames of a whole recording that the network computes at once."""
+"""Frames that the network processes at once in a whole recording."""
 
 
 class Model:
-    """A loaded archive.
+    """A loaded model archive.
 
     Attributes:
-        metadata: what the archive says about itself.
-        rate_hz: frames per second that it was trained for.
-        past: frames before the present one of a window, of a bidirectional model.
-        future: frames after the present one that it waits for; 0 of a unidirectional model.
-        precision: of its weights while it runs.
+        metadata: the archive's own description.
+        rate_hz: frame rate for which the model was trained, frames per second.
+        past: frames in a bidirectional model's window before the present one.
+        future: frames after the present one that the model waits for; 0 for a unidirectional model.
+        precision: precision of the weights at run time.
     """
 
     def __init__(self, name: str | Path, *, trust: bool = False, precision: str = "auto") -> None:
         """Load an archive.
 
         Args:
-            name: of a bundled model, or the path of an archive.
-            trust: load it although its checksum is not known: loading an archive runs its code.
-            precision: of the weights, "auto", "f32", "fp16" or "int8".
+            name: name of a bundled model, or path of an archive.
+            trust: load the archive although its checksum is unknown; loading an archive runs its code.
+            precision: precision of the weights, "auto", "f32", "fp16" or "int8".
 
         Raises:
             ModelError: there is no such archive, it is damaged or not trusted, or cannot run here.
@@ -47,25 +47,25 @@ class Model:
         self.precision = quantise_weights(self._module, info, precision)
 
     def engine(self, frames_per_step: int = 1) -> Engine:
-        """What makes poses frame by frame; it has a state of its own.
+        """Return a new engine, which makes poses frame by frame and has its own state.
 
         Args:
-            frames_per_step: frames that are computed together; more than one is faster, and for recordings.
+            frames_per_step: number of frames computed together; more than one is faster, for recordings.
         """
         many = frames_per_step > 1 and self.precision != "int8" and hasattr(self._module, "stream_many")
         return StreamEngine(self._module, self.past, self.future, frames_per_step if many else 1)
 
     def poses(self, orientation: ArrayLike, acceleration: ArrayLike) -> NDArray[np.float32]:
-        """Poses of a whole recording (DIP section 3).
+        """Estimate the poses of a whole recording (DIP section 3).
 
         Args:
-            orientation: (T, 6, 3, 3) rotations of the bones in the body frame, R_TB, in the order of
+            orientation: (T, 6, 3, 3) orientations of the segments in the body frame, R_TB, in the order of
                 `edgepose.PLACEMENTS`, at `rate_hz`.
             acceleration: (T, 6, 3) accelerations in the body frame without gravity, m/s^2.
 
         Returns:
-            (T, 24, 3, 3) rotations of SMPL's joints, each against its parent, the pelvis against the body
-            frame.
+            (T, 24, 3, 3) rotations of SMPL's joints, each relative to its parent, the pelvis relative to the
+            body frame.
 
         Raises:
             ModelError: the arrays have other shapes, or numbers in them are not finite.
@@ -88,5 +88,5 @@ class Model:
 
 
 def load_model(name: str | Path, *, trust: bool = False, precision: str = "auto") -> Model:
-    """A `Model`; see there."""
+    """Load a model archive; see `Model`."""
     return Model(name, trust=trust, precision=precision)

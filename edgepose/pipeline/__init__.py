@@ -1,1 +1,1 @@
-"""The steps of a run joined, for one wearer and for several."""
+"""The chain from a source's samples to the outputs, for one wearer and for several."""

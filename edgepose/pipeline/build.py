@@ -1,4 +1,4 @@
-"""One wearer of a run, from opening its source to its closing summary."""
+"""Setup of one wearer's run, from opening the source to the closing summary."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ if TYPE_CHECKING:
     from edgepose.sinks.base import Sink
 
 Notify = Callable[[str], None]
-"""Takes a line for the user."""
+"""Shows a line to the user."""
 
 
 class OpenWearer:
     """A wearer whose source is open.
 
     Attributes:
-        source: where the samples come from.
-        say: reports something about the wearer.
+        source: the wearer's open source.
+        notify: reports something about the wearer.
     """
 
     def __init__(
@@ -47,20 +47,20 @@ class OpenWearer:
         blocking: bool,
         notify: Notify,
     ) -> None:
-        """Opens the source.
+        """Open the source.
 
         Args:
-            stack: closes what is opened.
-            config: the wearer's.
-            calibration: the wearer's, see `load_wearer_calibration`.
-            by_key: re-zero requests from the keyboard.
+            stack: closes the source and the control socket.
+            config: the wearer's configuration.
+            calibration: the wearer's calibration, see `load_wearer_calibration`.
+            by_key: returns the re-zero requests from the keyboard.
             blocking: see `edgepose.sources.open_source`.
-            notify: takes lines for the user.
+            notify: called with each line for the user.
 
         Raises:
-            EdgeposeError: the source cannot be opened, or a filter or address is not to be had here.
+            EdgeposeError: the source cannot be opened, or the filter or control address is not available.
         """
-        self.notify = _prefixed(config.name, notify)
+        self.notify = _with_name(config.name, notify)
         self._config, self._calibration = config, calibration
         with prefix_errors(config.name):
             self.source = stack.enter_context(open_source(**config.source.arguments(), blocking=blocking))
@@ -69,26 +69,25 @@ class OpenWearer:
         self._sinks: list[Sink] = []
 
     def open_outputs(self, stack: ExitStack, rate: float, stopped: Callable[[], bool]) -> None:
-        """Opens the outputs.
+        """Open the outputs.
 
         Args:
             stack: closes them.
-            rate: poses a second.
+            rate: poses per second.
             stopped: whether the run is to end, see `SinkContext`.
 
         Raises:
-            EdgeposeError: one cannot be written to.
+            EdgeposeError: an output cannot be written to.
         """
         with prefix_errors(self._config.name):
             self._sinks = open_outputs(stack, self._config.outputs, rate, stopped)
 
     def pipeline(self, rate: float, several: bool, on_pose: Callable[[RunSummary], None]) -> WearerPipeline:
-        """From samples to the outputs.
+        """Build the pipeline from samples to outputs.
 
         Args:
-            rate: frames a second.
-            several: live wearers share their ticks: their poses can be compared, and steps of the network are
-                full.
+            rate: frames per second.
+            several: align the ticks of live wearers, so that their poses can be compared and batched.
             on_pose: called after each pose.
         """
         source = self._config.source
@@ -113,20 +112,20 @@ class OpenWearer:
         return other_devices(self._calibration, self.source.devices)
 
     def report(self, pipeline: WearerPipeline, rate: float, future: int) -> EdgeposeError | None:
-        """Says the counts of a finished pipeline; gives what went wrong, if anything did."""
+        """Report the counts of a finished pipeline; return the error that ended it, if any."""
         summary, counts = pipeline.summary, self.source.counters
         speed = summary.poses / summary.seconds if summary.seconds else 0.0
         self.notify(
-            f"poses    {summary.poses} in {summary.seconds:.1f} s, {speed:.1f} a second; "
+            f"poses    {summary.poses} in {summary.seconds:.1f} s, {speed:.1f} per second; "
             f"{summary.warming_up} while the window was filling"
         )
         self.notify(
             f"packets  {counts.packets} good, {counts.lost} lost, {counts.bad} bad; "
-            f"{pipeline.clock.dropped} samples too late or twice"
+            f"{pipeline.clock.dropped} samples too late or duplicate"
         )
         if pipeline.clock.restarts:
             self.notify(
-                f"clock    began anew {pipeline.clock.restarts} times, "
+                f"clock    restarted {pipeline.clock.restarts} times, "
                 "after all sensors were silent for a minute or more"
             )
         if summary.held:
@@ -156,10 +155,10 @@ def _latency(summary: RunSummary, rate: float, future: int) -> str:
 
 
 def load_wearer_calibration(config: WearerConfig, notify: Notify) -> Calibration:
-    """The calibration of a wearer.
+    """Load a wearer's calibration.
 
     Raises:
-        EdgeposeError: it cannot be read, or orientations are not made as they were for it.
+        EdgeposeError: it cannot be read, or was made with another orientation filter than the run's.
     """
     calibration = load_calibration(config.calibration)
     with prefix_errors(config.name):
@@ -168,9 +167,9 @@ def load_wearer_calibration(config: WearerConfig, notify: Notify) -> Calibration
 
 
 def _check_filter(calibration: Calibration, config: WearerConfig, notify: Notify) -> None:
-    """Raises EdgeposeError unless orientations are made as they were for the calibration.
+    """Raise EdgeposeError unless the run's orientation filter is the one that the calibration was made with.
 
-    Not a warning: another filter has other headings, and all poses would be wrong without looking so.
+    This is no mere warning: another filter has other headings, and all poses would be subtly wrong.
     """
     if config.filter != calibration.filter:
         raise CalibrationError(
@@ -183,17 +182,17 @@ def _check_filter(calibration: Calibration, config: WearerConfig, notify: Notify
         )
     made_from = calibration.metadata.get("source")
     if not config.source.live and _restarts_with_filter(calibration) and made_from != config.source.name:
-        _prefixed(config.name, notify)(
+        _with_name(config.name, notify)(
             f"warning: the calibration was made from {made_from}, and headings of a filter without "
-            "magnetometers begin anew in each recording: calibrate from this one"
+            "magnetometers start from scratch in each recording: calibrate from this one"
         )
 
 
 def _restarts_with_filter(calibration: Calibration) -> bool:
-    """Whether a filter without a north has begun anew since the calibration."""
+    """Whether headings start from scratch in each run: a filter runs here, without magnetometers."""
     return calibration.filter != "none" and not calibration.north
 
 
-def _prefixed(name: str, notify: Notify) -> Notify:
-    """Reports with the wearer's name in front, if there is one."""
+def _with_name(name: str, notify: Notify) -> Notify:
+    """Prefix reports with the wearer's name, if there is one."""
     return lambda text: notify(f"{name}: {text}" if name else text)

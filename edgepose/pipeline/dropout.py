@@ -1,9 +1,9 @@
-"""Bones whose sensors are silent: they go on with the rest of the body.
+"""Extrapolation of segments whose sensors dropped out: they move along with the rest of the body.
 
-A bone that kept its orientation in the room would turn against a wearer who turns. So it keeps the attitude
-in which it last stood to the pelvis; a lower leg, which does not lean when the wearer bends, only follows the
-pelvis' heading. A silent pelvis turns with the lower legs, whose turns add up to its own. What that is worth:
-`tools/bench_robustness.py`.
+If a segment kept its orientation in the room, it would rotate against the body of a wearer who turns. Instead
+it keeps its last orientation relative to the pelvis. A lower leg, which does not lean when the wearer bends
+over, only follows the pelvis' heading. A silent pelvis follows the mean heading of the lower legs.
+`tools/bench_robustness.py` measures the benefit.
 """
 
 from __future__ import annotations
@@ -22,35 +22,37 @@ _LOWER_LEGS = np.array([name.endswith("lower_leg") for name in PLACEMENTS])
 def extrapolate_dropouts(
     orientation: Array, acceleration: Array, held: NDArray[np.bool_], before: Array | None
 ) -> tuple[Array, Array]:
-    """Bones with those of silent sensors moved along.
+    """Extrapolate the orientations and accelerations of segments whose sensors are silent.
 
     Args:
-        orientation: (6, 3, 3) R_TB, of silent sensors the last that was measured.
+        orientation: (6, 3, 3) R_TB; for silent sensors the last measured one.
         acceleration: (6, 3) a_T, m/s^2.
         held: (6,) which sensors are silent.
-        before: (6, 3, 3) what this gave for the frame before; None for the first.
+        before: (6, 3, 3) the orientations returned for the previous frame; None for the first.
 
     Returns:
-        The same shapes; a silent pelvis does not accelerate, other silent bones do as the pelvis does.
+        Orientations and accelerations of the same shapes. A silent pelvis has zero acceleration, other silent
+        segments that of the pelvis.
     """
     if before is None or not held.any():
         return orientation, acceleration
     orientation, acceleration = orientation.copy(), acceleration.copy()
     if held[ROOT]:
         legs = _LOWER_LEGS & ~held
-        turns = _turns(before[legs], orientation[legs])
-        orientation[ROOT] = rotation_about_axis("y", turns.mean() if legs.any() else 0.0) @ before[ROOT]
+        changes = _heading_changes(before[legs], orientation[legs])
+        orientation[ROOT] = rotation_about_axis("y", changes.mean() if legs.any() else 0.0) @ before[ROOT]
         acceleration[ROOT] = 0.0
-    turn = orientation[ROOT] @ before[ROOT].T
+    pelvis_rotation = orientation[ROOT] @ before[ROOT].T
     others = held & (np.arange(len(held)) != ROOT)
     legs = others & _LOWER_LEGS
-    orientation[others] = turn @ before[others]
-    orientation[legs] = rotation_about_axis("y", _turns(before[ROOT], orientation[ROOT])) @ before[legs]
+    orientation[others] = pelvis_rotation @ before[others]
+    pelvis_heading_change = _heading_changes(before[ROOT], orientation[ROOT])
+    orientation[legs] = rotation_about_axis("y", pelvis_heading_change) @ before[legs]
     acceleration[others] = acceleration[ROOT]
     return orientation, acceleration
 
 
-def _turns(before: Array, now: Array) -> Array:
-    """How far headings of (..., 3, 3) turned, (...) from -pi to pi."""
-    turns: Array = (yaw_of_matrix(now) - yaw_of_matrix(before) + np.pi) % (2.0 * np.pi) - np.pi
-    return turns
+def _heading_changes(before: Array, now: Array) -> Array:
+    """Return the changes of heading (...), from -pi to pi, between orientations (..., 3, 3)."""
+    changes: Array = (yaw_of_matrix(now) - yaw_of_matrix(before) + np.pi) % (2.0 * np.pi) - np.pi
+    return changes

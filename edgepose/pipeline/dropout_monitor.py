@@ -1,4 +1,4 @@
-"""Tells when a sensor falls silent during a run, and when it is back."""
+"""Messages about sensors that drop out during a run, and come back."""
 
 from __future__ import annotations
 
@@ -8,40 +8,40 @@ from edgepose.imu import ImuFrame
 from edgepose.placements import PLACEMENTS
 
 SILENT_S = 1.0
-"""How long a sensor is held before it is told; shorter losses are counted only."""
+"""Time a sensor is held before it is reported, seconds; shorter dropouts are only counted."""
 
 QUIET_S = 30.0
-"""Least time between two losses of one sensor that are told, seconds: a loose plug comes and goes."""
+"""Least time between two reports about one sensor, seconds: a loose plug would cause a flood of them."""
 
 
 class DropoutMonitor:
-    """Watches frames."""
+    """Watches the frames of a run for sensors that are held."""
 
     def __init__(self) -> None:
-        """Nothing is silent."""
+        """Start with all sensors live."""
         self._since_s: list[float | None] = [None] * len(PLACEMENTS)
-        self._told_s = [-inf] * len(PLACEMENTS)
-        self._is_told = [False] * len(PLACEMENTS)
+        self._reported_s = [-inf] * len(PLACEMENTS)
+        self._is_reported = [False] * len(PLACEMENTS)
 
     def update(self, frame: ImuFrame) -> list[str]:
-        """What there is to tell of a frame: one line for each sensor that is lost or back."""
+        """Return one message per sensor that dropped out or came back."""
         lines = []
         for i, (name, held) in enumerate(zip(PLACEMENTS, frame.held.tolist(), strict=True)):
             since_s = self._since_s[i]
             if not held:
-                if self._is_told[i] and since_s is not None:
+                if self._is_reported[i] and since_s is not None:
                     lines.append(f"{name}: back after {frame.time_s - since_s:.1f} s")
-                self._since_s[i], self._is_told[i] = None, False
+                self._since_s[i], self._is_reported[i] = None, False
             elif since_s is None:
                 self._since_s[i] = frame.time_s
             elif (
                 frame.time_s - since_s >= SILENT_S
-                and not self._is_told[i]
-                and frame.time_s - self._told_s[i] >= QUIET_S
+                and not self._is_reported[i]
+                and frame.time_s - self._reported_s[i] >= QUIET_S
             ):
-                self._is_told[i], self._told_s[i] = True, frame.time_s
+                self._is_reported[i], self._reported_s[i] = True, frame.time_s
                 lines.append(
-                    f"{name}: nothing for {frame.time_s - since_s:.0f} s; its last values are repeated: "
-                    "check its power and link"
+                    f"{name}: no data for {frame.time_s - since_s:.0f} s; its last values are repeated: "
+                    "check its power and connection"
                 )
         return lines

@@ -1,7 +1,7 @@
-"""Samples of six sensors, each at its own rate, to frames at one fixed rate.
+"""Resampling of six sensors, each at its own rate, to frames at one fixed rate.
 
-Every tick is judged by the samples' own times, so a recording gives the same frames whether it is read at
-once or bit by bit. Plain floats on purpose: at six sensors of 100 Hz and more, numpy on four numbers at a
+Frames depend only on the samples' own times, so a recording yields the same frames whether it is read at once
+or bit by bit. Plain floats are used on purpose: at six sensors of 100 Hz and more, numpy on four numbers at a
 time costs ten times as much.
 """
 
@@ -19,14 +19,13 @@ from edgepose.imu import GAP_S, ImuFrame, ImuSample, Quaternion, Vector3
 from edgepose.placements import PLACEMENTS
 
 START_TIMEOUT_S = 3.0
-"""How long all six sensors may take until each has sent something."""
+"""Longest time until each of the six sensors has sent a sample, seconds."""
 
 STALE_S = 0.5
-"""A sensor that is silent for longer is not waited for."""
+"""Longest silence of a sensor that is still waited for, seconds."""
 
-_HOLD_PERIODS = 2.5
-_WAIT_PERIODS = 1.5
-_WAIT_S = 0.010
+_HOLD_PERIODS = 2.5  # age of a sensor's last sample, in its periods, at which the sensor is held
+_WAIT_PERIODS, _WAIT_S = 1.5, 0.010  # see `_Sensor.wait_s`
 _PERIOD_RANGE_S = (0.001, 0.2)
 _PERIOD_MEMORY = 20  # samples
 
@@ -41,40 +40,40 @@ class _Entry(NamedTuple):
 
 
 class _Sensor:
-    """Samples of one sensor that a coming tick may need."""
+    """One sensor's samples that are needed for future ticks."""
 
     __slots__ = ("intervals", "last", "newest_s", "pending", "period_s")
 
     def __init__(self) -> None:
-        self.last: _Entry | None = None  # newest one at or before the last tick
-        self.pending: deque[_Entry] = deque()  # those after it, oldest first
+        self.last: _Entry | None = None  # newest sample at or before the last tick
+        self.pending: deque[_Entry] = deque()  # samples after it, oldest first
         self.newest_s = -inf
-        self.intervals = 0  # measured so far
+        self.intervals = 0  # number of intervals averaged in period_s
         self.period_s = _PERIOD_RANGE_S[1]
 
     def add(self, entry: _Entry) -> bool:
-        """Put an entry where it belongs in time; False if there is one of that time already."""
+        """Insert an entry in time order; return False, and drop it, if its time is taken."""
         if entry.time_s > self.newest_s:
             self.newest_s = entry.time_s
             self.pending.append(entry)
             return True
-        place = len(self.pending)
-        while place and self.pending[place - 1].time_s > entry.time_s:
-            place -= 1
-        before = self.pending[place - 1] if place else self.last
+        index = len(self.pending)
+        while index and self.pending[index - 1].time_s > entry.time_s:
+            index -= 1
+        before = self.pending[index - 1] if index else self.last
         if before is not None and before.time_s >= entry.time_s:
             return False
-        self.pending.insert(place, entry)
+        self.pending.insert(index, entry)
         return True
 
     def take(self) -> _Entry:
-        """Make the oldest pending entry the last one."""
+        """Move the oldest pending entry to `last`, update the period, and return the entry."""
         entry = self.pending.popleft()
-        # Measured here and not in `add`: how far samples run ahead of the ticks must not matter.
+        # Updated here and not in `add`: the period must not depend on how far samples run ahead of the ticks.
         if self.last is not None:
             interval = entry.time_s - self.last.time_s
             if self.intervals:
-                # A mean of the newest intervals in which one gap counts for little.
+                # A moving average in which a single gap has little weight.
                 change = min(interval, 4.0 * self.period_s) - self.period_s
                 interval = self.period_s + change / min(self.intervals + 1, _PERIOD_MEMORY)
             self.intervals += 1
@@ -84,35 +83,36 @@ class _Sensor:
 
     @property
     def wait_s(self) -> float:
-        """How long after a tick a sample may come and still be waited for, seconds."""
+        """Longest time after a tick for which this sensor's next sample is waited for, seconds."""
         return _WAIT_PERIODS * self.period_s + _WAIT_S
 
 
 class FrameSynchronizer:
-    """Makes frames at ticks `t0 + k / rate`; t0 is when the last of the six sensors sent its first sample.
+    """Makes frames at ticks `t0 + k / rate`; t0 is the time of the first sample of the last sensor to start.
 
     A frame is ready once every sensor has a sample at or after its tick. A late sensor is waited for, on the
-    source's clock, for one and a half of its own periods and 10 ms after the tick; one that is silent for
-    half a second not at all. Where a sensor had nothing new for two and a half of its periods (and a frame),
-    its last values are repeated and the frame says `held`.
+    source's clock, for one and a half of its own periods plus 10 ms after the tick; a sensor that has been
+    silent for half a second is not waited for. If a sensor had nothing new for two and a half of its periods
+    (and at least a frame), its last values are repeated and the frame marks it as `held`.
 
-    On a grid, t0 is the next multiple of `1 / rate` after that: the clocks of several wearers tick at once.
+    On a grid, t0 is rounded up to a multiple of `1 / rate`, so that the clocks of several wearers tick at
+    once.
 
     Attributes:
-        dropped: samples left out because they came after their frame, or twice.
-        restarts: gaps of all sensors over a minute after which the ticks began anew; frame numbers go on.
+        dropped: samples ignored because they came after their frame, or were duplicates.
+        restarts: restarts of the ticks, after all sensors were silent for over a minute; frame numbers go on.
     """
 
     def __init__(
         self, rate: float = 60.0, interpolation: Interpolation = "slerp", grid: bool = False
     ) -> None:
-        """Start with no sample seen.
+        """Create the synchroniser.
 
         Args:
-            rate: frames a second.
-            interpolation: orientation at a tick: "slerp" between the samples on its two sides, or "hold" the
-                last one.
-            grid: let ticks be multiples of `1 / rate` on the source's clock.
+            rate: frames per second.
+            interpolation: orientation at a tick: "slerp" between the samples before and after it, or "hold"
+                for the last one.
+            grid: place ticks at multiples of `1 / rate` on the source's clock.
         """
         self.dropped = 0
         self.restarts = 0
@@ -126,14 +126,14 @@ class FrameSynchronizer:
         self._last_tick_s = -inf
         self._first_arrival_s: float | None = None
         self._newest_s = -inf  # over all sensors
-        # Samples after a gap, until the ticks before it are out.
+        # Samples after a gap, kept until all frames before it are made.
         self._after_gap: deque[tuple[ImuSample, float]] = deque()
 
     def push(self, samples: Iterable[ImuSample], arrival_s: float) -> None:
-        """Take samples in.
+        """Add samples.
 
         Args:
-            samples: of any sensors; each sensor's in time order, save a few.
+            samples: samples of any sensors; each sensor's in time order, with few exceptions.
             arrival_s: time on the source's clock at which they came, seconds.
 
         Raises:
@@ -155,11 +155,11 @@ class FrameSynchronizer:
         if quat is None:
             raise EdgeposeError(
                 f"{PLACEMENTS[sensor]}: the device sends no orientation; set it to send quaternions, "
-                "or make it here of gyroscope and accelerometer: --filter kalman"
+                "or compute it here from gyroscope and accelerometer: --filter kalman"
             )
         if acc is None:
             raise EdgeposeError(
-                f"{PLACEMENTS[sensor]}: the device sends no acceleration; switch it on in its settings"
+                f"{PLACEMENTS[sensor]}: the device sends no acceleration; enable it in the device's settings"
             )
         if time_s <= self._last_tick_s:
             self.dropped += 1
@@ -175,13 +175,13 @@ class FrameSynchronizer:
             self._newest_s = time_s
 
     def frames(self, now_s: float) -> list[ImuFrame]:
-        """Frames that are ready.
+        """Return the frames that are ready.
 
         Args:
             now_s: time on the source's clock up to which everything has been pushed, seconds.
 
         Raises:
-            EdgeposeError: not all sensors have reported within the start timeout.
+            EdgeposeError: not all sensors have sent samples within the start timeout.
         """
         if self._t0 is None and not self._start(now_s):
             return []
@@ -193,10 +193,10 @@ class FrameSynchronizer:
         return result
 
     def flush(self) -> list[ImuFrame]:
-        """Frames up to the newest sample, at the end of the samples.
+        """Return the frames up to the newest sample, at the end of the samples.
 
         Raises:
-            EdgeposeError: some sensors have never reported.
+            EdgeposeError: some sensors have never sent a sample.
         """
         if self._first_arrival_s is None:
             return []
@@ -231,7 +231,7 @@ class FrameSynchronizer:
     def _until(self, now_s: float) -> list[ImuFrame]:
         assert self._t0 is not None
         result: list[ImuFrame] = []
-        # Nobody needs a minute of repeated values and more: after that the clock waits for samples.
+        # Frames stop after a minute of repeated values; the clock then waits for new samples.
         end_s = self._newest_s + GAP_S if now_s < inf else self._newest_s
         while True:
             tick_s = self._t0 + self._tick / self._rate
@@ -267,7 +267,7 @@ class FrameSynchronizer:
             quat, mean = last.quat, last.force
             if not is_held:
                 ready_s = max(ready_s, last.arrival_s)
-                # A sample that is further off would not have been waited for.
+                # A later sample would not have been waited for; using it would depend on timing.
                 if pending and age_s > 0.0 and pending[0].time_s - tick_s <= sensor.wait_s:
                     following = pending[0]
                     ready_s = max(ready_s, following.arrival_s)
@@ -294,8 +294,8 @@ class FrameSynchronizer:
 def _mean_force(entries: list[_Entry], start_s: float, end_s: float) -> Vector3:
     """Mean over the time from start to end of a force that is linear between entries and constant beyond.
 
-    The mean over time, not over samples: with 5 samples in 3 frames the samples' mean would shake by a
-    fraction of a period.
+    It is a mean over time, not over samples: with 5 samples in 3 frames, the mean over samples would jitter
+    by a fraction of a period.
     """
     x = y = z = 0.0
     t0 = start_s

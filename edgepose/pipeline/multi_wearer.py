@@ -1,9 +1,9 @@
-"""Several wearers at once: each walks for itself, and the network takes one step for all that have a frame.
+"""Several wearers in one loop: separate pipelines whose frames go through the network in batches.
 
-A turn looks at every source, then takes the next frame of each wearer that has one through the network.
-What becomes ready between two looks goes together, and on a busy machine turns are longer and steps fuller,
-so that what a frame costs falls as more is asked for. Nobody waits for anybody: who has no frame has no part
-in the step.
+Each turn of the loop polls every source, then runs the network on the next frame of each wearer who has one.
+Frames that become ready between two polls share a batch. On a busy machine turns are longer and batches
+fuller, so the cost per frame falls as the load rises. No wearer waits for another: a wearer without a frame
+is left out of the batch.
 """
 
 from __future__ import annotations
@@ -21,86 +21,86 @@ from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
 from edgepose.sources import Source
 
 POLL_S = 0.004
-"""Time between two looks at sources that come at their own pace, seconds; a quarter of a frame."""
+"""Time between two polls of live sources, seconds; a quarter of a frame."""
 
 
 class _Waiting(NamedTuple):
-    body: EngineInput
+    engine_input: EngineInput
     arrived: float  # see `WearerPipeline.arrived`
 
 
 class Wearer:
-    """One of several wearers; an error of any kind ends only their part.
+    """One of several wearers; an error of any kind ends only this wearer's part of the run.
 
     Attributes:
-        pipeline: from the wearer's samples to the outputs.
-        waiting: frames that have not been through the network.
-        ended: no more samples are taken.
+        pipeline: the wearer's pipeline from samples to outputs.
+        waiting: frames that have not been through the network yet.
+        ended: no more samples are read.
     """
 
     def __init__(self, source: Source, pipeline: WearerPipeline, notify: Callable[[str], None]) -> None:
-        """Nothing has come.
+        """Start to iterate over the source.
 
         Args:
-            source: entered, and not one that waits.
-            pipeline: from the wearer's samples to the outputs.
-            notify: hears of an error.
+            source: the wearer's source, entered and non-blocking.
+            pipeline: the wearer's pipeline from samples to outputs.
+            notify: called with a message if an error ends the wearer's part.
         """
         self.pipeline = pipeline
         self.waiting: deque[_Waiting] = deque()
         self.ended = False
-        self._source, self._batches, self._tell = source, source.__iter__(), notify
-        self._spoilt = False  # an output can take no more
+        self._source, self._batches, self._notify = source, source.__iter__(), notify
+        self._output_failed = False
 
     def poll(self) -> None:
-        """Takes the next batch."""
+        """Process the next batch."""
         try:
             batch = next(self._batches, None)
             if batch is not None:
-                self._put(self.pipeline.process(batch))
+                self._enqueue(self.pipeline.process(batch))
                 return
         except Exception as error:
             self._fail(error)
         self.end()
 
     def end(self) -> None:
-        """Takes no more, but for the last frames of what has come."""
+        """Stop reading; queue the last frames of the samples read so far."""
         if self.ended:
             return
         self.ended = True
         try:
             self._batches.close()
-            self._put(self.pipeline.flush())
+            self._enqueue(self.pipeline.flush())
         except Exception as error:
             self._fail(error)
 
     def write(self, outputs: list[EngineOutput], arrived: float) -> None:
-        """Writes poses unless an output has failed before."""
+        """Write poses unless an output has failed before."""
         try:
-            if not self._spoilt:
+            if not self._output_failed:
                 self.pipeline.emit(outputs, arrived)
         except Exception as error:
-            self._spoilt = True
+            self._output_failed = True
             self._fail(error)
             self.end()
             self.waiting.clear()
 
     def close(self) -> None:
-        """Closes outputs and source: what they were open on is free for others."""
+        """Close outputs and source, so that others can use their files, ports and addresses."""
         self.pipeline.close()
         try:
             self._source.__exit__(None, None, None)
         except Exception as error:
             self.pipeline.end(as_edgepose_error(error))
 
-    def _put(self, bodies: Iterable[EngineInput]) -> None:
-        self.waiting += (_Waiting(body, self.pipeline.arrived) for body in bodies)
+    def _enqueue(self, engine_inputs: Iterable[EngineInput]) -> None:
+        self.waiting += (_Waiting(engine_input, self.pipeline.arrived) for engine_input in engine_inputs)
 
     def _fail(self, error: Exception) -> None:
-        told = as_edgepose_error(error)
+        reported = as_edgepose_error(error)
         if self.pipeline.summary.error is None:
-            self._tell(f"ended: {told}")
-        self.pipeline.end(told)
+            self._notify(f"ended: {reported}")
+        self.pipeline.end(reported)
 
 
 def run_together(
@@ -110,52 +110,53 @@ def run_together(
     stopped: Callable[[], bool] = lambda: False,
     on_turn: Callable[[RunSummary], None] = lambda total: None,
 ) -> None:
-    """Runs all to their ends, or until `stopped`; counts and errors are in the summaries of their pipelines.
+    """Run all wearers to their ends, or until `stopped`; the summaries of their pipelines keep the errors.
 
-    Outputs are closed as their wearers end: of an hour of poses that takes a while, and holds up nobody.
+    A wearer's outputs are closed in a thread of their own as soon as the wearer ends: with an hour of poses
+    that takes a while, and must not hold up the others.
 
     Args:
-        wearers: numbered as the engine's.
-        engine: makes poses.
-        poll_s: time between two looks while nothing waits, seconds; 0 does not pause.
-        stopped: asked in each turn whether to end the run.
-        on_turn: called after each turn with what all have done together.
+        wearers: the wearers, in the engine's order.
+        engine: turns frames into poses.
+        poll_s: time between two polls while no frame waits, seconds; 0 means no pause.
+        stopped: called in each turn; true ends the run.
+        on_turn: called after each turn with the counts of all wearers together.
     """
-    going = dict(enumerate(wearers))
-    closed: list[Future[None]] = []
+    running = dict(enumerate(wearers))
+    closings: list[Future[None]] = []
     due_s = time.monotonic()
-    with ThreadPoolExecutor() as closing:
-        while going:
+    with ThreadPoolExecutor() as executor:
+        while running:
             if stopped():
-                for wearer in going.values():
+                for wearer in running.values():
                     wearer.end()
-            for wearer in going.values():
+            for wearer in running.values():
                 if not wearer.ended:
                     wearer.poll()
-            frames = {i: wearer.waiting.popleft() for i, wearer in going.items() if wearer.waiting}
-            _step(engine, frames, going)
-            for i in [i for i, wearer in going.items() if wearer.ended and not wearer.waiting]:
-                wearer = going.pop(i)
+            frames = {i: wearer.waiting.popleft() for i, wearer in running.items() if wearer.waiting}
+            _step(engine, frames, running)
+            for i in [i for i, wearer in running.items() if wearer.ended and not wearer.waiting]:
+                wearer = running.pop(i)
                 wearer.write(engine.finish(i), wearer.pipeline.arrived)
                 wearer.pipeline.end()
-                closed.append(closing.submit(wearer.close))
+                closings.append(executor.submit(wearer.close))
             on_turn(_total([wearer.pipeline.summary for wearer in wearers]))
-            if poll_s and not any(wearer.waiting for wearer in going.values()):
-                # Looks that are missed are left out.
+            if poll_s and not any(wearer.waiting for wearer in running.values()):
+                # Polls that are overdue are skipped.
                 due_s += poll_s * max(1, ceil((time.monotonic() - due_s) / poll_s))
                 time.sleep(max(0.0, due_s - time.monotonic()))
-    for each in closed:
-        each.result()  # raises what was not foreseen
+    for closing in closings:
+        closing.result()  # raises unexpected exceptions
 
 
 def _step(engine: MultiWearerEngine, frames: dict[int, _Waiting], wearers: dict[int, Wearer]) -> None:
-    """One frame of each wearer who has one, to its sinks."""
-    for i, outputs in engine.push({i: waiting.body for i, waiting in frames.items()}).items():
+    """Run the network on one frame of each wearer who has one, and write the poses."""
+    for i, outputs in engine.push({i: waiting.engine_input for i, waiting in frames.items()}).items():
         wearers[i].write(outputs, frames[i].arrived)
 
 
 def _total(summaries: Sequence[RunSummary]) -> RunSummary:
-    """What all have done together, as far as it is shown while they go on."""
+    """Sum the counts that are shown during a run."""
     return RunSummary(
         poses=sum(summary.poses for summary in summaries),
         held=sum(summary.held for summary in summaries),

@@ -1,4 +1,4 @@
-"""The main job from Python: samples of a source in, poses out."""
+"""The pipeline of the Python API: a source's samples in, poses out."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from edgepose.inference.model import Model
 
 
-class _Latest(Sink):
-    """Keeps the poses until they are taken."""
+class _PoseBuffer(Sink):
+    """Keeps poses until they are taken."""
 
     def __init__(self) -> None:
         self._poses: list[PoseFrame] = []
@@ -42,7 +42,7 @@ class Pipeline:
     """Turns the samples of one wearer into poses.
 
     Attributes:
-        summary: counts of what has been done so far.
+        summary: counts so far.
     """
 
     def __init__(
@@ -51,9 +51,9 @@ class Pipeline:
         """Load the model.
 
         Args:
-            calibration: of the wearer; it says which orientation filter runs.
-            model: name of a bundled model, path of an archive, or a loaded one.
-            trust: load an archive although its checksum is not known.
+            calibration: the wearer's calibration; it names the orientation filter to use.
+            model: name of a bundled model, path of an archive, or a loaded model.
+            trust: load an archive although its checksum is unknown.
 
         Raises:
             ModelError: the archive cannot be loaded.
@@ -65,34 +65,34 @@ class Pipeline:
         self.summary = RunSummary()
 
     def poses(self, source: Iterable[Batch | tuple[float, list[ImuSample]]]) -> Iterator[PoseFrame]:
-        """Poses as they become ready, to the end of the source.
+        """Yield poses as they become ready, to the end of the source.
 
         Args:
-            source: batches as `edgepose.open_source` gives them once it is entered, or pairs (time in
-                seconds up to which everything has been delivered, samples).
+            source: an entered source of `edgepose.open_source`, or other batches, or pairs (time in seconds
+                up to which everything has been delivered, samples).
 
         Raises:
-            EdgeposeError: the source ended in an error; all poses before it have been given.
+            EdgeposeError: the source ended in an error; all poses before it have been yielded.
         """
-        latest, engine = _Latest(), self._model.engine()
+        buffer, engine = _PoseBuffer(), self._model.engine()
         calibration = self._calibration
         orient = OrientationStage(calibration.filter, magnetometer=calibration.north)
         pipeline = WearerPipeline(
-            FrameSynchronizer(self._model.rate_hz), HeadingRezero(calibration), [latest], orient
+            FrameSynchronizer(self._model.rate_hz), HeadingRezero(calibration), [buffer], orient
         )
         self.summary = pipeline.summary
         failure: EdgeposeError | None = None
         try:
             for batch in source:
-                for body in pipeline.process(Batch(*batch)):
-                    pipeline.emit(engine.push(*body), pipeline.arrived)
-                yield from latest.take()
+                for engine_input in pipeline.process(Batch(*batch)):
+                    pipeline.emit(engine.push(*engine_input), pipeline.arrived)
+                yield from buffer.take()
         except EdgeposeError as error:
-            failure = error  # raised once the poses of what came before it are given
-        for body in pipeline.flush():
-            pipeline.emit(engine.push(*body), pipeline.arrived)
+            failure = error  # raised once all poses before it have been yielded
+        for engine_input in pipeline.flush():
+            pipeline.emit(engine.push(*engine_input), pipeline.arrived)
         pipeline.emit(engine.finish(), pipeline.arrived)
         pipeline.end(failure)
-        yield from latest.take()
+        yield from buffer.take()
         if failure is not None:
             raise failure

@@ -1,4 +1,4 @@
-"""Re-zero requests during a run: keys, and over UDP the text `rezero` or the OSC message /edgepose/rezero."""
+"""Re-zero requests during a run: by key, or over UDP by the text `rezero` or OSC message /edgepose/rezero."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from edgepose.errors import DeviceError
 from edgepose.utils.sockets import resolve
 
 MAX_DELAY_S = 60.0
-# OSC ends a text with a zero byte and fills it up to a multiple of four.
+# OSC terminates a string with a zero byte and pads it to a multiple of four.
 _ADDRESS = b"/edgepose/rezero" + bytes(4)
 
 
 class Control:
-    """A socket that hears wishes; it never answers.
+    """A UDP socket that receives requests; it never answers.
 
     Attributes:
-        ignored: datagrams that were no wish.
+        ignored: number of datagrams that were not a request.
     """
 
     def __init__(self, host: str, port: int) -> None:
-        """Binds it.
+        """Bind the socket.
 
         Raises:
-            DeviceError: the address is not of this machine, or in use.
+            DeviceError: the address does not belong to this machine, or is in use.
         """
         self.ignored = 0
         try:
@@ -47,45 +47,45 @@ class Control:
             ) from error
 
     def requests(self) -> list[float]:
-        """What has come: for each wish to re-zero, in how many seconds."""
-        wishes = []
-        # A flood must not stop the frames.
+        """Return the delay of each re-zero request received since the last call, seconds."""
+        delays = []
+        # Limited, so that a flood of datagrams does not stop the frames.
         for _ in range(16):
             try:
                 datagram = self._socket.recv(1024)
-            except OSError:  # nothing is there
+            except OSError:  # nothing to receive
                 break
             delay_s = parse(datagram)
             if delay_s is None:
                 self.ignored += 1
             else:
-                wishes.append(delay_s)
-        return wishes
+                delays.append(delay_s)
+        return delays
 
     def close(self) -> None:
-        """Stops listening."""
+        """Close the socket."""
         self._socket.close()
 
     def __enter__(self) -> Control:
-        """Listening since its construction."""
+        """Return the object itself; the socket is open since its construction."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stops listening."""
+        """Close the socket."""
         self.close()
 
 
 def parse(datagram: bytes) -> float | None:
-    """Seconds until the hold that a datagram asks for; None if it asks for nothing.
+    """Return the delay until the requested hold, seconds; None if the datagram is not a request.
 
-    An OSC 1.0 message may have one argument, the seconds, as int32 or float32.
+    An OSC 1.0 message may have one argument, the delay in seconds, as int32 or float32.
     """
     if datagram.strip() == b"rezero":
         return 0.0
     address, rest = datagram[: len(_ADDRESS)], datagram[len(_ADDRESS) :]
     if address != _ADDRESS:
         return None
-    # The oldest senders leave the type tags out.
+    # Old senders omit the type tags.
     if rest in (b"", b",\0\0\0"):
         return 0.0
     form = {b",i\0\0": ">i", b",f\0\0": ">f"}.get(rest[:4])
@@ -96,7 +96,7 @@ def parse(datagram: bytes) -> float | None:
 
 
 KEY_DELAY_S = 3.0
-"""Time from a key to the hold: somebody has to walk away from the keyboard, or let go of it."""
+"""Time from a key press to the hold, seconds: the wearer has to leave the keyboard first."""
 
 
 class RezeroRequests:
@@ -110,7 +110,7 @@ class RezeroRequests:
         Args:
             stack: closes the socket.
             control: host and port to listen on; None for none.
-            by_key: requests from the keyboard, one of `key_requests`.
+            by_key: returns the requests from the keyboard, one of `key_requests`.
 
         Raises:
             DeviceError: the address cannot be listened on.
@@ -119,32 +119,32 @@ class RezeroRequests:
         self._by_key = by_key
 
     def poll(self) -> list[float]:
-        """Delay of each new request, seconds."""
+        """Return the delay of each new request, seconds."""
         return self._by_key() + ([] if self._control is None else self._control.requests())
 
     def summary_lines(self) -> list[str]:
-        """What there is to say at the end."""
+        """Return the lines for the end of the run."""
         if self._control is None or not self._control.ignored:
             return []
-        return [f"control  {self._control.ignored} datagrams that ask for nothing known"]
+        return [f"control  {self._control.ignored} datagrams without a known request"]
 
 
 def key_requests(count: int, pressed: Callable[[], str]) -> list[Callable[[], list[float]]]:
-    """One callable for each wearer that returns the requests since its last call.
+    """Return one callable per wearer, which returns the requests since its last call.
 
     Every key press goes to all wearers.
 
     Args:
         count: number of wearers.
-        pressed: the keys pressed since its last call.
+        pressed: returns the keys pressed since its last call.
     """
-    unheard: list[list[float]] = [[] for _ in range(count)]
+    pending: list[list[float]] = [[] for _ in range(count)]
 
     def by_key(wearer: int) -> list[float]:
-        wishes = [KEY_DELAY_S for key in pressed() if key in "rR\r\n"]
-        for own in unheard:
-            own += wishes
-        own, unheard[wearer] = unheard[wearer], []
-        return own
+        delays = [KEY_DELAY_S for key in pressed() if key in "rR\r\n"]
+        for queue in pending:
+            queue += delays
+        requests, pending[wearer] = pending[wearer], []
+        return requests
 
     return [partial(by_key, wearer) for wearer in range(count)]

@@ -1,4 +1,4 @@
-"""Runs one wearer's pipeline to the end of its source."""
+"""The loop that runs one wearer's pipeline to the end of its source."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ def run(
     engine: Engine,
     stopped: Callable[[], bool] = lambda: False,
 ) -> RunSummary:
-    """Runs a source to its end, or until `stopped`, and writes every pose to every sink.
+    """Run a source to its end, or until `stopped`, and write every pose to every sink.
 
-    What the source gave before an error or the stop comes out. After an error of a sink nothing more is
-    written. An error is kept in the summary for the caller to report.
+    Samples that came before the stop or an error of the source are still processed. After an error of a sink
+    nothing more is written. The summary keeps an error for the caller to report.
 
     Args:
-        pipeline: of one wearer.
+        pipeline: the wearer's pipeline.
         source: batches of samples.
-        engine: makes poses.
-        stopped: asked after each batch whether to end the run. An interrupt would lose the frame under way.
+        engine: turns frames into poses.
+        stopped: called after each batch; true ends the run. An interrupt would lose the frame in progress.
     """
 
-    def bodies() -> Iterator[EngineInput]:
-        """All bodies; an error of the source or the clock ends the samples, not the frames made of them."""
+    def engine_inputs() -> Iterator[EngineInput]:
+        """Yield all network inputs; after an error of the source or the clock, those before it."""
         try:
             for batch in source:
                 yield from pipeline.process(batch)
@@ -40,8 +40,8 @@ def run(
         yield from pipeline.flush()
 
     try:
-        for body in bodies():
-            pipeline.emit(engine.push(*body), pipeline.arrived)
+        for engine_input in engine_inputs():
+            pipeline.emit(engine.push(*engine_input), pipeline.arrived)
         pipeline.emit(engine.finish(), pipeline.arrived)
         pipeline.end()
     except Exception as error:

@@ -1,4 +1,4 @@
-"""One wearer's samples through calibration and dropout handling to the outputs, in order."""
+"""One wearer's pipeline: from samples through calibration and dropout handling to the outputs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from edgepose.sinks.base import Sink
 from edgepose.sources import Batch
 
 LATENCIES = 216_000
-"""Latencies that are kept: those of the last hour at 60 Hz. A run may last for weeks."""
+"""Number of latencies kept, those of the last hour at 60 Hz: a run may last for weeks."""
 
 
 @dataclass
@@ -34,14 +34,14 @@ class RunSummary:
 
     Attributes:
         poses: poses written.
-        filling: of these, poses made before the network's past was full.
-        held: of these, poses in which a sensor's last values were repeated.
+        warming_up: poses written before the network's window was full.
+        held: poses written in which a sensor's last values were repeated.
         held_by_sensor: frames in which each sensor was held, in the order of PLACEMENTS.
-        behind_s: how long the newest batch had waited to be taken.
+        backlog_s: time that the newest batch had waited before it was read, seconds.
         seconds: wall time from the first samples to the end.
-        late_s: seconds from the arrival of the newest packet here to the newest pose's being sent.
-        latencies_s: that of the newest LATENCIES poses, in no order.
-        error: what ended the run early, if anything did.
+        latency_s: time from the arrival of the newest packet here until the newest pose was sent, seconds.
+        latencies_s: latencies of the newest LATENCIES poses, in no order, seconds.
+        error: the error that ended the run early, if any.
     """
 
     poses: int = 0
@@ -54,30 +54,30 @@ class RunSummary:
     latencies_s: array[float] = field(default_factory=lambda: array("f"), repr=False)
     error: EdgeposeError | None = None
 
-    def sent(self, late_s: float) -> None:
-        """Counts a pose that was sent so late, seconds."""
-        self.latency_s = late_s
+    def sent(self, latency_s: float) -> None:
+        """Count a pose that was sent with a latency, seconds."""
+        self.latency_s = latency_s
         if len(self.latencies_s) < LATENCIES:
-            self.latencies_s.append(late_s)
+            self.latencies_s.append(latency_s)
         else:
-            self.latencies_s[self.poses % LATENCIES] = late_s
+            self.latencies_s[self.poses % LATENCIES] = latency_s
         self.poses += 1
 
 
 def pose_frame(output: EngineOutput) -> PoseFrame:
-    """The pose of a frame that went through the network."""
+    """Return the pose of a frame from the network's output."""
     frame: ImuFrame = output.frame
     held = frozenset(name for name, held in zip(PLACEMENTS, frame.held.tolist(), strict=True) if held)
     return PoseFrame(frame.index, frame.time_s, output.rotations, output.std, None, held, output.warming_up)
 
 
 class WearerPipeline:
-    """One wearer's pipeline from samples to sinks, but for the network, which may serve several wearers.
+    """One wearer's pipeline from samples to sinks, without the network, which may serve several wearers.
 
     Attributes:
         summary: counts so far.
-        clock: makes frames.
-        arrived: when the samples taken last had arrived, on `time.perf_counter`.
+        clock: makes frames from samples.
+        arrived: arrival of the newest samples, on the clock of `time.perf_counter`.
     """
 
     def __init__(
@@ -91,42 +91,42 @@ class WearerPipeline:
         misfits: MisfitDetector | None = None,
         warn: Callable[[str], None] = lambda text: None,
     ) -> None:
-        """Nothing has come.
+        """Join the stages.
 
         Args:
-            clock: makes frames.
-            headings: the calibration of each frame; frames without one give no pose.
-            sinks: written in order.
-            orient: makes raw samples oriented ones.
-            notify: hears of sensors that fall silent and are back.
-            on_pose: called after each pose was written.
-            misfits: finds out whether the calibration can be the wearer's.
-            warn: hears that it cannot.
+            clock: makes frames from samples.
+            headings: provides the calibration for each frame; frames without one produce no pose.
+            sinks: outputs, written in this order.
+            orient: adds orientations to raw samples.
+            notify: called with one message per sensor that drops out or comes back.
+            on_pose: called after each pose has been written.
+            misfits: checks whether the calibration fits the wearer.
+            warn: called with one message per finding of `misfits`.
         """
         self.summary, self.clock = RunSummary(), clock
         self.arrived = self._started = time.perf_counter()
-        self._headings, self._sinks, self._orient, self._tell = headings, sinks, orient, notify
+        self._headings, self._sinks, self._orient, self._notify = headings, sinks, orient, notify
         self._on_pose, self._misfits, self._warn = on_pose, misfits, warn
-        self._silences = DropoutMonitor()
-        self._bones: NDArray[np.float64] | None = None  # of the frame before
+        self._dropouts = DropoutMonitor()
+        self._bones: NDArray[np.float64] | None = None  # those of the previous frame
 
     def process(self, batch: Batch) -> Iterator[EngineInput]:
-        """Bodies of the frames that are ready after a batch."""
+        """Return the network inputs of the frames that are ready after a batch."""
         self.summary.backlog_s = batch.backlog_s
         self.arrived = time.perf_counter() - batch.backlog_s
         if batch.samples:
             self.clock.push(self._orient(batch.samples), batch.now_s)
-        return self._bodies(self.clock.frames(batch.now_s))
+        return self._engine_inputs(self.clock.frames(batch.now_s))
 
     def flush(self) -> Iterator[EngineInput]:
-        """Bodies of the last frames."""
-        yield from self._bodies(self.clock.flush())
+        """Yield the network inputs of the last frames."""
+        yield from self._engine_inputs(self.clock.flush())
         if self._misfits is not None:
             for line in self._misfits.at_end():
                 self._warn(line)
 
     def emit(self, outputs: list[EngineOutput], arrived: float) -> None:
-        """Writes poses whose newest packet arrived at a time on `time.perf_counter`."""
+        """Write poses whose newest packet arrived at a time on the clock of `time.perf_counter`."""
         summary = self.summary
         for output in outputs:
             frame: ImuFrame = output.frame
@@ -142,22 +142,22 @@ class WearerPipeline:
             self._on_pose(summary)
 
     def end(self, error: EdgeposeError | None = None) -> None:
-        """The walk is over, by an error unless there was one before."""
+        """End the run; only the first error is kept."""
         self.summary.error = self.summary.error or error
         self.summary.seconds = time.perf_counter() - self._started
 
     def close(self) -> None:
-        """Closes the sinks; what goes wrong then ends the pipeline as any error does."""
+        """Close the sinks; their errors go to the summary like any other."""
         for sink in self._sinks:
             try:
                 sink.close()
             except Exception as error:
                 self.summary.error = self.summary.error or as_edgepose_error(error)
 
-    def _bodies(self, frames: list[ImuFrame]) -> Iterator[EngineInput]:
+    def _engine_inputs(self, frames: list[ImuFrame]) -> Iterator[EngineInput]:
         for frame in frames:
-            for line in self._silences.update(frame):
-                self._tell(line)
+            for line in self._dropouts.update(frame):
+                self._notify(line)
             calibration = self._headings.calibration_for(frame)
             if calibration is not None:
                 bones, acceleration = apply_calibration(calibration, frame.orientation, frame.force)

@@ -1,1 +1,1 @@
-"""Outputs of poses: one module for each kind; `base` has the interface and the table."""
+"""Outputs for poses: one module per kind; `base` has the interface and the table of kinds."""

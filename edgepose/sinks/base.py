@@ -1,4 +1,4 @@
-"""The interface of outputs, and the table of those that there are."""
+"""The interface of outputs, and the table of available ones."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ class Sink(ABC):
     """An output of poses, open from its construction until `close`; use it in a `with` statement."""
 
     def start(self) -> None:  # noqa: B027 - most outputs have nothing to do
-        """The run begins: a file may appear.
+        """Begin the run: from now on files may appear.
 
         Raises:
-            EdgeposeError: it cannot.
+            EdgeposeError: a file cannot be created.
         """
 
     @abstractmethod
     def write(self, pose: PoseFrame) -> None:
-        """Take the next pose.
+        """Write the next pose.
 
         Raises:
-            EdgeposeError: the output can take no more; what it has taken so far is complete.
+            EdgeposeError: the output cannot be written to any more; the poses written before are complete.
         """
 
     @abstractmethod
@@ -39,21 +39,21 @@ class Sink(ABC):
         """Finish the output; a second call does nothing."""
 
     def discard(self) -> None:
-        """Finish the output after a failure: as `close`, but without a pose no file appears."""
+        """Finish the output after a failure: like `close`, but no file appears if no pose was written."""
         self.close()
 
     def summary_lines(self) -> list[str]:
-        """What there is to say at the end of a run, one line each."""
+        """Return messages for the end of a run, one line each."""
         return []
 
     def __enter__(self: Self) -> Self:
-        """The sink itself, open since its construction."""
+        """Return the sink itself, which is open since its construction."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close, whatever happened."""
+        """Close the sink, or discard it after an error."""
         if kind is None:
             self.close()
         else:
@@ -61,17 +61,18 @@ class Sink(ABC):
 
 
 class SinkContext(NamedTuple):
-    """What sinks need besides their own target.
+    """Settings for sinks besides their own targets.
 
     Attributes:
-        body: the wearer's, for bone lengths.
+        body: the wearer's body, for bone lengths.
         height: the wearer's stature, metres.
         rate: poses per second.
-        rotations: representation of rotations in CSV, a key of `edgepose.formats.poses.csv_columns.FORMS`.
-        std: write standard deviations, where the format has room for them.
+        rotations: representation of rotations in CSV, a key of `ROTATION_FORMATS` in
+            `edgepose.formats.poses.csv_columns`.
+        std: write standard deviations, if the format has room for them.
         translation: poses have a translation.
-        overwrite: replace files that exist.
-        stopped: whether the run is to end. Then a reader that takes nothing is not waited for.
+        overwrite: replace existing files.
+        stopped: whether the run is to end; a reader that has stopped reading is then not waited for.
     """
 
     body: Body
@@ -88,7 +89,7 @@ SinkFactory = Callable[[Any, SinkContext], Sink]
 """Opens a sink, given its target (a file, an address) and the context.
 
 Raises:
-    EdgeposeError: it cannot be opened.
+    EdgeposeError: the sink cannot be opened.
 """
 
 SINKS = {
@@ -100,20 +101,21 @@ SINKS = {
     "csv": "edgepose.sinks.csv:open_sink",
     "view": "edgepose.sinks.viewer:open_sink",
 }
-"""Factories by the name of their flag, in the order in which they are opened.
+"""Factories by the name of their flag, in the order of opening.
 
-A wrong address is reported before a pipe's reader is waited for; the viewer starts when all else is ready.
+Addresses come first, so that a wrong one is reported before waiting for a pipe's reader; the viewer starts
+once everything else is ready.
 """
 
 ENTRY_POINTS = "edgepose.sinks"
-"""Group of entry points under which other packages name their factories."""
+"""Group of entry points under which other packages register their factories."""
 
 
 def sink_factory(name: str) -> SinkFactory:
-    """The factory of a sink, from the table or from another package.
+    """Return the factory of a sink, from the table or from another package.
 
     Raises:
-        ConfigError: there is none, or the other package cannot be imported.
+        ConfigError: there is none of that name, or the other package cannot be imported.
     """
     if name in SINKS:
         module, _, function = SINKS[name].partition(":")
@@ -122,7 +124,7 @@ def sink_factory(name: str) -> SinkFactory:
     for point in entry_points(group=ENTRY_POINTS, name=name):
         try:
             loaded: SinkFactory = point.load()
-        except (Exception, SystemExit) as error:  # code of others
+        except (Exception, SystemExit) as error:  # third-party code
             raise ConfigError(f"output {name!r}: {point.value} cannot be imported: {error}") from error
         return loaded
     known = ", ".join(sorted({point.name for point in entry_points(group=ENTRY_POINTS)})) or "none"

@@ -1,4 +1,4 @@
-"""Poses as BVH, a skeleton and its angles over time, for Blender and other animation programs."""
+"""BVH output: a skeleton and its joint angles over time, for Blender and other animation programs."""
 
 from __future__ import annotations
 
@@ -22,37 +22,37 @@ from edgepose.utils.output_targets import is_stream
 Array = NDArray[np.float64]
 
 BLOCK = 600
-"""Poses that are held back at most."""
+"""Largest number of poses kept in memory before they are written."""
 
 TIPS = {10: (0, 0, 6), 11: (0, 0, 6), 15: (0, 18, 0), 22: (8, 0, 0), 23: (-8, 0, 0)}
-"""Where the bones without a joint at their end stop: joint, and tip in its frame, cm."""
+"""End points of the bones without a joint at their end: joint, and tip in its frame, cm."""
 
 _COUNT = "Frames: "
 _DIGITS = 10
-"""Room for the number of frames, which is known only at the end."""
+"""Width of the number of frames, which is updated in place."""
 
 
 def hierarchy(offsets: Array) -> str:
-    """The part of a file that describes a skeleton; offsets (24, 3), row 0 the pelvis' place, in cm."""
+    """Return the skeleton part of a file; offsets (24, 3) in cm, row 0 the pelvis' position."""
     children: dict[int, list[int]] = {joint: [] for joint in range(len(JOINTS))}
     for joint, parent in enumerate(PARENTS[1:], start=1):
         children[parent].append(joint)
 
     def lines(joint: int, depth: int) -> list[str]:
-        room = "  " * depth
+        indent = "  " * depth
         channels = "3 " if joint else "6 Xposition Yposition Zposition "
         result = [
-            f"{room}{'JOINT' if joint else 'ROOT'} {JOINTS[joint]}",
-            f"{room}{{",
-            f"{room}  OFFSET {_text(offsets[joint])}",
-            f"{room}  CHANNELS {channels}Zrotation Xrotation Yrotation",
+            f"{indent}{'JOINT' if joint else 'ROOT'} {JOINTS[joint]}",
+            f"{indent}{{",
+            f"{indent}  OFFSET {_text(offsets[joint])}",
+            f"{indent}  CHANNELS {channels}Zrotation Xrotation Yrotation",
         ]
         for child in children[joint]:
             result += lines(child, depth + 1)
         if joint in TIPS:
             tip = _text(np.array(TIPS[joint], float))
-            result += [f"{room}  End Site", f"{room}  {{", f"{room}    OFFSET {tip}", f"{room}  }}"]
-        return [*result, f"{room}}}"]
+            result += [f"{indent}  End Site", f"{indent}  {{", f"{indent}    OFFSET {tip}", f"{indent}  }}"]
+        return [*result, f"{indent}}}"]
 
     return "\n".join(["HIERARCHY", *lines(0, 0), ""])
 
@@ -62,7 +62,7 @@ def _text(numbers: Array) -> str:
 
 
 def depth_first() -> list[int]:
-    """Joints in the order in which a file lists them."""
+    """Return the joints in the order in which a file lists them."""
     order: list[int] = []
 
     def visit(joint: int) -> None:
@@ -76,9 +76,9 @@ def depth_first() -> list[int]:
 
 
 class BvhSink(PoseFileSink):
-    """Writes poses to a file, which is whole after every write to the disk, about once a second.
+    """Writes poses to a BVH file, which is valid after every write to the disk, about once a second.
 
-    The body frame T is the file's world: X to the wearer's left, Y up, Z forward; lengths in cm.
+    The body frame T is the file's world frame: X to the wearer's left, Y up, Z forward; lengths in cm.
     """
 
     def __init__(
@@ -89,8 +89,8 @@ class BvhSink(PoseFileSink):
         Args:
             path: file to write; it appears with the first poses.
             rate: frames per second.
-            body: whose bone lengths the file gets; the default body if None.
-            overwrite: whether it may take the place of a file.
+            body: body whose bone lengths are written; None for the default body.
+            overwrite: replace an existing file.
 
         Raises:
             EdgeposeError: the file cannot be written.
@@ -103,7 +103,8 @@ class BvhSink(PoseFileSink):
         self._count = 0
         if is_stream(path):
             raise EdgeposeError(
-                f"cannot write BVH to {path}: it must be a file on a disk, as its start tells how long it is"
+                f"cannot write BVH to {path}: it must be a file on a disk, because the number of frames at "
+                "its start is filled in at the end"
             )
         output = GrowingFile(path, "poses", overwrite=overwrite)
         self._file = output.file
@@ -115,7 +116,7 @@ class BvhSink(PoseFileSink):
         self._poses.append(pose)
         return len(self._poses) >= BLOCK
 
-    def _write_gathered(self) -> None:
+    def _write_collected(self) -> None:
         poses, self._poses = self._poses, []
         if not poses:
             return
@@ -126,27 +127,27 @@ class BvhSink(PoseFileSink):
         finally:
             self._count += rows[: self._file.tell() - start].count(b"\n")
             end = self._file.seek(0, 2)
-            # In its place, which needs no room on a full disk.
+            # Overwriting in place works even on a full disk.
             with contextlib.suppress(OSError):
                 self._file.seek(self._count_at)
                 self._file.write(f"{self._count:<{_DIGITS}}".encode())
             self._file.seek(end)
 
     def _rows(self, poses: Sequence[PoseFrame]) -> bytes:
-        """Lines of channel values."""
+        """Return the lines of channel values for poses."""
         angles = matrix_to_euler_zxy(np.stack([pose.rotations for pose in poses]))
-        # Without leaps of a whole turn, because programs interpolate between frames.
+        # Without jumps of 360 degrees, because programs interpolate between frames.
         angles = np.unwrap(np.concatenate([self._before[None], angles]), axis=0)[1:]
         self._before = angles[-1]
-        places = [self._standing if pose.translation is None else pose.translation for pose in poses]
+        positions = [self._standing if pose.translation is None else pose.translation for pose in poses]
         values = np.degrees(angles[:, self._channels]).reshape(len(poses), -1)
-        table = np.concatenate([100.0 * np.array(places, float), values], axis=1)
+        table = np.concatenate([100.0 * np.array(positions, float), values], axis=1)
         line = " ".join(["%.4f"] * table.shape[1]) + "\n"
         return "".join(line % tuple(row) for row in table.tolist()).encode()
 
 
 def open_sink(target: str, context: SinkContext) -> Sink:
-    """A `BvhSink`; a device or pipe gets the file when it is whole."""
+    """Open a `BvhSink`; a device or pipe gets the file once it is complete."""
     if target != "-" and is_stream(target):
         return SpooledSink(target, lambda part: BvhSink(part, context.rate, context.body), context.stopped)
     return BvhSink(target, context.rate, context.body, overwrite=context.overwrite)

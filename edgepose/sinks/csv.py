@@ -1,4 +1,4 @@
-"""Poses as comma-separated values, one row a frame. Columns: docs/reference/outputs.md."""
+"""CSV output: one row per frame. Columns: docs/reference/outputs.md."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from edgepose.utils.growing_files import GrowingFile
 
 
 class CsvSink(PoseFileSink):
-    """Writes poses to a file, or to standard output for the path "-".
+    """Writes poses to a CSV file, or to standard output for the path "-".
 
-    Rows to a file are gathered and written about once a second; a pipe or terminal gets each at once, so that
-    a program that reads along has no added latency. After an error a file ends at a whole row.
+    Rows for a file are collected and written about once a second. A pipe or terminal gets each row at once,
+    so that there is no added latency for its reader. After an error a file ends with a complete row.
     """
 
     def __init__(
@@ -37,10 +37,10 @@ class CsvSink(PoseFileSink):
             path: file to write; "-" is standard output. It appears with the first pose.
             rotations: a key of `ROTATION_FORMATS`; angles are in radians.
             std: add the network's standard deviation of each joint, radians.
-            translation: add the place of the pelvis, metres, which every pose must then have.
-            overwrite: whether it may take the place of a file.
-            follow: write to the file at the end of a link; without, in the place of the link.
-            stopped: whether the run is to end: then a reader that takes nothing is not waited for.
+            translation: add the position of the pelvis, metres, which every pose must then have.
+            overwrite: replace an existing file.
+            follow: write to the target of a symbolic link; if false, replace the link.
+            stopped: whether the run is to end; a reader that has stopped reading is then not waited for.
 
         Raises:
             EdgeposeError: the file cannot be written.
@@ -68,14 +68,14 @@ class CsvSink(PoseFileSink):
         self._rows.append(self._format % (pose.index, pose.time_s, status, *values))
         return not self._output.regular
 
-    def _write_gathered(self) -> None:
+    def _write_collected(self) -> None:
         rows, self._rows = "".join(self._rows).encode(), []
         if rows:
             self._output.write(rows)
 
 
 def open_sink(target: str, context: SinkContext) -> Sink:
-    """A `CsvSink`."""
+    """Open a `CsvSink`."""
     return CsvSink(
         *(target, context.rotations, context.std, context.translation),
         overwrite=context.overwrite,

@@ -1,4 +1,4 @@
-"""Poses as NPZ with the keys of AMASS, for SMPL tools. The arrays are in docs/reference/outputs.md."""
+"""NPZ output with the keys of AMASS, for SMPL tools. Arrays: docs/reference/outputs.md."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from edgepose.utils.output_targets import find_target, is_stream, part_path
 
 
 class NpzSink(Sink):
-    """Writes poses to a file that appears when the sink closes.
+    """Writes poses to an NPZ file that appears when the sink closes.
 
-    Until then they are in a CSV file beside it, `walk.part.csv` for `walk.npz`: however a run ends, there is
-    a file of poses that everything reads, and no more than a second of them is in memory.
+    Until then they are in a CSV file next to it, `walk.part.csv` for `walk.npz`. So however a run ends, there
+    is a file of poses that all commands read, and at most one second of poses is kept in memory.
     """
 
     def __init__(
@@ -32,19 +32,19 @@ class NpzSink(Sink):
             path: file to write.
             rate: frames per second.
             translation: whether the poses have a translation.
-            overwrite: whether it may take the place of a file; that of another run's CSV file it never takes.
+            overwrite: replace an existing NPZ file; the CSV file of another run is never replaced.
 
         Raises:
-            EdgeposeError: it cannot be written, or poses of a run that was cut off are where they would go.
+            EdgeposeError: the file cannot be written, or the CSV file of a run that was cut off exists.
         """
         self._path, self._overwrite = Path(path), overwrite
         target = find_target(path, "poses")
         if target.stream:
-            raise EdgeposeError(f"cannot write poses to {path}: an NPZ file needs a file's name")
+            raise EdgeposeError(f"cannot write poses to {path}: NPZ output needs the name of a file")
         self._part = part_path(path)
         if os.path.lexists(self._part):
             raise EdgeposeError(
-                f"{self._part} is there already, perhaps of a run that was cut off: keep its poses with "
+                f"{self._part} already exists, perhaps from a run that was cut off: save its poses with "
                 f"edgepose convert {self._part} --to npz --out saved, then delete it"
             )
         self._rate, self._closed, self._count = rate, False, 0
@@ -57,10 +57,10 @@ class NpzSink(Sink):
         self._count += 1
 
     def close(self) -> None:
-        """Write the file and take the other away; a second call does nothing.
+        """Write the NPZ file and delete the CSV file; a second call does nothing.
 
         Raises:
-            EdgeposeError: something could not be written; what was is in the CSV file.
+            EdgeposeError: something could not be written; the poses written so far are in the CSV file.
         """
         if self._closed:
             return
@@ -70,11 +70,11 @@ class NpzSink(Sink):
         self._closed = True
         try:
             self._csv.close()
-        finally:  # A full disk may have room for this one, which is smaller.
+        finally:  # a full disk may still have room for the NPZ file, which is smaller
             self._finish()
 
     def discard(self) -> None:
-        """As `close`."""
+        """Finish the file like `close`, unless no pose was written."""
         if self._count:
             self.close()
             return
@@ -87,7 +87,7 @@ class NpzSink(Sink):
                 count = sum(piece.count(b"\n") for piece in iter(lambda: file.read(1 << 20), b"")) - 1
         except OSError as error:
             raise EdgeposeError(
-                f"cannot write poses to {self._path}: {self._part}, which has them, is gone: "
+                f"cannot write poses to {self._path}: {self._part}, which holds them, cannot be read: "
                 f"{error.strerror or error}"
             ) from error
         if count > 0:
@@ -104,7 +104,7 @@ class NpzSink(Sink):
 
 
 def open_sink(target: str, context: SinkContext) -> Sink:
-    """An `NpzSink`; a device or pipe gets the file when it is whole."""
+    """Open an `NpzSink`; a device or pipe gets the file once it is complete."""
     rate, translation = context.rate, context.translation
     if target != "-" and is_stream(target):
         return SpooledSink(target, lambda part: NpzSink(part, rate, translation), context.stopped)

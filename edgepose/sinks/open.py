@@ -1,4 +1,4 @@
-"""Opens the outputs of a configuration."""
+"""Opening of the outputs of a configuration."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ def open_outputs(
     rate: float = 60.0,
     stopped: Callable[[], bool] = lambda: False,
 ) -> list[Sink]:
-    """The sinks of one wearer. No file takes its place before all of them are open.
+    """Open the sinks of one wearer. No file appears or is replaced before all of them are open.
 
     Args:
-        stack: closes them.
-        outputs: which ones.
+        stack: closes the sinks.
+        outputs: the outputs to open.
         rate: poses per second.
         stopped: whether the run is to end, see `SinkContext`.
 
@@ -48,6 +48,6 @@ def open_outputs(
             sinks.append(stack.enter_context(sink_factory(name)(target, context)))
     for sink in sinks:
         sink.start()
-    if outputs.view:  # what sees the viewer finds the files there
+    if outputs.view:  # last: when the viewer is up, the files exist
         sinks.append(stack.enter_context(sink_factory("view")(True, context)))
     return sinks

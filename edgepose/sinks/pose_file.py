@@ -1,4 +1,4 @@
-"""What outputs of poses to one growing file have in common: when it appears, is written and is finished."""
+"""Common base of outputs to one growing file: when it appears, is written and is finished."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from edgepose.utils.growing_files import FLUSH_S, GrowingFile
 
 
 class PoseFileSink(Sink):
-    """Gathers poses and writes them about once a second to a file that appears with the first of them."""
+    """Collects poses and writes them about once a second to a file that appears with the first pose."""
 
     def __init__(self, output: GrowingFile, head: bytes) -> None:
-        """Write what stands before the poses.
+        """Write the start of the file.
 
         Args:
             output: the open file, closed by this sink.
-            head: what it begins with.
+            head: content before the poses.
 
         Raises:
-            EdgeposeError: it cannot be written; the file is gone.
+            EdgeposeError: the start cannot be written; the file is deleted.
         """
         self._output = output
         self._closed, self._empty = False, True
@@ -35,23 +35,23 @@ class PoseFileSink(Sink):
 
     @abstractmethod
     def _add(self, pose: PoseFrame) -> bool:
-        """Gather a pose; whether it has to be written now."""
+        """Collect a pose; return whether it has to be written at once."""
 
     @abstractmethod
-    def _write_gathered(self) -> None:
-        """Write what is gathered, which may be nothing, and gather anew."""
+    def _write_collected(self) -> None:
+        """Write and forget the collected poses, of which there may be none."""
 
     def start(self) -> None:
-        """Let the file appear; where one is there already, with the first pose.
+        """Let the file appear; if it replaces an existing one, it appears with the first pose instead.
 
         Raises:
-            EdgeposeError: another file is there now.
+            EdgeposeError: another file has appeared there in the meantime.
         """
         if not self._output.exists:
             self._output.start()
 
     def write(self, pose: PoseFrame) -> None:
-        """Add a pose; a file has it on disk within about a second."""
+        """Add a pose; it is on disk within about a second."""
         if self._empty:
             self._empty = False
             self._output.start()
@@ -59,8 +59,10 @@ class PoseFileSink(Sink):
             self._flush()
 
     def close(self) -> None:
-        """Write what is still held back and close the file; standard output stays open. A file that is there
-        already stays if no pose has come."""
+        """Write the collected poses and close the file; standard output stays open.
+
+        An existing file is kept if no pose was written.
+        """
         if self._closed:
             return
         self._closed = True
@@ -70,7 +72,7 @@ class PoseFileSink(Sink):
             self._output.close()
 
     def discard(self) -> None:
-        """As `close`, but without a pose no file appears."""
+        """Finish the file like `close`, but no file appears if no pose was written."""
         if not self._empty:
             self.close()
             return
@@ -79,4 +81,4 @@ class PoseFileSink(Sink):
 
     def _flush(self) -> None:
         self._flushed = time.monotonic()
-        self._write_gathered()
+        self._write_collected()

@@ -1,4 +1,4 @@
-"""Files that only appear at the end, or are written to at their start again, to a device or pipe."""
+"""Output to a device or pipe in formats that cannot be streamed."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from edgepose.utils.output_streams import copy_to_stream
 
 
 class SpooledSink(Sink):
-    """Has a file written in a temporary folder, and copies it when it is whole."""
+    """Writes a file in a temporary folder, and copies it to the device or pipe once it is complete."""
 
     def __init__(self, path: str | Path, make: Callable[[Path], Sink], stopped: Callable[[], bool]) -> None:
         """Open the file in the temporary folder.
 
         Args:
-            path: of the device or pipe.
-            make: opens the sink of the file.
-            stopped: whether the run is to end: then a reader that takes nothing is not waited for.
+            path: the device or pipe.
+            make: opens the sink that writes the file.
+            stopped: whether the run is to end; a reader that has stopped reading is then not waited for.
 
         Raises:
-            EdgeposeError: there is no room for it.
+            EdgeposeError: the file cannot be opened.
         """
         self._path, self._stopped, self._closed = str(path), stopped, False
         self._folder = TemporaryDirectory()
@@ -42,18 +42,18 @@ class SpooledSink(Sink):
         """Copy the file; a second call does nothing.
 
         Raises:
-            EdgeposeError: the file could not be written, or not be copied.
+            EdgeposeError: the file could not be written or copied.
         """
         if self._closed:
             return
         self._closed = True
         with self._folder:
             self._sink.close()
-            if self._file.exists():  # not without poses
+            if self._file.exists():  # there is no file if there are no poses
                 copy_to_stream(self._file, self._path, "poses", self._stopped)
 
     def discard(self) -> None:
-        """Copy nothing."""
+        """Delete the file without copying it."""
         if not self._closed:
             self._closed = True
             with self._folder:

@@ -1,4 +1,4 @@
-"""Poses as text over TCP, as the Unity viewer of TransPose and its successors reads them."""
+"""Output as text over TCP, in the format of the Unity viewer of TransPose and its successors."""
 
 from __future__ import annotations
 
@@ -12,40 +12,40 @@ from edgepose.sinks.base import Sink, SinkContext
 from edgepose.utils.sockets import resolve
 
 CLIENTS = 16
-"""Viewers at a time; more are turned away."""
+"""Largest number of viewers at a time; further ones are rejected."""
 
 SEND_BUFFER = 16_384
-"""Bytes that the system holds back for a slow viewer, about 20 poses: it should see the newest ones."""
+"""Bytes that the system buffers for a slow viewer, about 20 poses; few, so that it sees the newest ones."""
 
 _TEXT = ",".join(["%g"] * 72) + "#%g,%g,%g$"
 
 
 def encode(pose: PoseFrame) -> bytes:
-    """72 axis-angle numbers in SMPL order, radians, "#", the pelvis' place, metres (0 if unknown), "$"."""
-    where = (0.0, 0.0, 0.0) if pose.translation is None else tuple(pose.translation)
-    return (_TEXT % (*matrix_to_rotvec(pose.rotations).ravel().tolist(), *where)).encode()
+    """Encode a pose: 72 axis-angle numbers, SMPL order, radians, "#", pelvis position, metres (or 0), "$"."""
+    translation = (0.0, 0.0, 0.0) if pose.translation is None else tuple(pose.translation)
+    return (_TEXT % (*matrix_to_rotvec(pose.rotations).ravel().tolist(), *translation)).encode()
 
 
 @dataclass
 class _Viewer:
-    """A connection, and what of a pose it has not taken yet."""
+    """A connection, and the unsent rest of a pose."""
 
     socket: socket.socket
     rest: bytes = b""
 
 
 class TcpSink(Sink):
-    """Waits for viewers and sends them each pose.
+    """Listens for viewers and sends them each pose.
 
-    A run goes on whether or not any come, go or read: one that is slow misses poses, which are counted in
-    `missed`, but gets none in part.
+    A run does not wait for viewers. A slow viewer misses poses, which are counted in `missed`, but never gets
+    a partial one.
     """
 
     def __init__(self, host: str, port: int) -> None:
-        """Listen at an address of this machine.
+        """Listen on an address of this machine.
 
         Raises:
-            EdgeposeError: it is not one, or another program listens there.
+            EdgeposeError: the address is not this machine's, or another program listens on it.
         """
         self.missed = 0
         self._viewers: list[_Viewer] = []
@@ -54,20 +54,19 @@ class TcpSink(Sink):
             self._server = socket.create_server(address[:2], family=family, backlog=CLIENTS)
         except (OSError, UnicodeError) as error:
             raise EdgeposeError(f"cannot listen for viewers at {host} port {port}: {error}") from error
-        self._server.setsockopt(
-            socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER
-        )  # its connections inherit it
+        # Connections inherit it.
+        self._server.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         self._server.setblocking(False)
 
     def write(self, pose: PoseFrame) -> None:
-        """Send a pose to the viewers that are there."""
+        """Send a pose to the connected viewers."""
         self._accept()
         if self._viewers:
             text = encode(pose)
             self._viewers = [viewer for viewer in self._viewers if self._offer(viewer, text)]
 
     def close(self) -> None:
-        """Hang up."""
+        """Close all connections."""
         for viewer in self._viewers:
             viewer.socket.close()
         self._viewers = []
@@ -76,7 +75,7 @@ class TcpSink(Sink):
     def _accept(self) -> None:
         try:
             connection, _ = self._server.accept()
-        except OSError:  # Nobody, or somebody who has left again.
+        except OSError:  # no connection is waiting, or it has been closed already
             return
         if len(self._viewers) == CLIENTS:
             connection.close()
@@ -86,7 +85,7 @@ class TcpSink(Sink):
         self._viewers.append(_Viewer(connection))
 
     def summary_lines(self) -> list[str]:
-        """How many poses viewers missed."""
+        """Return a line with the number of missed poses, if any."""
         return (
             [f"tcp      {self.missed} poses were missed by viewers that read too slowly"]
             if self.missed
@@ -94,7 +93,7 @@ class TcpSink(Sink):
         )
 
     def _offer(self, viewer: _Viewer, text: bytes) -> bool:
-        """Send what was begun, then the text if all of that has left; False where nobody is there."""
+        """Send the rest of an earlier pose, then the text; return False if the viewer has disconnected."""
         try:
             while viewer.rest or text:
                 if not viewer.rest:
@@ -109,5 +108,5 @@ class TcpSink(Sink):
 
 
 def open_sink(target: tuple[str, int], context: SinkContext) -> Sink:
-    """A `TcpSink` at a host and port."""
+    """Open a `TcpSink` on a host and port."""
     return TcpSink(*target)

@@ -1,4 +1,4 @@
-"""Poses over UDP, one datagram a frame, as JSON or binary. Layouts: docs/reference/outputs.md."""
+"""Output over UDP, one datagram per frame, as JSON or binary. Layouts: docs/reference/outputs.md."""
 
 from __future__ import annotations
 
@@ -31,33 +31,33 @@ _BINARY = struct.Struct("<4sBBBBdI96f")
 
 
 def encode_json(pose: PoseFrame) -> bytes:
-    """One line of JSON: frame, time_s, status, pose (72 axis-angle numbers in SMPL order, radians)."""
+    """Encode a pose as a line of JSON: frame, time_s, status, pose (72 axis-angle numbers, SMPL order)."""
     numbers = matrix_to_rotvec(pose.rotations).ravel().tolist()
     status = _quoted(format_status(pose.held, pose.warming_up))
     return (_JSON % (pose.index, pose.time_s, status, *numbers)).encode()
 
 
 def encode_binary(pose: PoseFrame) -> bytes:
-    """The binary datagram of a pose, 404 bytes."""
+    """Encode a pose as a binary datagram of 404 bytes."""
     flags = _FILLING_WINDOW if pose.warming_up else 0
     held = sum(1 << i for i, name in enumerate(PLACEMENTS) if name in pose.held)
     quats = matrix_to_quat(pose.rotations).ravel().tolist()
-    index = pose.index & 0xFFFFFFFF  # Wraps after two years at 60 Hz.
+    index = pose.index & 0xFFFFFFFF  # wraps after two years at 60 Hz
     return _BINARY.pack(MAGIC, VERSION, flags, held, len(JOINTS), pose.time_s, index, *quats)
 
 
 def decode_binary(datagram: bytes) -> PoseFrame:
-    """The pose in a binary datagram; `std`, which is not sent, is NaN.
+    """Decode a binary datagram; `std`, which is not sent, is NaN.
 
     Raises:
-        EdgeposeError: not a datagram of this kind and version, or its numbers are no rotations.
+        EdgeposeError: not a datagram of this kind and version, or its numbers are not rotations.
     """
     if len(datagram) != _BINARY.size or not datagram.startswith(MAGIC):
         raise EdgeposeError(f"not a pose datagram: {len(datagram)} bytes that begin with {datagram[:4]!r}")
     _, version, flags, held, joints, time_s, index, *numbers = _BINARY.unpack(datagram)
     if version != VERSION or joints != len(JOINTS):
         raise EdgeposeError(
-            f"pose datagram of version {version} with {joints} joints, this program knows 1 with 24"
+            f"pose datagram of version {version} with {joints} joints; supported is version 1 with 24"
         )
     quats = np.array(numbers).reshape(-1, 4)
     norms = np.linalg.norm(quats, axis=-1, keepdims=True)
@@ -72,7 +72,7 @@ def decode_binary(datagram: bytes) -> PoseFrame:
 
 
 def decode_json(datagram: bytes) -> PoseFrame:
-    """The pose in a JSON datagram; `std`, which is not sent, is NaN.
+    """Decode a JSON datagram; `std`, which is not sent, is NaN.
 
     Raises:
         EdgeposeError: not a datagram of this kind, or its numbers are not valid.
@@ -92,36 +92,36 @@ def decode_json(datagram: bytes) -> PoseFrame:
 
 
 def decode(datagram: bytes) -> PoseFrame:
-    """The pose in a datagram of either kind; see `decode_binary` and `decode_json`."""
+    """Decode a datagram of either kind; see `decode_binary` and `decode_json`."""
     return decode_binary(datagram) if datagram.startswith(MAGIC) else decode_json(datagram)
 
 
 class DatagramSink(Sink):
     """Sends each pose to one address.
 
-    A run goes on whether or not anybody listens: datagrams that could not be sent are counted in `unsent`.
+    A run does not depend on a listener: datagrams that could not be sent are counted in `unsent`.
     """
 
     NAME = "udp"
 
     def __init__(self, host: str, port: int) -> None:
-        """Resolve the host, once.
+        """Resolve the host name, once.
 
         Args:
             host: name or address.
             port: UDP port.
 
         Raises:
-            EdgeposeError: unknown host or no network to reach it.
+            EdgeposeError: the host is unknown, or there is no network to reach it.
         """
         self.unsent = 0
-        self._where = f"{host}:{port}"
+        self._address = f"{host}:{port}"
         try:
             family, address = resolve(host, port, socket.SOCK_DGRAM)
         except (OSError, UnicodeError) as error:
             raise EdgeposeError(f"cannot find host {host!r} to send poses to: {error}") from error
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)  # A full network queue costs a datagram, not the time of a frame.
+        self._socket.setblocking(False)  # a full network queue loses a datagram instead of delaying a frame
         try:
             self._socket.connect(address)
         except OSError as error:
@@ -132,7 +132,7 @@ class DatagramSink(Sink):
 
     @abstractmethod
     def encode(self, pose: PoseFrame) -> Sequence[bytes]:
-        """The datagrams of a pose."""
+        """Return the datagrams of a pose."""
 
     def write(self, pose: PoseFrame) -> None:
         """Send a pose."""
@@ -147,17 +147,17 @@ class DatagramSink(Sink):
         self._socket.close()
 
     def summary_lines(self) -> list[str]:
-        """How many datagrams did not arrive."""
+        """Return a line with the number of datagrams that did not arrive, if any."""
         if not self.unsent:
             return []
-        asked = f"is anything listening at {self._where}?"
-        return [f"{self.NAME}      {self.unsent} datagrams did not arrive; {asked}"]
+        question = f"is anything listening at {self._address}?"
+        return [f"{self.NAME}      {self.unsent} datagrams did not arrive; {question}"]
 
     def _send(self, datagram: bytes) -> None:
         try:
             self._socket.send(datagram)
         except ConnectionRefusedError:
-            # The answer to the datagram before, with nobody listening then; this one has not left yet.
+            # This reports that nothing received the previous datagram; the present one has not been sent yet.
             self.unsent += 1
             self._socket.send(datagram)
 
@@ -166,12 +166,12 @@ class UdpSink(DatagramSink):
     """Sends each pose as one datagram, JSON or binary."""
 
     def __init__(self, host: str, port: int, format: str = "json") -> None:
-        """Resolve the host; `format` is "json" or "binary". See `DatagramSink`."""
+        """Resolve the host name; `format` is "json" or "binary". See `DatagramSink`."""
         self._encode = {"json": encode_json, "binary": encode_binary}[format]
         super().__init__(host, port)
 
     def encode(self, pose: PoseFrame) -> Sequence[bytes]:
-        """The datagram of a pose."""
+        """Return the datagram of a pose."""
         return (self._encode(pose),)
 
 
@@ -181,5 +181,5 @@ def _quoted(text: str) -> str:
 
 
 def open_sink(target: Destination, context: SinkContext) -> Sink:
-    """A `UdpSink` to a destination."""
+    """Open a `UdpSink` to a destination."""
     return UdpSink(*target)

@@ -1,4 +1,4 @@
-"""Poses as a figure in the browser, by a process of its own that no run has to wait for."""
+"""Output to a figure in the browser, shown by a separate process that cannot delay the run."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from edgepose.sinks.base import Sink, SinkContext
 from edgepose.sinks.udp import UdpSink
 
 STOP_S = 5.0
-"""Time that the viewer has to end, seconds."""
+"""Longest time to wait for the viewer to exit, seconds."""
 
 
 def check_viewer() -> None:
-    """Raises EdgeposeError unless what the viewer needs is installed."""
+    """Raise EdgeposeError unless the packages that the viewer needs are installed."""
     if find_spec("viser") is None:
         raise EdgeposeError("the viewer needs viser: install it with pip install 'edgepose[view]'")
 
 
 class ViewSink(Sink):
-    """Starts `edgepose view` and sends it each pose as a datagram, of which it shows the newest."""
+    """Starts `edgepose view` and sends it each pose as a datagram; the viewer shows the newest one."""
 
     def __init__(self, height_m: float) -> None:
-        """Start the viewer; it prints on standard error where the page is.
+        """Start the viewer, which prints the address of its page on standard error.
 
         Args:
             height_m: stature of the figure, metres.
 
         Raises:
-            EdgeposeError: what the viewer needs is not installed.
+            EdgeposeError: a package that the viewer needs is not installed.
         """
         check_viewer()
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
@@ -45,11 +45,11 @@ class ViewSink(Sink):
         self._datagrams = UdpSink("127.0.0.1", port, "binary")
 
     def write(self, pose: PoseFrame) -> None:
-        """Send a pose. Whether it is shown does not matter: the viewer may have been closed."""
+        """Send a pose, even if the viewer has been closed."""
         self._datagrams.write(pose)
 
     def close(self) -> None:
-        """End the viewer; a second call does nothing."""
+        """Stop the viewer; a second call does nothing."""
         self._datagrams.close()
         self._viewer.terminate()
         try:
@@ -60,5 +60,5 @@ class ViewSink(Sink):
 
 
 def open_sink(target: bool, context: SinkContext) -> Sink:
-    """A `ViewSink`."""
+    """Open a `ViewSink`."""
     return ViewSink(context.height)

@@ -1,6 +1,6 @@
-"""Poses by the VMC protocol (Virtual Motion Capture, OSC over UDP), which programs for VRM avatars read.
+"""Output in the VMC protocol (Virtual Motion Capture, OSC over UDP), which programs for VRM avatars read.
 
-Version 2.0 of https://protocol.vmc.info; what is sent is described in docs/reference/outputs.md.
+Version 2.0 of https://protocol.vmc.info; docs/reference/outputs.md describes the messages.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ BONES = {
     "LeftHand": "left_wrist",
     "RightHand": "right_wrist",
 }
-"""Bones of VRM's humanoid and the joints that turn them.
+"""Bones of VRM's humanoid and the joints that move them.
 
-spine3 would be UpperChest, which an avatar may lack; Chest turns by spine2 and spine3 together instead, so
-that head and arms point the same way on every avatar.
+spine3 would be UpperChest, which an avatar may lack. Instead, Chest gets the rotations of spine2 and spine3
+combined, so that head and arms point the same way on every avatar.
 """
 
 _INDEX = [JOINTS.index(joint) for joint in BONES.values()]
@@ -50,7 +50,7 @@ _CHEST, _UPPER_CHEST = JOINTS.index("spine2"), JOINTS.index("spine3")
 _ON_UPPER_CHEST = [JOINTS.index(name) for name in ("neck", "left_collar", "right_collar")]
 
 TO_UNITY = np.array([-1.0, 1.0, 1.0])
-"""Ours is X left, Y up, Z forward; Unity's is X right: points are mirrored, turns about Y and Z reverse."""
+"""Mirrors points from T (X left, Y up, Z forward) to Unity, X right; rotations about Y and Z reverse."""
 
 
 def _string(text: str) -> bytes:
@@ -59,7 +59,7 @@ def _string(text: str) -> bytes:
 
 
 def _bundle(messages: Sequence[bytes]) -> bytes:
-    """An OSC bundle that is due at once."""
+    """Return an OSC bundle for immediate execution."""
     parts = [b"#bundle\0", struct.pack(">Q", 1)]
     for message in messages:
         parts += [struct.pack(">i", len(message)), message]
@@ -72,7 +72,7 @@ _ROOT += struct.pack(">7f", 0, 0, 0, 0, 0, 0, 1)
 _OK = _string("/VMC/Ext/OK") + _string(",i") + struct.pack(">i", 1)
 _TIME = _string("/VMC/Ext/T") + _string(",f")
 _HALF = (len(BONES) + 1) // 2
-"""Bones in the first datagram: more would not fit into an Ethernet frame with the rest."""
+"""Bones in the first datagram: with all of them it would not fit into an Ethernet frame."""
 
 
 class VmcSink(DatagramSink):
@@ -81,36 +81,36 @@ class VmcSink(DatagramSink):
     NAME = "osc"
 
     def __init__(self, host: str, port: int, body: Body | None = None) -> None:
-        """Resolve the host.
+        """Resolve the host name.
 
         Args:
             host: name or address.
             port: UDP port.
-            body: whose bone lengths are sent; the default body if None.
+            body: body whose bone lengths are sent; None for the default body.
         """
         offsets = (body or default_body()).offsets.copy()
         self._standing = standing_pelvis_position(offsets)
         offsets[_ON_UPPER_CHEST] += offsets[_UPPER_CHEST]
-        self._places = offsets[_INDEX] * TO_UNITY
+        self._positions = offsets[_INDEX] * TO_UNITY
         self._start_s: float | None = None
         super().__init__(host, port)
 
     def encode(self, pose: PoseFrame) -> Sequence[bytes]:
-        """The two bundles of a pose."""
+        """Return the two bundles of a pose."""
         if self._start_s is None:
             self._start_s = pose.time_s
         rotations = pose.rotations.copy()
         rotations[_CHEST] = rotations[_CHEST] @ rotations[_UPPER_CHEST]
         w, x, y, z = matrix_to_quat(rotations[_INDEX]).T
-        places = self._places.copy()
-        places[0] = (self._standing if pose.translation is None else pose.translation) * TO_UNITY
-        numbers = np.column_stack([places, x, -y, -z, w]).astype(">f4")
+        positions = self._positions.copy()
+        positions[0] = (self._standing if pose.translation is None else pose.translation) * TO_UNITY
+        numbers = np.column_stack([positions, x, -y, -z, w]).astype(">f4")
         bones = [head + row.tobytes() for head, row in zip(_BONE_HEADS, numbers, strict=True)]
-        # Relative, because single precision keeps no fractions of a second of Unix time.
+        # Relative, because single precision cannot hold fractions of a second of Unix time.
         time_s = _TIME + struct.pack(">f", pose.time_s - self._start_s)
         return _bundle([_OK, time_s, _ROOT, *bones[:_HALF]]), _bundle([time_s, *bones[_HALF:]])
 
 
 def open_sink(target: tuple[str, int], context: SinkContext) -> Sink:
-    """A `VmcSink` to a host and port."""
+    """Open a `VmcSink` to a host and port."""
     return VmcSink(*target, context.body)

@@ -1,12 +1,12 @@
-"""Where samples come from. A source is a context manager to iterate over once; it yields batches of samples.
+"""Sources of samples: context managers that can be iterated over once and yield batches of samples.
 
     with open_source(port="/dev/ttyUSB0") as source:
         for batch in source:
             ...
 
-A live source's clock is Unix time, taken once in a process and carried on by the monotonic clock, so that it
-never jumps; a batch comes at least every 20 ms, empty if need be, also while a line has disappeared. Files
-have their own times.
+A live source's clock is Unix time, read once per process and continued by the monotonic clock, so that it
+never jumps. A live source yields a batch at least every 20 ms, an empty one if nothing came, even while a
+line is disconnected. Files keep their own times.
 """
 
 from __future__ import annotations
@@ -22,14 +22,15 @@ from edgepose.sources.clock_sync import DeviceClock
 
 
 class Batch(NamedTuple):
-    """What came together.
+    """Samples that came together.
 
     Attributes:
         now_s: time on the source's clock up to which everything has been delivered, seconds.
-        samples: in the order in which they came.
-        raw: what came over live lines: Unix time of arrival, s, and bytes or a CAN message; nothing in files.
-        backlog_s: how long the batch had waited to be taken, at most, seconds; 0 for files unless they come
-            at their own pace.
+        samples: the samples, in order of arrival.
+        raw: the undecoded data of live lines: Unix time of arrival, s, and bytes or a CAN message; empty for
+            files.
+        backlog_s: longest time that the batch may have waited before it was read, seconds; 0 for files unless
+            they are replayed at their own pace.
     """
 
     now_s: float
@@ -39,20 +40,20 @@ class Batch(NamedTuple):
 
 
 Batches = Generator[Batch, None, None]
-"""Closing it ends the reading, without waiting for what is under way."""
+"""Closing the generator ends the reading, without waiting for a read in progress."""
 
 POLL_S = 0.02
 """Longest time between two batches of a live source, seconds."""
 
 
 class SourceCounters(NamedTuple):
-    """What has come in so far, for the summary at the end.
+    """Counts of the packets received so far.
 
     Attributes:
         packets: good packets or samples.
-        lost: packets missing from the devices' counts.
-        bad: pieces of the stream that were no valid packet.
-        unknown: good packets of ids that belong to no placement.
+        lost: packets missing, by the devices' counters.
+        bad: pieces of the stream that were not a valid packet.
+        unknown: good packets with ids that belong to no placement.
     """
 
     packets: int = 0
@@ -62,11 +63,11 @@ class SourceCounters(NamedTuple):
 
 
 class Device(NamedTuple):
-    """What the samples of a placement come from.
+    """The device that sends a placement's samples.
 
     Attributes:
         protocol: name of its wire format.
-        line: its port or bus; None in a file, which does not always say.
+        line: its port or bus; None for a file, which does not always name it.
         id: its id on the line.
     """
 
@@ -75,16 +76,16 @@ class Device(NamedTuple):
     id: int
 
     def __str__(self) -> str:
-        """As a message has it."""
+        """Description for a message."""
         return f"{self.protocol} id {self.id}{'' if self.line is None else f' on {self.line}'}"
 
 
 class Source(AbstractContextManager["Source"], Protocol):
-    """See the module's text."""
+    """The interface of sources; see the module's docstring."""
 
     @property
     def counters(self) -> SourceCounters:
-        """What has come in so far."""
+        """Counts of the packets received so far."""
 
     @property
     def clocks(self) -> Mapping[int, DeviceClock]:
@@ -92,23 +93,22 @@ class Source(AbstractContextManager["Source"], Protocol):
 
     @property
     def devices(self) -> Mapping[int, Device]:
-        """What has sent samples so far, by placement; of recordings nobody knows."""
+        """Devices that have sent samples so far, by placement; empty for recordings."""
 
     @property
     def damage(self) -> str | None:
-        """One line for the user if something was wrong with the input although the rest of it was
-        delivered."""
+        """One line for the user if part of the input was bad although the rest of it was delivered."""
 
     def __iter__(self) -> Batches:
-        """Batches, in order.
+        """Yield batches, in order.
 
         Raises:
-            EdgeposeError: the input ended in an error; all that was good has been yielded before.
+            EdgeposeError: the input ended in an error; all good samples before it have been yielded.
         """
 
 
 def sum_counters(counters: Iterable[SourceCounters]) -> SourceCounters:
-    """Counters of several lines together."""
+    """Add up the counters of several lines."""
     return SourceCounters(*(sum(column) for column in zip(SourceCounters(), *counters, strict=True)))
 
 
@@ -126,30 +126,30 @@ def open_source(
     lenient: bool = False,
     blocking: bool = True,
 ) -> Source:
-    """The source that the options ask for; nothing is opened before it is entered.
+    """Return the source that the options describe; nothing is opened before it is entered.
 
     Args:
         port: serial ports, separated by commas.
-        baud: their speed, bit/s; None is the protocol's usual one, or 115200.
+        baud: speed of the ports, bit/s; None means the protocol's usual speed, or 115200.
         can: CAN bus, INTERFACE:CHANNEL.
-        bitrate: its speed, bit/s; None is the protocol's usual one, or 500000.
-        fd: take CAN FD frames too.
+        bitrate: speed of the bus, bit/s; None means the protocol's usual speed, or 500000.
+        fd: receive CAN FD frames too.
         file: recording of any format ("-" is CSV on stdin), raw serial capture (.bin, .raw) or log of a CAN
             bus.
-        realtime: deliver a file at its own pace.
+        realtime: replay a file at its own pace.
         protocol: name of a wire format, a TOML file that describes text lines, or "auto".
-        sensors: map of devices to placements; ports and buses that it names need no `port` and `can`.
-        lenient: take what there is: of a recording the good rows of any sensors, of lines those that speak;
-            those that do not are told and waited for.
-        blocking: a batch may take as long as the module's text says; if not, it is there at once, empty where
-            nothing has come, for those who look after several sources.
+        sensors: map of devices to placements; ports and buses that it names need no `port` or `can`.
+        lenient: accept incomplete input: the good rows of a recording, with any number of sensors, and the
+            lines that send; lines that do not are warned about and waited for.
+        blocking: wait for a batch as the module's docstring describes; if false, return one at once, empty if
+            nothing has come, for callers that read several sources.
 
     Raises:
-        EdgeposeError: no input or two; a protocol, kind of file or entry of the map that means nothing.
+        EdgeposeError: no input or more than one; an unknown protocol or kind of file; an invalid map.
     """
     if file is not None and (port is not None or can is not None):
         raise EdgeposeError("give one input: --port or --can, or --file")
-    # What the kinds of input need is imported only for them.
+    # Imported only here: each kind of input has dependencies of its own.
     from edgepose.sources.sensor_map import read_map
 
     sensor_map = None if sensors is None else read_map(Path(sensors))

@@ -1,4 +1,4 @@
-"""Frames of a CAN bus and of logs of one, through python-can."""
+"""CAN buses as transports, and logs of CAN buses, through python-can."""
 
 from __future__ import annotations
 
@@ -14,37 +14,37 @@ import can
 
 from edgepose.errors import DeviceError, FileFormatError
 from edgepose.sources import POLL_S
-from edgepose.sources.live import LineDisconnectedError
+from edgepose.sources.line_reader import LineDisconnectedError
 
-# It tells of every maker's library that is not installed, and of every clock that is not.
+# python-can warns about every vendor library and every clock that is not installed.
 logging.getLogger("can").setLevel(logging.CRITICAL)
 
 _LATEST_S = 1e11  # 5000 years of Unix time
 _BLF_OBJECT, _BLF_HEAD = b"LOBJ", struct.Struct("<4sHHII")
 _MOST = 256
-"""Messages read at a time."""
+"""Most messages read at a time."""
 
 
 class Buffered:
-    """A serial port whose bytes are fetched all at once, however few of them are asked for.
+    """A serial port that fetches all available bytes at once, however few of them are read.
 
-    python-can reads slcan adapters byte by byte. At two system calls each, the frames of six sensors take it
-    4 ms, and where devices send no time these would be an error of their times.
+    python-can reads slcan adapters byte by byte, with two system calls per byte. The frames of six sensors
+    would take 4 ms, which would add to the error of the arrival times of devices that send no time.
     """
 
     def __init__(self, port: Any) -> None:
-        """Nothing fetched yet."""
+        """Start with an empty buffer."""
         self._port = port
         self._data = b""
         self._at = 0
 
     @property
     def in_waiting(self) -> int:
-        """Bytes that can be read without waiting; those fetched already, if there are any."""
+        """Number of bytes that can be read without waiting: those in the buffer, if any, or in the port."""
         return len(self._data) - self._at or self._port.in_waiting
 
     def read(self, size: int = 1) -> bytes:
-        """Up to so many bytes; waits for the first one for as long as the port does."""
+        """Read up to `size` bytes, waiting for the first as long as the port does."""
         if self._at == len(self._data):
             self._data = self._port.read(1)
             self._data += self._port.read(self._port.in_waiting)
@@ -54,31 +54,31 @@ class Buffered:
         return data
 
     def reset_input_buffer(self) -> None:
-        """Throws away what came."""
+        """Discard all data received so far."""
         self._data, self._at = b"", 0
         self._port.reset_input_buffer()
 
     def __getattr__(self, name: str) -> Any:
-        """All else is the port's."""
+        """Forward everything else to the port."""
         return getattr(self._port, name)
 
 
 class CanBus:
-    """An open bus.
+    """An open CAN bus.
 
     Attributes:
-        waiting: see `live.Handle`; python-can's interfaces differ in whether they can be looked at.
+        waiting: see `Transport.waiting`; None, because not all of python-can's interfaces can be polled.
     """
 
     waiting = None
 
     def __init__(self, name: str, bitrate: int, fd: bool) -> None:
-        """Open it.
+        """Open the bus.
 
         Args:
-            name: INTERFACE:CHANNEL, as python-can names them.
-            bitrate: speed, bit/s, for interfaces that are set up here; the system sets that of SocketCAN.
-            fd: take CAN FD frames too.
+            name: INTERFACE:CHANNEL, in python-can's names.
+            bitrate: speed, bit/s, for interfaces that python-can configures; the system sets SocketCAN's.
+            fd: receive CAN FD frames too.
 
         Raises:
             DeviceError: no such interface or channel, or it cannot be opened.
@@ -90,7 +90,7 @@ class CanBus:
         flags: dict[str, Any] = {"fd": True} if fd else {}
         try:
             self._bus = can.Bus(channel or None, interface, bitrate=bitrate, **flags)
-        # Every maker's library fails in its own way.
+        # Vendor libraries raise arbitrary exceptions.
         except Exception as error:
             raise DeviceError(f"{name}: {_opening_problem(interface, channel, error)}") from None
         self._port: Buffered | None = None
@@ -99,21 +99,21 @@ class CanBus:
             self._port = bus.serialPortOrig = Buffered(bus.serialPortOrig)
 
     def read(self) -> tuple[list[can.Message], bool]:
-        """See `live.Handle`."""
+        """See `Transport.read`."""
         messages: list[can.Message] = []
         timeout = POLL_S
         try:
             while len(messages) < _MOST:
                 try:
                     message = self._bus.recv(timeout)
-                except (ValueError, IndexError):  # slcan's line was damaged
+                except (ValueError, IndexError):  # a corrupted slcan line
                     continue
                 if message is None:
                     return messages, False
                 timeout = 0.0
                 if not message.is_error_frame and not message.is_remote_frame:
                     messages.append(message)
-                # To ask slcan for what is not there takes a millisecond.
+                # Reading an empty slcan port takes a millisecond.
                 if self._port is not None and not self._port.in_waiting:
                     return messages, False
         except (can.CanError, OSError):
@@ -122,8 +122,8 @@ class CanBus:
         return messages, True
 
     def close(self) -> None:
-        """See `live.Handle`."""
-        with contextlib.suppress(can.CanError, OSError):  # it may have gone already
+        """See `Transport.close`."""
+        with contextlib.suppress(can.CanError, OSError):  # it may be disconnected already
             self._bus.shutdown()
 
 
@@ -135,22 +135,22 @@ def _opening_problem(interface: str, channel: str, error: Exception) -> str:
             f"sudo ip link set {channel or 'can0'} up type can bitrate 500000"
         )
     if isinstance(error, can.CanInterfaceNotImplementedError | ImportError):
-        return f"python-can cannot use this interface here: {text}; install the maker's driver and library"
-    return f"cannot open it: {text}; see python-can's page on {interface} for how its channels are named"
+        return f"python-can cannot use this interface here: {text}; install the vendor's driver and library"
+    return f"cannot open it: {text}; see python-can's page on {interface} for the names of its channels"
 
 
 class _BlfReader(can.BLFReader):
-    """Ends where python-can's would turn in a circle: at an object that says it is shorter than its head."""
+    """A BLF reader that stops at an object whose stated size is below its header's: python-can would loop."""
 
     def _parse_data(self, data: bytes) -> Iterator[can.Message]:
-        end = _circle(data)
+        end = _find_empty_object(data)
         yield from super()._parse_data(data if end is None else data[:end])
         if end is not None:
             raise ValueError("damaged: an object in it has no length")
 
 
-def _circle(data: bytes) -> int | None:
-    """Where the first object without a length is in a container of a BLF file; None if there is none."""
+def _find_empty_object(data: bytes) -> int | None:
+    """Return the offset of the first object without a length in a BLF container; None if there is none."""
     at = data.find(_BLF_OBJECT, 0, 8)
     while at >= 0 and at + _BLF_HEAD.size <= len(data):
         size = _BLF_HEAD.unpack_from(data, at)[3]
@@ -161,9 +161,9 @@ def _circle(data: bytes) -> int | None:
 
 
 def _check_table(path: Path) -> None:
-    """Raises ValueError unless the messages of an SQLite log are a table.
+    """Raise ValueError unless the messages of an SQLite log are a table.
 
-    A view can be without an end, and SQLite looks at no signal while it computes one.
+    A view can be endless, and SQLite cannot be interrupted by a signal while it computes one.
     """
     with contextlib.closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as log:
         row = log.execute("SELECT type, sql FROM sqlite_master WHERE name = 'messages'").fetchone()
@@ -178,7 +178,7 @@ def _open_log(path: Path) -> Any:
 
 
 def _is_good(message: can.Message) -> bool:
-    """Whether what a log says of a frame can be: logs are files of anyone, and readers do not look."""
+    """Whether a frame's time and id are possible; logs are untrusted files, and python-can does not check."""
     return (
         isinstance(message.timestamp, int | float)
         and abs(message.timestamp) < _LATEST_S
@@ -188,10 +188,12 @@ def _is_good(message: can.Message) -> bool:
 
 
 def read_log(path: Path) -> Iterator[tuple[str, float, list[can.Message] | None]]:
-    """Channel, time in seconds, and message, of a log, in its order; None for one whose time or id cannot be.
+    """Yield channel, time in seconds and message of each frame of a log, in the file's order.
+
+    The message is None if its time or id is impossible.
 
     Raises:
-        FileFormatError: it cannot be read, at once or up to its end.
+        FileFormatError: the log cannot be read, from its start or to its end.
     """
     try:
         with _open_log(path) as messages:
@@ -205,7 +207,7 @@ def read_log(path: Path) -> Iterator[tuple[str, float, list[can.Message] | None]
                     yield channel, 0.0, None
     except OSError as error:
         raise FileFormatError(f"{path}: cannot read it: {error.strerror or error}") from None
-    # The readers of the formats fail in many ways.
+    # python-can's readers raise arbitrary exceptions for damaged files.
     except Exception as error:
         text = (str(error).splitlines() or [""])[0] or type(error).__name__
         raise FileFormatError(f"{path}: cannot read it as a log of a CAN bus: {text}") from None

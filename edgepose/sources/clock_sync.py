@@ -1,7 +1,7 @@
-"""Device clocks on the source's time line: jitter of arrival taken out, drift followed, reboots survived.
+"""Mapping of device clocks to the source's clock, free of arrival jitter, robust to drift and reboots.
 
-A device stamps samples with microseconds that start at any value and wrap, those of native packets after 71.6
-minutes; or with nothing, and then arrivals have to do.
+A device stamps samples with microseconds that start at any value and wrap (in native packets after 71.6
+minutes). Samples without time stamps are timed by their arrivals.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from math import inf, nan
 import numpy as np
 
 WRAP_US = 1 << 32
-"""Where the clocks of native packets wrap, microseconds."""
+"""Value at which the clocks of native packets wrap, microseconds."""
 
 STEP_S = 1e-6
 """Smallest step between two times of one sensor, seconds."""
@@ -20,25 +20,23 @@ STEP_S = 1e-6
 FOLLOWED_PPM = 200.0
 """Largest drift of a device's clock that is followed, parts per million."""
 
-_LATE_S = 0.05
-_LATE_FOR_S = 1.0
-_DRIFT_S, _DRIFT_BLOCKS, _DRIFT_LEAST = 1.0, 120, 8  # the fastest arrival of each second tells the drift
-_AHEAD_S = 1.0
-_BACK_S = 0.1
+_LATE_S, _LATE_FOR_S = 0.05, 1.0  # lateness, and for how long, that restarts the offset
+_DRIFT_S, _DRIFT_BLOCKS, _DRIFT_LEAST = 1.0, 120, 8  # drift is fitted to the fastest arrival of each second
+_AHEAD_S, _BACK_S = 1.0, 0.1  # jumps ahead and back that are reboots
 
-
+# Gains of ArrivalClock: of the times for early and for late arrivals, and of the period.
 _PULL_BACK, _PULL_ON, _PULL_PERIOD = 0.5, 0.05, 0.02
-_FIRST = 16  # arrivals that tell the period
-_CHECK, _WRONG = 50, 0.1  # arrivals after which it is checked, and the error that is corrected at once
+_FIRST = 16  # arrivals that give the first estimate of the period
+_CHECK, _WRONG = 50, 0.1  # arrivals between checks of the period, and the relative error that resets it
 _UNEVEN_S = 0.02  # a USB converter delivers every 16 ms
 _SHORTEST_S = 0.0005  # period
 _PAUSE_S, _PAUSE_PERIODS = 0.25, 4.0
 
 
 def unwrap(t_us: int, expected_s: float, wrap_us: int = WRAP_US) -> float:
-    """Seconds of a microsecond clock that wraps, in the turn that comes nearest to the expected time."""
-    turns = round((expected_s * 1e6 - t_us) / wrap_us)
-    return (t_us + turns * wrap_us) * 1e-6
+    """Unwrap a microsecond clock to the seconds nearest to the expected time."""
+    wraps = round((expected_s * 1e6 - t_us) / wrap_us)
+    return (t_us + wraps * wrap_us) * 1e-6
 
 
 class DeviceClock:
@@ -46,16 +44,16 @@ class DeviceClock:
 
     A packet can come late but never early, so `arrival - device time` is the clocks' offset plus a delay that
     is often near its smallest value. The offset is therefore a leaky minimum: it drops at once and rises by
-    200 ppm, more than quartz clocks drift apart. A device that rebooted (its time jumps back, or ahead of
-    what has passed here) starts a new offset, and so does one that has been later than 50 ms for a whole
-    second: its clock stood still, or it runs on something worse than quartz.
+    200 ppm, more than quartz clocks drift apart. The offset is estimated from scratch if the device rebooted
+    (its time jumps back, or ahead of the time that has passed here) or has been late by more than 50 ms for a
+    whole second (its clock was stopped, or is worse than quartz).
 
     Attributes:
-        resets: times the offset began anew.
+        resets: number of times the offset was estimated from scratch.
     """
 
     def __init__(self, wrap_us: int = WRAP_US) -> None:
-        """Start with no packet seen; the clock wraps at wrap_us."""
+        """Create the clock; device times wrap at wrap_us."""
         self.resets = 0
         self._wrap_us = wrap_us
         self._started = False
@@ -63,13 +61,13 @@ class DeviceClock:
         self._arrival_s = 0.0
         self._offset = 0.0
         self._result = 0.0
-        self._window_s = 0.0  # arrival time at which the present look-out for lateness began
+        self._window_s = 0.0  # arrival time at which the present watch for lateness began
         self._least_late = 0.0
-        # Since the offset began anew: start of a second, and least arrival less device time in it.
+        # Per second since the last reset: its start, and the least arrival minus device time in it.
         self._fastest: deque[tuple[float, float]] = deque(maxlen=_DRIFT_BLOCKS)
 
     def host_time(self, t_us: int, arrival_s: float) -> float:
-        """Host time of a measurement, seconds; always larger than that of the call before.
+        """Return the host time of a measurement, seconds; always later than the previous call's result.
 
         Args:
             t_us: device time, microseconds modulo wrap_us.
@@ -88,13 +86,12 @@ class DeviceClock:
             self._restart(t_us, arrival_s)
         elif step > 0:
             if arrival_s - self._arrival_s > _LATE_FOR_S:
-                # One packet after a pause is no proof: a second of them is.
+                # One late packet after a pause proves nothing; a second of late packets does.
                 self._window_s, self._least_late = arrival_s, inf
             self._device_s, self._arrival_s = device_s, arrival_s
-            self._note_delay(arrival_s, arrival_s - device_s)
-            rise = min(
-                FOLLOWED_PPM * 1e-6 * step, late
-            )  # negative where this packet came faster than any before
+            self._add_delay(arrival_s, arrival_s - device_s)
+            # Negative if this packet came faster than any before.
+            rise = min(FOLLOWED_PPM * 1e-6 * step, late)
             self._offset += rise
             self._least_late = min(self._least_late, late - rise)
             if arrival_s - self._window_s > _LATE_FOR_S:
@@ -111,20 +108,21 @@ class DeviceClock:
         return unwrap(t_us, self._device_s, self._wrap_us) + self._offset
 
     def drift_ppm(self) -> tuple[float, float]:
-        """What the device's clock loses against the host's, and the standard error of that, parts per
-        million; NaN in the first seconds.
+        """Return the device clock's loss against the host's and its standard error, parts per million.
+
+        Both are NaN in the first seconds.
         """
         if len(self._fastest) < _DRIFT_LEAST:
             return nan, nan
-        noted = np.array(self._fastest)
-        arrival_s, delay_s = (noted - noted.mean(axis=0)).T
+        fastest = np.array(self._fastest)
+        arrival_s, delay_s = (fastest - fastest.mean(axis=0)).T
         square = float(arrival_s @ arrival_s)
         slope = float(arrival_s @ delay_s) / square
-        rest = delay_s - slope * arrival_s
-        error = float(np.sqrt(rest @ rest / (len(rest) - 2) / square))
+        residuals = delay_s - slope * arrival_s
+        error = float(np.sqrt(residuals @ residuals / (len(residuals) - 2) / square))
         return 1e6 * slope, 1e6 * error
 
-    def _note_delay(self, arrival_s: float, delay_s: float) -> None:
+    def _add_delay(self, arrival_s: float, delay_s: float) -> None:
         if self._fastest and arrival_s - self._fastest[-1][0] < _DRIFT_S:
             start_s, least_s = self._fastest[-1]
             if delay_s < least_s:
@@ -141,34 +139,35 @@ class DeviceClock:
 
 
 class ArrivalClock:
-    """Times of one sensor's samples that come without any: arrivals, with the line's unevenness taken out.
+    """Times one sensor's samples by their arrivals, smoothed, if the device sends no time stamps.
 
-    A steady rate is assumed, and followed: where a line delivers several samples at once they are a period
-    apart. As nothing comes before it is measured, an early arrival corrects the times at once and a late one
-    slowly, unless it is so late that samples must be missing. After a pause the times begin anew, and with
-    another rate if the first one was wrong: samples that have waited in a buffer come at none.
+    The sensor is assumed to have a steady rate, which is followed: samples that a line delivers all at once
+    are timed one period apart. As no sample comes before it was measured, an early arrival corrects the times
+    at once, a late one slowly, unless it is so late that samples must be missing. After a pause the times
+    start again from the arrival. A period estimated from buffered samples, which come at no steady rate, is
+    detected and replaced.
     """
 
     def __init__(self) -> None:
-        """Start with no packet seen."""
+        """Create the clock."""
         self._count = 0
         self._checked = (0, 0.0)  # count and arrival at the last check of the period
-        self._mean_s = 0.0  # interval before it
+        self._mean_s = 0.0  # mean interval before that check
         self._first_s = 0.0
         self._period_s = 0.0
         self._result = -inf
 
     def host_time(self, arrival_s: float) -> float:
-        """Host time of a measurement, seconds; always larger than that of the call before."""
+        """Return the host time of a measurement, seconds; always later than the previous call's result."""
         self._count += 1
         expected_s = self._result + self._period_s
         late = arrival_s - expected_s
-        if self._is_wrong(arrival_s):
+        if self._correct_period(arrival_s):
             time_s = arrival_s
         elif self._count == 1:
             self._first_s = time_s = arrival_s
         elif late > max(_PAUSE_S, _PAUSE_PERIODS * self._period_s):
-            # The period is as it was, if it is known.
+            # A period that is known already is kept.
             if self._count <= _FIRST:
                 self._count, self._first_s = 1, arrival_s
             self._checked = (self._count, arrival_s)
@@ -188,14 +187,14 @@ class ArrivalClock:
         self._result = max(self._result + STEP_S, time_s)
         return self._result
 
-    def _is_wrong(self, arrival_s: float) -> bool:
-        """If the newest arrivals have shown, and corrected, a period that is far off."""
+    def _correct_period(self, arrival_s: float) -> bool:
+        """Replace the period if recent arrivals show that it is far off; return whether it was replaced."""
         count, checked_s = self._checked
         if self._count - count < _CHECK:
             return False
         before_s, self._mean_s = self._mean_s, (arrival_s - checked_s) / (self._count - count)
         self._checked = (self._count, arrival_s)
-        # Twice alike: one stretch alone may have a gap or a crowd in it.
+        # Two stretches must agree: a single one may contain a gap or a burst.
         if abs(self._mean_s - before_s) > _WRONG * before_s:
             return False
         if abs(self._mean_s - self._period_s) <= _WRONG * self._period_s or self._mean_s < _SHORTEST_S:
@@ -205,20 +204,20 @@ class ArrivalClock:
 
 
 class HostClocks:
-    """The clocks of all sensors on a line whose arrivals are known.
+    """The clocks of all sensors on a line with known arrival times.
 
     Attributes:
-        devices: of the sensors that send a time.
+        devices: clocks of the sensors that send a time.
     """
 
     def __init__(self, wrap_us: int) -> None:
-        """Start with no packet seen; the devices' clocks wrap at wrap_us."""
+        """Create the clocks; device times wrap at wrap_us."""
         self.devices: dict[int, DeviceClock] = {}
         self._arrivals: dict[int, ArrivalClock] = {}
         self._wrap_us = wrap_us
 
     def time(self, sensor: int, t_us: int | None, arrival_s: float) -> float:
-        """Host time of a measurement, seconds; t_us is None where the device sends no time."""
+        """Return the host time of a measurement, seconds; t_us is None if the device sends no time."""
         if t_us is not None:
             clock = self.devices.get(sensor)
             if clock is None:
@@ -231,27 +230,27 @@ class HostClocks:
 
 
 class CaptureClock:
-    """Device clocks of a raw capture, where arrival times are not known: device time is the time line.
+    """Device clocks of a raw capture without arrival times: the first sensor's clock is the reference.
 
-    The first sensor's clock leads. Another one that is more than a second away from it, and any that jumps
-    back or ahead (reboot; a pause over a minute), is set to the newest time reached.
+    Another sensor's clock that starts more than a second away from it, and any clock that jumps back or ahead
+    (reboot; a pause over a minute), is set to the newest time reached.
     """
 
     def __init__(self, wrap_us: int = WRAP_US) -> None:
-        """Start with no packet seen; the clocks wrap at wrap_us."""
+        """Create the clocks; device times wrap at wrap_us."""
         self._wrap_us = wrap_us
         self._now: float | None = None
         self._offsets: dict[int, float] = {}
         self._last: dict[int, float] = {}  # result of each sensor's last packet
 
     def time(self, sensor: int, t_us: int) -> float:
-        """Time of a measurement, seconds; always larger than that of the sensor's packet before."""
+        """Return the time of a measurement, seconds; always later than the sensor's previous one."""
         last = self._last.get(sensor)
         now = t_us * 1e-6 if self._now is None else self._now
         offset = self._offsets.get(sensor, 0.0)
         result = unwrap(t_us, (now if last is None else last) - offset, self._wrap_us) + offset
-        strange = abs(result - now) > 1.0 if last is None else not -_BACK_S < result - last < 60.0
-        if strange:
+        jumped = abs(result - now) > 1.0 if last is None else not -_BACK_S < result - last < 60.0
+        if jumped:
             self._offsets[sensor] = now - t_us * 1e-6
             result = now
         if last is not None:

@@ -1,4 +1,4 @@
-"""The lines that the flags and the map of sensors name."""
+"""Specifications of the lines named by the flags and the sensor map."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from collections.abc import Callable, Sequence
 
 from edgepose.errors import ConfigError
 from edgepose.sources.line_decoder import PlacementById
-from edgepose.sources.live import LineSpec, Transport
+from edgepose.sources.line_reader import LineSpec, Transport
 from edgepose.sources.protocol_detection import candidate_protocols
 from edgepose.sources.sensor_map import PortSettings, SensorMap, channel, default_places
 from firmware_protocols.registry import Protocol
 
 BAUD = 115200
-"""Speed of a serial port of which nothing is known, bit/s."""
+"""Default speed of a serial port, bit/s."""
 
 BITRATE = 500_000
-"""Speed of a CAN bus of which nothing is known, bit/s."""
+"""Default speed of a CAN bus, bit/s."""
 
 
 def line_specs(
@@ -27,13 +27,13 @@ def line_specs(
     protocol: str,
     sensor_map: SensorMap | None,
 ) -> list[LineSpec]:
-    """Ports and buses to listen to; the arguments are those of `open_source`.
+    """Return the ports and buses to read from; the arguments are those of `open_source`.
 
     Raises:
-        ConfigError: there are none, a name is wrong, or the map names another one.
+        ConfigError: there are none, a name is invalid, or the map names a line that the flags do not.
     """
-    ports = _names("--port", port)
-    buses = _names("--can", can)
+    ports = _split_names("--port", port)
+    buses = _split_names("--can", can)
     if sensor_map is not None:
         if not ports and not buses:
             ports, buses = sensor_map.lines("port"), sensor_map.lines("can")
@@ -41,8 +41,8 @@ def line_specs(
         for name, device in sensor_map.devices.items():
             if device.line is not None and device.line not in known:
                 raise ConfigError(
-                    f"{sensor_map.path}: {name}: {device.port or device.can} is none of "
-                    f"{', '.join([*ports, *buses])}, which --port and --can name"
+                    f"{sensor_map.path}: {name}: {device.port or device.can} is not one of the lines given "
+                    f"with --port and --can: {', '.join([*ports, *buses])}"
                 )
         for name in sensor_map.ports:
             if name not in ports and name not in buses:
@@ -56,27 +56,27 @@ def line_specs(
         if ":" not in bus:
             raise ConfigError(f"{bus}: give --can as INTERFACE:CHANNEL, such as socketcan:can0")
 
-    def places(line: str, index: int) -> Callable[[Protocol], PlacementById]:
+    def placements(line: str, index: int) -> Callable[[Protocol], PlacementById]:
         if sensor_map is not None:
-            return lambda spoken: sensor_map.places(line)
-        return lambda spoken: default_places(line, spoken, index, count)
+            return lambda found: sensor_map.places(line)
+        return lambda found: default_places(line, found, index, count)
 
     result = []
     for index, name in enumerate([*ports, *buses]):
         settings = PortSettings() if sensor_map is None else sensor_map.settings(name)
-        spoken = settings.protocol or protocol
+        line_protocol = settings.protocol or protocol
         if index < len(ports):
-            link = serial_link(name, spoken, settings.baud or baud, places(name, index))
+            spec = serial_line(name, line_protocol, settings.baud or baud, placements(name, index))
         else:
-            link = can_link(name, spoken, settings.baud or bitrate, fd, places(name, index))
-        result.append(link)
+            spec = can_line(name, line_protocol, settings.baud or bitrate, fd, placements(name, index))
+        result.append(spec)
     return result
 
 
-def serial_link(
-    name: str, protocol: str, baud: int | None, places: Callable[[Protocol], PlacementById]
+def serial_line(
+    name: str, protocol: str, baud: int | None, placements: Callable[[Protocol], PlacementById]
 ) -> LineSpec:
-    """One serial port.
+    """Return the specification of a serial port.
 
     Raises:
         ConfigError: no such protocol.
@@ -86,26 +86,24 @@ def serial_link(
     speed = baud or (named.default_bitrate if named else BAUD)
     requests: list[tuple[bytes, int]] = []
     if named is not None and named.request is not None:
-        requests = [named.request(sensor) for sensor in places(named) if sensor is not None]
+        requests = [named.request(sensor) for sensor in placements(named) if sensor is not None]
         if not requests:
-            raise ConfigError(
-                f"{name}: devices of {named.name} are asked by id; give their ids with --sensors"
-            )
+            raise ConfigError(f"{name}: {named.name} devices are polled by id; give their ids with --sensors")
 
-    def open_it() -> Transport:
-        # pyserial is not needed to read files.
+    def open_port() -> Transport:
+        # Imported only here: pyserial is not needed to read files.
         from edgepose.sources.serial_port import SerialPort
 
         return SerialPort(name, speed, requests)
 
     check = ("--port and that the device is on and sending", f"--baud (now {speed}) and --protocol")
-    return LineSpec(name, open_it, protocols, places, "bytes", check)
+    return LineSpec(name, open_port, protocols, placements, "bytes", check)
 
 
-def can_link(
-    name: str, protocol: str, bitrate: int | None, fd: bool, places: Callable[[Protocol], PlacementById]
+def can_line(
+    name: str, protocol: str, bitrate: int | None, fd: bool, placements: Callable[[Protocol], PlacementById]
 ) -> LineSpec:
-    """One CAN bus.
+    """Return the specification of a CAN bus.
 
     Raises:
         ConfigError: no such protocol.
@@ -113,8 +111,8 @@ def can_link(
     protocols = candidate_protocols(protocol, "can", live=True)
     speed = bitrate or (protocols[0].default_bitrate if len(protocols) == 1 else BITRATE)
 
-    def open_it() -> Transport:
-        # python-can takes a while to import.
+    def open_bus() -> Transport:
+        # Imported only here: python-can takes a while to import.
         from edgepose.sources.can_bus import CanBus
 
         return CanBus(name, speed, fd)
@@ -123,14 +121,14 @@ def can_link(
         f"that the devices are on and that --bitrate (now {speed}) is theirs",
         "--protocol, --fd and the ids that the devices are set to",
     )
-    return LineSpec(name, open_it, protocols, places, "frames", check)
+    return LineSpec(name, open_bus, protocols, placements, "frames", check)
 
 
-def _names(flag: str, text: str | None) -> Sequence[str]:
+def _split_names(flag: str, text: str | None) -> Sequence[str]:
     names = [] if text is None else [name.strip() for name in text.split(",")]
     for i, name in enumerate(names):
         if not name:
             raise ConfigError(f"{flag} {text}: an empty name between commas")
         if name in names[:i]:
-            raise ConfigError(f"{flag} {text}: {name} is there twice")
+            raise ConfigError(f"{flag} {text}: {name} is given twice")
     return names

@@ -1,4 +1,4 @@
-"""What comes over one line, to samples of placements: the same for live lines and for logs of them."""
+"""Decoding of one line's data to samples with placements, for live lines and for their logs."""
 
 from __future__ import annotations
 
@@ -16,44 +16,44 @@ from firmware_protocols.sample import Sample
 _log = logging.getLogger(__name__)
 
 LISTEN_S = 1.0
-"""How long a line is listened to before what it speaks is decided on weak evidence, seconds."""
+"""Time after which a line's protocol is decided on weak evidence, seconds."""
 
 LISTEN_BYTES = 1 << 16
-"""The same for captures, which have no times."""
+"""Amount of data with the same effect, for captures without times."""
 
 PlacementById = Mapping[int | None, int]
-"""Index into PLACEMENTS by the device's id on the line; None stands for the only device, whatever its id."""
+"""Index into PLACEMENTS by device id on the line; the key None is the only device, whatever its id."""
 
 Clock = Callable[[int, int | None, float], float]
-"""Time of a measurement, seconds, of sensor, device time in microseconds, and arrival in seconds."""
+"""Time of a measurement, seconds, from placement index, device time in us and arrival in seconds."""
 
 
 class LineDecoder:
-    """Detection, decoder, clocks, counters and the map from ids to placements of one line.
+    """Protocol detection, decoder, clock, counters and the map from ids to placements of one line.
 
     Attributes:
         name: port, bus or file, for messages.
-        protocol: what the line speaks, None until that is known.
+        protocol: the line's protocol; None until it is known.
         first_s: arrival of the first chunk.
-        amount: bytes or frames that came.
+        amount: bytes or frames received so far.
     """
 
     def __init__(
         self,
         name: str,
         protocols: Sequence[Protocol],
-        places: Callable[[Protocol], PlacementById],
+        placements: Callable[[Protocol], PlacementById],
         clock: Callable[[int], Clock],
         placement_owner: dict[int, str],
     ) -> None:
-        """Start with nothing seen.
+        """Create the decoder.
 
         Args:
             name: port, bus or file, for messages.
-            protocols: what the line may speak.
-            places: the line's map of ids, once the protocol is known.
-            clock: makes the line's clock, given where the devices' times wrap, microseconds.
-            placement_owner: placements that have come, with the name of their line; shared by all lines.
+            protocols: protocols that the line may use.
+            placements: returns the line's map of ids, once the protocol is known.
+            clock: makes the line's clock, given the value at which device times wrap, microseconds.
+            placement_owner: name of the line that sends each placement's samples; shared by all lines.
         """
         self.name = name
         self.protocol: Protocol | None = None
@@ -61,20 +61,20 @@ class LineDecoder:
         self.amount = 0
         self._arrival_s = 0.0
         self._detector: Detector | None = Detector(name, protocols)
-        self._places_of = places
-        self._clock_of = clock
+        self._make_placements = placements
+        self._make_clock = clock
         self._placement_owner = placement_owner
         self._decoder: Decoder | None = None
         self._clock: Clock | None = None
-        self._places: PlacementById = {}
-        self._known: dict[int, int] = {}  # placement by id, of those that have come
+        self._placements: PlacementById = {}
+        self._known: dict[int, int] = {}  # placement by id, for the ids seen so far
         self._unknown: dict[int, int] = {}  # packets by id
         if len(protocols) == 1:
-            self._settle(protocols[0], self._detector.decoders[0])
+            self._set_protocol(protocols[0], self._detector.decoders[0])
 
     @property
     def counters(self) -> SourceCounters:
-        """What has come in so far."""
+        """Counts of the packets received so far."""
         if self._decoder is None:
             return SourceCounters()
         c = self._decoder.counters
@@ -83,9 +83,9 @@ class LineDecoder:
 
     @property
     def devices(self) -> dict[int, Device]:
-        """What has sent samples, by placement."""
-        spoken = "" if self.protocol is None else self.protocol.name
-        return {place: Device(spoken, self.name, sensor) for sensor, place in self._known.items()}
+        """Devices that have sent samples, by placement."""
+        protocol = "" if self.protocol is None else self.protocol.name
+        return {placement: Device(protocol, self.name, sensor) for sensor, placement in self._known.items()}
 
     @property
     def unknown_ids(self) -> list[int]:
@@ -95,17 +95,17 @@ class LineDecoder:
     @property
     def ids(self) -> str:
         """The ids that belong to placements, for a message."""
-        return format_ids(sorted(sensor for sensor in self._places if sensor is not None))
+        return format_ids(sorted(sensor for sensor in self._placements if sensor is not None))
 
     def feed(self, chunk: Chunk, arrival_s: float) -> list[ImuSample]:
-        """Samples completed by what comes next.
+        """Return the samples completed by a chunk.
 
         Args:
             chunk: bytes or frames.
-            arrival_s: when they came, seconds; NaN if nobody knows.
+            arrival_s: time at which they came, seconds; NaN if unknown.
 
         Raises:
-            EdgeposeError: formats fit equally well; it is not known where the sensors sit; or a device's
+            EdgeposeError: formats fit equally well; the sensors' placements are unknown; or a device's
                 inertial frame points down.
         """
         self.amount += len(chunk)
@@ -119,7 +119,7 @@ class LineDecoder:
         return self._decide(arrival_s - self.first_s >= LISTEN_S or self.amount >= LISTEN_BYTES)
 
     def finish(self) -> list[ImuSample]:
-        """What is held back at the end of a log."""
+        """Return the samples still held back at the end of a log."""
         result = [] if self._detector is None else self._decide(True)
         if self._decoder is not None:
             result += self._take(self._decoder.flush(), self._arrival_s)
@@ -130,53 +130,54 @@ class LineDecoder:
         found = self._detector.best(now)
         if found is None:
             return []
-        protocol, decoder, heard = found
-        self._settle(protocol, decoder)
+        protocol, decoder, decoded = found
+        self._set_protocol(protocol, decoder)
         _log.info("%s: protocol %s", self.name, protocol.name)
-        return [sample for arrival_s, samples in heard for sample in self._take(samples, arrival_s)]
+        return [sample for arrival_s, samples in decoded for sample in self._take(samples, arrival_s)]
 
-    def _settle(self, protocol: Protocol, decoder: Decoder) -> None:
+    def _set_protocol(self, protocol: Protocol, decoder: Decoder) -> None:
         self.protocol, self._decoder = protocol, decoder
         self._detector = None
-        self._places = self._places_of(protocol)
-        self._clock = self._clock_of(decoder.WRAP_US)
+        self._placements = self._make_placements(protocol)
+        self._clock = self._make_clock(decoder.WRAP_US)
 
     def _take(self, samples: Sequence[Sample], arrival_s: float) -> list[ImuSample]:
         assert self._clock is not None
         assert self._decoder is not None
         result = []
         for sensor, time_us, quat, acc, gyr, mag, _ in samples:
-            place = self._known.get(sensor)
-            if place is None:
-                place = self._find(sensor)
-                if place is None:
+            placement = self._known.get(sensor)
+            if placement is None:
+                placement = self._find_placement(sensor)
+                if placement is None:
                     continue
-            result.append(ImuSample(place, self._clock(place, time_us, arrival_s), quat, acc, gyr, mag))
+            time_s = self._clock(placement, time_us, arrival_s)
+            result.append(ImuSample(placement, time_s, quat, acc, gyr, mag))
         if self._decoder.infos:
             self._check_frames(self._decoder.infos)
         return result
 
-    def _find(self, sensor: int) -> int | None:
-        """Placement of a sensor that has not come before, or that has none."""
-        place = self._places.get(sensor)
-        # Of a line with one device, the first id that comes is its.
-        if place is None and not self._known:
-            place = self._places.get(None)
-        if place is None:
+    def _find_placement(self, sensor: int) -> int | None:
+        """Return the placement of an id not seen before; None, and count the packet, if it has none."""
+        placement = self._placements.get(sensor)
+        # On a line with a single device, the first id seen is that device's.
+        if placement is None and not self._known:
+            placement = self._placements.get(None)
+        if placement is None:
             if sensor not in self._unknown:
                 _log.warning(
-                    "%s: packets of sensor id %d are left out; ids are %s", self.name, sensor, self.ids
+                    "%s: ignoring packets of sensor id %d; expected ids are %s", self.name, sensor, self.ids
                 )
             self._unknown[sensor] = self._unknown.get(sensor, 0) + 1
             return None
-        other = self._placement_owner.setdefault(place, self.name)
+        other = self._placement_owner.setdefault(placement, self.name)
         if other != self.name:
             raise EdgeposeError(
-                f"{other} and {self.name} both have a sensor for {PLACEMENTS[place]}, id {sensor}; "
-                "give each sensor an id of its own, or say with --sensors which is where"
+                f"{other} and {self.name} both have a sensor for {PLACEMENTS[placement]}, id {sensor}; "
+                "give each sensor its own id, or assign sensors to placements with --sensors"
             )
-        self._known[sensor] = place
-        return place
+        self._known[sensor] = placement
+        return placement
 
     def _check_frames(self, infos: Mapping[int, DeviceInfo]) -> None:
         for sensor, info in infos.items():
@@ -188,7 +189,7 @@ class LineDecoder:
 
 
 def format_ids(ids: Sequence[int]) -> str:
-    """Ids for a message: "0 to 5", or one by one."""
+    """Format ids for a message: "0 to 5", or one by one."""
     if len(ids) > 2 and list(ids) == list(range(ids[0], ids[0] + len(ids))):
         return f"{ids[0]} to {ids[-1]}"
-    return ", ".join(map(str, ids)) or "any, of one sensor"
+    return ", ".join(map(str, ids)) or "any, from a single sensor"

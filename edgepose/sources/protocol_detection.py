@@ -1,4 +1,4 @@
-"""Finds out what a line speaks: every decoder listens, the one that understands it is chosen."""
+"""Protocol detection: all decoders listen to a line, and the one that decodes it best is chosen."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from firmware_protocols.sample import Sample
 Chunk = bytes | list[Any]
 """Bytes of a serial line, or messages (`can.Message`) of a bus."""
 
-Heard = list[tuple[float, list[Sample]]]
-"""Arrival, seconds, and samples."""
+DecodedChunks = list[tuple[float, list[Sample]]]
+"""Arrival time, seconds, and samples of each chunk that completed any."""
 
 SURE_PACKETS = 10
-"""So many good packets of one format, and none of any other, need no further listening."""
+"""Good packets of one format that settle the matter at once, if no other format has any."""
 
 LEAST_PACKETS = 3
-"""Fewer good packets prove nothing."""
+"""Fewest good packets that count as evidence."""
 
 
 def decode(decoder: Decoder, chunk: Chunk) -> list[Sample]:
-    """Samples that a chunk completes."""
+    """Return the samples completed by a chunk."""
     if isinstance(chunk, bytes):
         return decoder.feed(chunk)
     samples: list[Sample] = []
@@ -35,10 +35,10 @@ def decode(decoder: Decoder, chunk: Chunk) -> list[Sample]:
 
 
 def protocol_named(name: str) -> Protocol:
-    """A protocol of the table, or the text lines that a TOML file describes.
+    """Return the protocol of that name, or the text protocol that a TOML file of that name describes.
 
     Raises:
-        ConfigError: there is none, or it does not fit.
+        ConfigError: no such protocol, or the file is not valid.
     """
     if name.endswith(".toml"):
         return _text_lines(Path(name))
@@ -48,22 +48,22 @@ def protocol_named(name: str) -> Protocol:
 
 
 def candidate_protocols(name: str, transport: Literal["bytes", "can"], live: bool) -> list[Protocol]:
-    """The protocols that a line may speak.
+    """Return the protocols that a line may use.
 
     Args:
-        name: one of them, or "auto".
-        transport: of the line.
-        live: the line has devices on it; those that want to be asked are not found by listening.
+        name: name of a protocol, or "auto".
+        transport: kind of line.
+        live: the line has devices on it; listening cannot find those that have to be polled.
 
     Raises:
-        ConfigError: no such protocol, it is one of another transport, or a package for it is missing.
+        ConfigError: no such protocol, it is for another transport, or a package for it is missing.
     """
     if name != "auto":
         protocol = protocol_named(name)
         if protocol.transport != transport:
-            where = "CAN" if protocol.transport == "can" else "serial lines"
+            transport_name = "CAN buses" if protocol.transport == "can" else "serial lines"
             flag = "--can" if protocol.transport == "can" else "--port"
-            raise ConfigError(f"protocol {name} is one of {where}; use it with {flag} or a log of one")
+            raise ConfigError(f"protocol {name} is for {transport_name}; use it with {flag} or a log of one")
         return [protocol]
     # Two names can stand for one decoder.
     first = {
@@ -75,17 +75,17 @@ def candidate_protocols(name: str, transport: Literal["bytes", "can"], live: boo
 
 
 class Detector:
-    """Listens to a line with the decoders of several protocols.
+    """The decoders of several protocols, all fed with one line's data.
 
     Attributes:
-        decoders: one for each protocol that can be listened for.
+        decoders: one for each protocol whose packages are installed.
     """
 
     def __init__(self, name: str, protocols: Sequence[Protocol]) -> None:
-        """Start with nothing heard.
+        """Create the decoders.
 
         Args:
-            name: of the line, for messages.
+            name: name of the line, for messages.
             protocols: the candidates.
 
         Raises:
@@ -94,45 +94,45 @@ class Detector:
         self._name = name
         self._protocols: list[Protocol] = []
         self.decoders: list[Decoder] = []
-        self._heard: list[Heard] = []
+        self._decoded: list[DecodedChunks] = []
         for protocol in protocols:
             try:
                 decoder = protocol.decoder()
-            except RuntimeError as error:  # an optional package
+            except RuntimeError as error:  # an optional package is missing
                 if len(protocols) == 1:
                     raise ConfigError(str(error)) from None
                 continue
             self._protocols.append(protocol)
             self.decoders.append(decoder)
-            self._heard.append([])
+            self._decoded.append([])
 
     def feed(self, chunk: Chunk, arrival_s: float) -> None:
-        """Listen to what came at a time, seconds."""
-        for decoder, heard in zip(self.decoders, self._heard, strict=True):
+        """Pass a chunk that came at a time, seconds, to all decoders."""
+        for decoder, decoded in zip(self.decoders, self._decoded, strict=True):
             samples = decode(decoder, chunk)
             if samples:
-                heard.append((arrival_s, samples))
+                decoded.append((arrival_s, samples))
 
-    def best(self, now: bool) -> tuple[Protocol, Decoder, Heard] | None:
-        """The protocol that the line speaks, its decoder, and what that has heard; None if it is not clear.
+    def best(self, now: bool) -> tuple[Protocol, Decoder, DecodedChunks] | None:
+        """Return the line's protocol, its decoder, and the samples decoded so far; None if not yet clear.
 
         Args:
             now: decide on weak evidence too.
 
         Raises:
-            ConfigError: two fit equally well.
+            ConfigError: two protocols fit equally well.
         """
-        heard = [i for i, samples in enumerate(self._heard) if samples]
-        most = max((self.decoders[i].counters.packets for i in heard), default=0)
-        # Decoders of text lines can understand some columns of another format, as many times.
-        close = [i for i in heard if 2 * self.decoders[i].counters.packets >= most]
+        active = [i for i, chunks in enumerate(self._decoded) if chunks]
+        most = max((self.decoders[i].counters.packets for i in active), default=0)
+        # A text decoder can find some of its columns in another text format, in as many lines.
+        close = [i for i in active if 2 * self.decoders[i].counters.packets >= most]
         close.sort(key=self._quantities, reverse=True)
         if not close:
             return None
         best = close[0]
         packets, bad = self.decoders[best].counters.packets, self.decoders[best].counters.bad
-        # A line that is heard from the middle of a packet begins with a bad one.
-        sure = len(heard) == 1 and packets >= SURE_PACKETS and bad <= 1
+        # One bad packet is expected: listening may start in the middle of one.
+        sure = len(active) == 1 and packets >= SURE_PACKETS and bad <= 1
         if not sure and not (now and packets >= LEAST_PACKETS and 2 * packets >= bad):
             return None
         for other in close[1:]:
@@ -140,13 +140,13 @@ class Detector:
                 raise ConfigError(
                     f"{self._name}: it could be {self._protocols[best].name} ({packets} good packets) or "
                     f"{self._protocols[other].name} ({self.decoders[other].counters.packets}); "
-                    "say which with --protocol"
+                    "choose one with --protocol"
                 )
-        return self._protocols[best], self.decoders[best], self._heard[best]
+        return self._protocols[best], self.decoders[best], self._decoded[best]
 
     def _quantities(self, i: int) -> int:
-        """How much there is in the last good packet of a decoder."""
-        return sum(value is not None for value in self._heard[i][-1][1][-1][2:])
+        """Return the number of quantities in a decoder's last good packet."""
+        return sum(value is not None for value in self._decoded[i][-1][1][-1][2:])
 
 
 def _text_lines(path: Path) -> Protocol:

@@ -1,4 +1,4 @@
-"""Samples from recordings of any format, raw captures of a serial port, and logs of CAN buses."""
+"""Samples from recordings of any format, raw captures of serial ports, and logs of CAN buses."""
 
 from __future__ import annotations
 
@@ -31,9 +31,10 @@ CAPTURES = (".bin", ".raw")
 CAN_LOGS = (".asc", ".blf", ".log", ".mf4", ".trc", ".db")
 """Endings of logs that python-can reads, besides .csv."""
 
-Chunks = Callable[[Path], Iterator[tuple[str, float, Chunk | None]]]
+ChunkReader = Callable[[Path], Iterator[tuple[str, float, Chunk | None]]]
+"""Yields the chunks of a file: name of the line, time in seconds, and data; None for data that is bad."""
 
-_SLICE_S = 0.01
+_SLICE_S = 0.01  # length of a batch
 
 
 class RecordingSource:
@@ -47,12 +48,12 @@ class RecordingSource:
         blocking: bool = True,
         ids: Mapping[int, str] | None = None,
     ) -> None:
-        """Nothing is read yet.
+        """Store the settings; `__enter__` reads the file.
 
         Args:
             path: the file, or the folder of a session.
             realtime: deliver it at its own pace.
-            lenient: take the good rows of any sensors; without, all six and no bad row.
+            lenient: accept the good rows of any sensors; otherwise all six sensors and no bad row.
             blocking: see `open_source`.
             ids: placements by serial number, see `read_recording`.
         """
@@ -64,29 +65,29 @@ class RecordingSource:
 
     @property
     def counters(self) -> SourceCounters:
-        """What has come in so far."""
+        """Counts of the samples delivered so far."""
         return SourceCounters(self._packets)
 
     @property
     def clocks(self) -> Mapping[int, DeviceClock]:
-        """Always none: a recording has one clock."""
+        """Always empty: a recording has one clock."""
         return {}
 
     @property
     def devices(self) -> Mapping[int, Device]:
-        """Always none: a recording holds placements."""
+        """Always empty: a recording names placements, not devices."""
         return {}
 
     @property
     def damage(self) -> str | None:
-        """What is wrong with the file; the rest of it is delivered."""
+        """Description of the bad part of the file; the rest of it is delivered."""
         return self._recording.damage if self._recording else None
 
     def __enter__(self) -> RecordingSource:
         """Read the file.
 
         Raises:
-            EdgeposeError: it is no recording.
+            EdgeposeError: it is not a recording.
         """
         self._recording = self._read(self._path, self._ids)
         return self
@@ -97,7 +98,7 @@ class RecordingSource:
         """Nothing is open."""
 
     def __iter__(self) -> Batches:
-        """All samples in time order, a hundredth of a second at a time."""
+        """Yield all samples in time order, a hundredth of a second at a time."""
         assert self._recording is not None, "the source has not been entered"
         rows = iter_samples(self._recording)
         for now_s, batch, late_s in _batches(rows, self._realtime, self._blocking):
@@ -106,65 +107,65 @@ class RecordingSource:
 
 
 class LogSource:
-    """What came over a serial port or CAN buses, in a file."""
+    """A file with the undecoded data of a serial port or of CAN buses."""
 
     def __init__(
         self,
         path: Path,
         realtime: bool,
-        chunks: Chunks,
-        stream: Callable[[str], LineDecoder],
+        read_chunks: ChunkReader,
+        make_decoder: Callable[[str], LineDecoder],
         blocking: bool = True,
     ) -> None:
-        """Nothing is opened yet.
+        """Store the settings; iteration opens the file.
 
         Args:
             path: the file.
             realtime: deliver it at its own pace.
-            chunks: reads the file: name of a line, time in seconds, and what came over it, None if it is bad.
-            stream: makes the stream of a line.
+            read_chunks: reads the file.
+            make_decoder: makes the decoder of a line, given its name.
             blocking: see `open_source`.
         """
         self._path = path
         self._realtime, self._blocking = realtime, blocking
-        self._chunks = chunks
-        self._stream = stream
-        self._streams: dict[str, LineDecoder] = {}
+        self._read_chunks = read_chunks
+        self._make_decoder = make_decoder
+        self._decoders: dict[str, LineDecoder] = {}
         self._bad = 0
 
     @property
     def counters(self) -> SourceCounters:
-        """What has come in so far."""
+        """Counts of the packets decoded so far."""
         return sum_counters(
-            [SourceCounters(bad=self._bad), *(stream.counters for stream in self._streams.values())]
+            [SourceCounters(bad=self._bad), *(decoder.counters for decoder in self._decoders.values())]
         )
 
     @property
     def clocks(self) -> Mapping[int, DeviceClock]:
-        """Always none: most logs do not say when what came."""
+        """Always empty: most logs have no arrival times to compare device clocks with."""
         return {}
 
     @property
     def devices(self) -> Mapping[int, Device]:
-        """What has sent samples so far, by placement."""
+        """Devices that have sent samples so far, by placement."""
         return {
-            place: device._replace(line=None)
-            for stream in self._streams.values()
-            for place, device in stream.devices.items()
+            placement: device._replace(line=None)
+            for decoder in self._decoders.values()
+            for placement, device in decoder.devices.items()
         }
 
     @property
     def damage(self) -> str | None:
-        """Frames of a log that cannot be; a log may start and end anywhere."""
+        """Number of impossible frames; partial packets do not count: a log may start and end anywhere."""
         if not self._bad:
             return None
-        return f"{self._path}: {self._bad} of its frames have no possible time or id; they are left out"
+        return f"{self._path}: ignored {self._bad} frames with an impossible time or id"
 
     def __enter__(self) -> LogSource:
         """Check that the file can be read.
 
         Raises:
-            EdgeposeError: it cannot.
+            EdgeposeError: it cannot be read.
         """
         try:
             with self._path.open("rb"):
@@ -178,7 +179,7 @@ class LogSource:
         """Nothing is open."""
 
     def __iter__(self) -> Batches:
-        """All samples in the order of the file.
+        """Yield all samples in the order of the file.
 
         Raises:
             EdgeposeError: the file cannot be read to its end, or there is no packet in it.
@@ -189,32 +190,30 @@ class LogSource:
             raise EdgeposeError(f"{self._path}: {self._problem()}")
 
     def _samples(self) -> Iterator[ImuSample]:
-        for name, time_s, chunk in self._chunks(self._path):
+        for name, time_s, chunk in self._read_chunks(self._path):
             if chunk is None:
                 self._bad += 1
                 continue
-            stream = self._streams.get(name)
-            if stream is None:
-                stream = self._streams[name] = self._stream(name)
-            yield from stream.feed(chunk, time_s)
-        for stream in self._streams.values():
-            yield from stream.finish()
+            decoder = self._decoders.get(name)
+            if decoder is None:
+                decoder = self._decoders[name] = self._make_decoder(name)
+            yield from decoder.feed(chunk, time_s)
+        for decoder in self._decoders.values():
+            yield from decoder.finish()
 
     def _problem(self) -> str:
-        streams = self._streams.values()
-        unknown = sorted({sensor for stream in streams for sensor in stream.unknown_ids})
+        decoders = self._decoders.values()
+        unknown = sorted({sensor for decoder in decoders for sensor in decoder.unknown_ids})
         if unknown:
-            expected = next(stream.ids for stream in streams if stream.unknown_ids)
+            expected = next(decoder.ids for decoder in decoders if decoder.unknown_ids)
             return (
-                f"packets only of sensor ids {', '.join(map(str, unknown))}, and known are {expected}; "
-                "say with --sensors which is where"
+                f"packets come only from sensor ids {', '.join(map(str, unknown))}, but the expected ids are "
+                f"{expected}; assign ids to placements with --sensors"
             )
-        protocols = {stream.protocol.name for stream in streams if stream.protocol is not None}
-        what = " or ".join(sorted(protocols)) or "known"
-        amount = sum(stream.amount for stream in streams)
-        return (
-            f"not one {what} packet in {amount} bytes or frames; is it a raw capture? if so, check --protocol"
-        )
+        protocols = {decoder.protocol.name for decoder in decoders if decoder.protocol is not None}
+        kind = " or ".join(sorted(protocols)) or "known"
+        amount = sum(decoder.amount for decoder in decoders)
+        return f"no {kind} packet in {amount} bytes or frames; is it a raw capture? if so, check --protocol"
 
 
 def open_file(
@@ -225,14 +224,14 @@ def open_file(
     lenient: bool = False,
     blocking: bool = True,
 ) -> Source:
-    """The source that a file is; the arguments are those of `edgepose.sources.open_source`.
+    """Return the source for a file; the arguments are those of `edgepose.sources.open_source`.
 
     Raises:
-        EdgeposeError: its kind, or the protocol, is not known.
+        EdgeposeError: the kind of file, or the protocol, is unknown.
     """
     if is_recording(path):
         if protocol != "auto":
-            protocol_named(protocol)  # a wrong name is told although it would not be needed
+            protocol_named(protocol)  # raises for an unknown name, although a recording needs no protocol
         ids = None if sensor_map is None else sensor_map.serial_numbers()
         return RecordingSource(path, realtime, lenient, blocking, ids)
     named = None if protocol == "auto" else protocol_named(protocol)
@@ -240,26 +239,25 @@ def open_file(
         from edgepose.sources.can_bus import read_log
 
         protocols = candidate_protocols(protocol, "can", live=False)
-        return LogSource(
-            path, realtime, read_log, _streams(path, protocols, sensor_map, _log_clock), blocking
-        )
+        make_decoder = _decoder_factory(path, protocols, sensor_map, _log_clock)
+        return LogSource(path, realtime, read_log, make_decoder, blocking)
     if path.suffix.lower() in CAPTURES or (named is not None and named.transport == "bytes"):
         protocols = candidate_protocols(protocol, "bytes", live=False)
-        streams = _streams(path, protocols, sensor_map, _capture_clock)
-        return LogSource(path, realtime, _read_capture, streams, blocking)
+        make_decoder = _decoder_factory(path, protocols, sensor_map, _capture_clock)
+        return LogSource(path, realtime, _read_capture, make_decoder, blocking)
     if not path.suffix and not path.exists():
         raise EdgeposeError(f"{path}: no such file or folder")
     raise EdgeposeError(
         f"{path}: unknown kind of file; recordings end in {', '.join(recording_suffixes())}, logs of CAN "
-        f"buses in {', '.join(CAN_LOGS)}, raw serial captures in {' or '.join(CAPTURES)} (with --protocol in "
-        "anything else)"
+        f"buses in {', '.join(CAN_LOGS)}, raw serial captures in {' or '.join(CAPTURES)} (or anything else, "
+        "with --protocol)"
     )
 
 
 def is_recording(path: Path) -> bool:
     """Whether a file is a recording, by its ending; a .csv may be a log of a CAN bus, by its first line.
 
-    A folder is taken for one: where none is in it, reading tells.
+    A folder counts as a recording; reading it fails if it holds none.
     """
     if str(path) == "-" or path.is_dir():
         return True
@@ -274,29 +272,29 @@ def is_can_log(path: Path) -> bool:
     try:
         with path.open("rb") as file:
             return file.readline(1000).startswith(b"timestamp,arbitration_id,")
-    except OSError:  # told where it is read
+    except OSError:  # reported when the file is read
         return False
 
 
-def _streams(
+def _decoder_factory(
     path: Path,
     protocols: Sequence[Protocol],
     sensor_map: SensorMap | None,
     clock: Callable[[str], Callable[[int], Clock]],
 ) -> Callable[[str], LineDecoder]:
-    """Makes the streams of a file's lines."""
-    claimed: dict[int, str] = {}
+    """Return a function that makes the decoder of one of a file's lines, given the line's name."""
+    placement_owner: dict[int, str] = {}
 
     def make(name: str) -> LineDecoder:
-        whole = f"{path}: channel {name}" if name else str(path)
+        full_name = f"{path}: channel {name}" if name else str(path)
 
-        def places(protocol: Protocol) -> PlacementById:
+        def placements(protocol: Protocol) -> PlacementById:
             if sensor_map is None:
-                return default_places(whole, protocol, 0, 1)
-            # A capture does not say of which port it is.
+                return default_places(full_name, protocol, 0, 1)
+            # A capture does not name its port.
             return sensor_map.places(name) if name else sensor_map.all_places()
 
-        return LineDecoder(whole, protocols, places, clock(whole), claimed)
+        return LineDecoder(full_name, protocols, placements, clock(full_name), placement_owner)
 
     return make
 
@@ -306,7 +304,7 @@ def _log_clock(name: str) -> Callable[[int], Clock]:
 
 
 def _capture_clock(name: str) -> Callable[[int], Clock]:
-    """Where nobody noted when the bytes came, device time is the clock."""
+    """Return a factory of clocks: host time where arrivals are known, device time elsewhere."""
 
     def make(wrap_us: int) -> Clock:
         capture, host = CaptureClock(wrap_us), HostClocks(wrap_us)
@@ -316,8 +314,8 @@ def _capture_clock(name: str) -> Callable[[int], Clock]:
                 return host.time(sensor, t_us, arrival_s)
             if t_us is None:
                 raise EdgeposeError(
-                    f"{name}: its packets carry no time, and nobody noted when they came; "
-                    "make captures with edgepose record, or switch the device's time on"
+                    f"{name}: neither its packets nor the capture hold times; "
+                    "make captures with edgepose record, or switch on the device's time"
                 )
             return capture.time(sensor, t_us)
 
@@ -334,8 +332,11 @@ def _read_capture(path: Path) -> Iterator[tuple[str, float, bytes]]:
 def _batches(
     rows: Iterator[ImuSample], realtime: bool, blocking: bool
 ) -> Iterator[tuple[float, list[ImuSample], float]]:
-    """Samples in slices of time, and how late each is; `now_s` is that of the newest sample, or goes on with
-    the clock where realtime is asked for; until a slice is due there are empty ones unless this blocks."""
+    """Yield samples in slices of time: the time up to which all are delivered, the samples, the delay.
+
+    In real time, that time runs on with the clock; otherwise it is that of the newest sample. Until a slice
+    is due, empty ones are yielded unless `blocking`.
+    """
     now_s = end_s = -inf
     batch: list[ImuSample] = []
     offset_s = 0.0
@@ -355,7 +356,7 @@ def _batches(
                 now_s = end_s
             yield now_s, batch, late_s()
             batch = []
-            # Nothing is said about a pause unless its time really passes.
+            # Outside real time, a pause in the samples is skipped.
             end_s = end_s + _SLICE_S if realtime else sample.time_s + _SLICE_S
         batch.append(sample)
         now_s = max(now_s, sample.time_s)

@@ -1,4 +1,4 @@
-"""The file that says which device sits where (`--sensors`), and what is assumed without one."""
+"""Sensor maps: the file that assigns devices to placements (`--sensors`), and the default assignment."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _AXIS = {"left": 0, "right": 0, "up": 1, "down": 1, "forward": 2, "back": 2}
 
 
 class Device(NamedTuple):
-    """Where the samples of a placement come from.
+    """The device of a placement.
 
     Attributes:
-        port: its serial port; None is any line.
-        can: its bus, INTERFACE:CHANNEL or the channel alone; None is any line.
-        id: its id on the line; None where it is the only device there.
-        mounting: how it is worn, in the words of `edgepose calibrate`.
+        port: its serial port; None for any line.
+        can: its bus, INTERFACE:CHANNEL or the channel alone; None for any line.
+        id: its id on the line; None if it is the only device there.
+        mounting: orientation in which it is worn, in the format of `edgepose calibrate`.
     """
 
     port: str | None = None
@@ -36,16 +36,16 @@ class Device(NamedTuple):
 
     @property
     def line(self) -> str | None:
-        """Port or channel; None is any."""
+        """Port or channel; None for any."""
         return self.port or (None if self.can is None else channel(self.can))
 
 
 class PortSettings(NamedTuple):
-    """How a line is read, where that differs from the flags.
+    """Settings of one line that override the flags.
 
     Attributes:
-        protocol: what it speaks.
-        baud: its speed, or that of a bus, bit/s.
+        protocol: name of its protocol.
+        baud: speed of the port or bus, bit/s.
     """
 
     protocol: str | None = None
@@ -53,11 +53,11 @@ class PortSettings(NamedTuple):
 
 
 class SensorMap(NamedTuple):
-    """What a map file says.
+    """The content of a map file.
 
     Attributes:
         path: the file, for messages.
-        devices: by placement, in the order of PLACEMENTS.
+        devices: devices by placement, in the order of PLACEMENTS.
         ports: settings by port or bus.
     """
 
@@ -66,16 +66,16 @@ class SensorMap(NamedTuple):
     ports: Mapping[str, PortSettings]
 
     def lines(self, key: str) -> list[str]:
-        """The ports ("port") or buses ("can") that the devices name, each once."""
+        """Return the ports ("port") or buses ("can") that the devices name, each once."""
         named = [getattr(device, key) for device in self.devices.values()]
         return [name for name in dict.fromkeys(named) if name is not None]
 
     def settings(self, line: str) -> PortSettings:
-        """How a line is read."""
+        """Return the settings of a line."""
         return self.ports.get(line, PortSettings())
 
     def places(self, line: str) -> PlacementById:
-        """Placements by id on one line."""
+        """Return the placements by id on one line."""
         return {
             device.id: i
             for i, device in enumerate(self.devices.values())
@@ -84,57 +84,57 @@ class SensorMap(NamedTuple):
         }
 
     def serial_numbers(self) -> dict[int, str]:
-        """Placements by id, for sessions of files that are named after serial numbers."""
+        """Return the placements by id, for sessions whose files are named after serial numbers."""
         return {device.id: name for name, device in self.devices.items() if device.id is not None}
 
     def all_places(self) -> PlacementById:
-        """Placements by id, of a line whose name is not known.
+        """Return the placements by id on a line whose name is unknown.
 
         Raises:
-            ConfigError: two devices can only be told apart by their lines.
+            ConfigError: two devices differ only in their lines.
         """
         result = {device.id: i for i, device in enumerate(self.devices.values())}
         if len(result) < len(self.devices):
             raise ConfigError(
-                f"{self.path}: it tells sensors apart by their ports, and a capture holds one port; "
+                f"{self.path}: it distinguishes sensors by port, but a capture holds only one port; "
                 "record samples instead (edgepose record walk.csv)"
             )
         return result
 
 
 def channel(bus: str) -> str:
-    """The channel of a bus named INTERFACE:CHANNEL, or named by its channel alone."""
+    """Return the channel of a bus named INTERFACE:CHANNEL, or by its channel alone."""
     return bus.split(":", 1)[-1]
 
 
 def default_places(line: str, protocol: Protocol, index: int, count: int) -> PlacementById:
-    """Placements by id on one line, without a map.
+    """Return the placements by id on one line, without a map.
 
     Args:
-        line: its name, for the message.
-        protocol: what it speaks.
+        line: name of the line, for the message.
+        protocol: protocol of the line.
         index: number of the line, from 0.
-        count: how many lines there are.
+        count: total number of lines.
 
     Raises:
-        ConfigError: nothing can be assumed.
+        ConfigError: there is no default for such a line.
     """
     if protocol.single_device and count == len(PLACEMENTS):
         return {None: index}
     if protocol.ids:
         return {sensor: i for i, sensor in enumerate(protocol.ids)}
     raise ConfigError(
-        f"{line}: which sensor is where? {protocol.name} has one sensor on a line: give six ports in the "
+        f"{line}: which sensor is where? {protocol.name} has one sensor per line: give six ports in the "
         f"order {', '.join(PLACEMENTS)},\nor --sensors MAP.toml with a row for each, such as  "
         f'{PLACEMENTS[0]} = {{ port = "{line}" }}'
     )
 
 
 def read_map(path: Path) -> SensorMap:
-    """The map in a file.
+    """Read a map file.
 
     Raises:
-        ConfigError: it cannot be read, or an entry means nothing.
+        ConfigError: the file cannot be read, or an entry is not valid.
     """
     content = read_toml(path)
     tables = content.pop("ports", {})
@@ -151,9 +151,7 @@ def read_map(path: Path) -> SensorMap:
         lines = {device.line, before.line}
         same_line = len(lines) == 1 or None in lines
         if same_line and (device.id == before.id or (len(lines) == 1 and None in (device.id, before.id))):
-            raise ConfigError(
-                f"{path}: {name} and {other} are the same device; give each a port or id of its own"
-            )
+            raise ConfigError(f"{path}: {name} and {other} are the same device; give each its own port or id")
     return SensorMap(str(path), devices, {n: _port(f"{path}: ports.{n}", t) for n, t in tables.items()})
 
 
@@ -168,7 +166,7 @@ def _device(where: str, entry: object) -> Device:
     if device.port is not None and device.can is not None:
         raise ConfigError(f"{where}: give port or can, not both")
     if device.port is None and device.can is None and device.id is None:
-        raise ConfigError(f"{where}: say where its samples come from: port, can or id")
+        raise ConfigError(f"{where}: no device named; give its port, can or id")
     if device.mounting is not None:
         words = _MOUNTING.fullmatch(device.mounting)
         if words is None or _AXIS[words[1]] == _AXIS[words[2]]:

@@ -1,4 +1,4 @@
-"""Bytes of a serial port."""
+"""Serial ports as transports."""
 
 from __future__ import annotations
 
@@ -11,37 +11,37 @@ from serial.tools import list_ports
 
 from edgepose.errors import DeviceError
 from edgepose.sources import POLL_S
-from edgepose.sources.live import LineDisconnectedError
+from edgepose.sources.line_reader import LineDisconnectedError
 
 try:
-    from termios import error as _TerminalError  # no OSError, and pyserial lets it through
-except ImportError:  # Windows has none
+    from termios import error as _TerminalError  # not an OSError, and pyserial does not catch it
+except ImportError:  # missing on Windows
     _TerminalError = OSError  # type: ignore[assignment, misc]
 
 _ANSWER_S = 0.02
-"""Time a device may take until it answers, seconds."""
+"""Longest time until a device starts to answer, seconds."""
 
 _FULL = 4095
-"""Bytes that a system shows at a time; behind so many more may wait, which it shows a moment later."""
+"""Bytes that the system buffers at a time; if it returns this many, more may follow a moment later."""
 
 _MOST = 1 << 16
-"""Bytes taken in one look, so that a line that never stops does not hold up the others."""
+"""Most bytes read in one poll, so that a line that never pauses does not block the others."""
 
 
 class SerialPort:
-    """An open serial port, which nobody else may open meanwhile."""
+    """A serial port opened for exclusive use."""
 
     def __init__(self, name: str, baud: int, requests: Sequence[tuple[bytes, int]] = ()) -> None:
-        """Open it.
+        """Open the port.
 
         Args:
-            name: as the system knows it.
+            name: the system's name of the port.
             baud: speed, bit/s.
-            requests: sent in turn, with the length of the answer that each is to wait for; none where the
-                devices speak on their own.
+            requests: requests to send in turn, each with the length of its answer; empty if the devices send
+                by themselves.
 
         Raises:
-            DeviceError: it is not there, in use, or not allowed.
+            DeviceError: the port does not exist, is in use, or may not be opened.
         """
         try:
             self._serial = serial.Serial(name, baud, timeout=POLL_S, exclusive=True)
@@ -55,7 +55,7 @@ class SerialPort:
             self._serial.timeout = _ANSWER_S + longest * 10 / baud
 
     def read(self) -> tuple[bytes, bool]:
-        """See `live.Handle`."""
+        """See `Transport.read`."""
         data = b""
         try:
             if self._requests is None:
@@ -68,26 +68,26 @@ class SerialPort:
             return data, bool(data) and self._requests is None and self._serial.in_waiting > 0
         except (OSError, _TerminalError):
             if data:
-                return data, False  # the next read tells
+                return data, False  # the next read raises
             raise LineDisconnectedError from None
 
     @property
     def waiting(self) -> Callable[[], tuple[bytes, bool]] | None:
-        """See `live.Handle`; the answers of devices that are asked have to be waited for."""
-        return self._waiting if self._requests is None else None
+        """See `Transport.waiting`; None for request-response devices, whose answers have to be waited for."""
+        return self._read_waiting if self._requests is None else None
 
-    def _waiting(self) -> tuple[bytes, bool]:
+    def _read_waiting(self) -> tuple[bytes, bool]:
         data = b""
         try:
             while len(data) < _MOST and (count := self._serial.in_waiting):
                 data += self._serial.read(count)
         except (OSError, _TerminalError):
-            if not data:  # else the next look tells
+            if not data:  # otherwise the next poll raises
                 raise LineDisconnectedError from None
         return data, len(data) >= _FULL
 
     def close(self) -> None:
-        """See `live.Handle`."""
+        """See `Transport.close`."""
         self._serial.close()
 
 

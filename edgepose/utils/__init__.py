@@ -1,1 +1,1 @@
-"""Files, sockets and parsers that any part may use; nothing in here knows of poses."""
+"""Files, sockets and parsers for use by any module; nothing here depends on poses."""

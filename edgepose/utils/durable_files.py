@@ -1,6 +1,6 @@
-"""Files that are whole or as they were before.
+"""Atomic writing of files: a file is either complete or as it was before.
 
-A new file has another name, in the same folder, until it is whole; then it takes its place at once.
+A new file has a temporary name in the same folder until it is complete, and is then renamed.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from edgepose.utils.output_targets import Target, find_target, write_error_messa
 
 
 def replace_file(name: str | Path, write: Callable[[Path], None], what: str, *, overwrite: bool) -> None:
-    """Have a file written under another name and put in its place at once: it is whole or as it was before.
+    """Write a file under a temporary name and rename it: it is either complete or as it was before.
 
     Args:
-        name: of the file; what is no file on a disk gets a copy.
-        write: writes the file of that name, whose ending is the same.
-        what: is in it, for messages.
-        overwrite: whether it may take the place of a file.
+        name: the file; a device or pipe gets a copy of the complete file.
+        write: writes a file of the given temporary name, which has the same ending.
+        what: the file's content, for messages.
+        overwrite: replace an existing file.
 
     Raises:
-        EdgeposeError: it cannot be written.
+        EdgeposeError: the file cannot be written.
     """
     target = find_target(name, what)
     if target.stream:
         with TemporaryDirectory() as folder:
             part = Path(folder) / f"output{Path(name).suffix}"
-            with _named(part, target, what):
+            with _errors_name_target(part, target, what):
                 write(part)
             copy_to_stream(part, target.name, what)
         return
-    part = other_name(target)
-    with _named(part, target, what):
+    part = temporary_name(target)
+    with _errors_name_target(part, target, what):
         os.close(new_file(part, target))
         try:
             write(part)
@@ -54,7 +54,7 @@ def replace_file(name: str | Path, write: Callable[[Path], None], what: str, *, 
 
 
 def write_whole(name: str | Path, content: str | bytes | memoryview, what: str, *, overwrite: bool) -> None:
-    """Write a file of a content, text in UTF-8; see `replace_file`."""
+    """Write a file with some content, text in UTF-8; see `replace_file`."""
     data = content.encode(errors="backslashreplace") if isinstance(content, str) else content
 
     def write(part: Path) -> None:
@@ -64,55 +64,55 @@ def write_whole(name: str | Path, content: str | bytes | memoryview, what: str, 
 
 
 def reason(error: EdgeposeError) -> str:
-    """What the system says of a file that could not be written, without its name."""
+    """Return the system's reason why a file could not be written, without the file's name."""
     cause = error.__cause__
     return cause.strerror or str(cause) if isinstance(cause, OSError) else str(error)
 
 
 @contextmanager
-def _named(part: Path, target: Target, what: str) -> Iterator[None]:
-    """Errors name the file as the user knows it."""
+def _errors_name_target(part: Path, target: Target, what: str) -> Iterator[None]:
+    """Replace the temporary name in errors by the user's name of the file."""
     try:
         yield
     except OSError as error:
         raise EdgeposeError(write_error_message(error, target.name, what)) from error
-    except EdgeposeError as error:  # of a sink, which knows the file by its other name
+    except EdgeposeError as error:  # from a sink, which was given the temporary name
         raise EdgeposeError(str(error).replace(str(part), target.name)) from error
 
 
-def other_name(target: Target) -> Path:
-    """A name in the folder of a file that nobody else has.
+def temporary_name(target: Target) -> Path:
+    """Return a unique name in the folder of a file.
 
-    Its ending is that of the user's name, not of what a link leads to: writers look at it.
+    Its ending is that of the user's name, not of a link's target, because writers depend on it.
     """
     return target.path.with_name(f".{secrets.token_hex(8)}{Path(target.name).suffix}")
 
 
 def new_file(part: Path, target: Target) -> int:
-    """Open a new file, which has the permissions and the owner of the one whose place it will take.
+    """Create a file with permissions and owner of the file that it will replace; return its descriptor.
 
     Raises:
-        OSError: it cannot be made.
+        OSError: it cannot be created.
     """
     if target.exists and not os.access(target.path, os.W_OK):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     number = os.open(part, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_CLOEXEC", 0), 0o666)
     if target.exists and hasattr(os, "fchown"):
-        there = target.path.lstat()
-        if stat.S_ISREG(there.st_mode):
-            with contextlib.suppress(OSError):  # only root can give a file to somebody else
-                os.fchown(number, there.st_uid, there.st_gid)
+        existing = target.path.lstat()
+        if stat.S_ISREG(existing.st_mode):
+            with contextlib.suppress(OSError):  # only root can change the owner
+                os.fchown(number, existing.st_uid, existing.st_gid)
             with contextlib.suppress(OSError):
-                os.fchmod(number, stat.S_IMODE(there.st_mode))
+                os.fchmod(number, stat.S_IMODE(existing.st_mode))
     return number
 
 
 def put_in_place(part: Path, path: Path, overwrite: bool) -> None:
-    """Give a file its own name, at once and for good.
+    """Rename a file from its temporary to its final name, atomically and durably.
 
     Raises:
-        EdgeposeError: another file has it and is not to be replaced.
-        OSError: it cannot be renamed.
+        EdgeposeError: another file has that name and must not be replaced.
+        OSError: the file cannot be renamed.
     """
     if overwrite:
         part.replace(path)
@@ -120,10 +120,10 @@ def put_in_place(part: Path, path: Path, overwrite: bool) -> None:
         try:
             os.link(part, path)
         except FileExistsError:
-            raise EdgeposeError(f"{path} is there already, made by another program meanwhile") from None
+            raise EdgeposeError(f"{path} already exists: another program has just created it") from None
         except OSError:  # a file system without hard links, such as that of SD cards
             if path.exists():
-                raise EdgeposeError(f"{path} is there already, made by another program meanwhile") from None
+                raise EdgeposeError(f"{path} already exists: another program has just created it") from None
             part.replace(path)
         else:
             part.unlink()
@@ -131,8 +131,8 @@ def put_in_place(part: Path, path: Path, overwrite: bool) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in a folder last; a file that has no name after a power cut is lost."""
-    with contextlib.suppress(OSError):  # Windows cannot, and need not.
+    """Write a folder's names to the disk; a file without a name after a power cut would be lost."""
+    with contextlib.suppress(OSError):  # not possible, nor needed, on Windows
         number = os.open(folder, os.O_RDONLY)
         try:
             os.fsync(number)

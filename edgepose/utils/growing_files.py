@@ -1,7 +1,7 @@
-"""Outputs that grow by whole rows for hours.
+"""Outputs that grow row by row for hours.
 
-Whenever the power, the disk or the reader goes, what is written ends at a whole row. A file on a disk has
-another name until its first row comes, so that what had its name before is not lost for nothing.
+If the power, the disk or the reader fails, the output ends with a complete row. A file on a disk has a
+temporary name until its first row comes, so that an existing file is not lost without a replacement.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from pathlib import Path
 from typing import Any
 
 from edgepose.errors import EdgeposeError
-from edgepose.utils.durable_files import new_file, other_name, put_in_place
+from edgepose.utils.durable_files import new_file, put_in_place, temporary_name
 from edgepose.utils.output_streams import OutputStream, never
 from edgepose.utils.output_targets import Target, find_target, write_error_message
 
 FLUSH_S = 1.0
-"""A killed program loses at most what came in this time, seconds."""
+"""Interval of writing to the disk, seconds: a killed program loses at most the rows of this time."""
 
 
 class GrowingFile:
     """An output that is written row by row, without a buffer.
 
     Attributes:
-        regular: a file on a disk, not a device, a pipe or a terminal.
-        file: what is written to; of a file on a disk, to seek in.
+        regular: the output is a file on a disk, not a device, a pipe or a terminal.
+        file: the file object to write to; one on a disk can be seeked.
     """
 
     def __init__(
@@ -41,18 +41,18 @@ class GrowingFile:
         follow: bool = True,
         stopped: Callable[[], bool] = never,
     ) -> None:
-        """Open it; a file on a disk has another name until it is started.
+        """Open the output; a file on a disk has a temporary name until it is started.
 
         Args:
-            name: of the output; "-" is standard output.
-            what: goes into it, for messages.
-            end: how rows end: where the disk is full the file ends with it. Empty if it may end anywhere.
-            overwrite: whether it may take the place of a file.
-            follow: write to the file at the end of a link; without, in the place of the link.
-            stopped: whether the run is to end. Then a reader that takes nothing is not waited for any more.
+            name: name of the output; "-" is standard output.
+            what: the output's content, for messages.
+            end: end of a row, with which the file ends if the disk is full. Empty if it may end anywhere.
+            overwrite: replace an existing file.
+            follow: write to the target of a symbolic link; if false, replace the link.
+            stopped: whether the run is to end; a reader that has stopped reading is then not waited for.
 
         Raises:
-            EdgeposeError: it cannot be written.
+            EdgeposeError: the output cannot be written to.
         """
         self._what, self._end, self._overwrite = what, end, overwrite
         self._closed = False
@@ -66,40 +66,40 @@ class GrowingFile:
             self.file: Any = self._stream.file
             self.regular = self._stream.regular
             return
-        self._part = other_name(self._target)
+        self._part = temporary_name(self._target)
         try:
             self.file = os.fdopen(new_file(self._part, self._target), "rb+", 0)
         except OSError as error:
-            raise self._explained(error) from error
+            raise self._writing_error(error) from error
         self.regular = True
 
-    def _explained(self, error: OSError) -> EdgeposeError:
+    def _writing_error(self, error: OSError) -> EdgeposeError:
         return EdgeposeError(write_error_message(error, self._target.name, self._what))
 
     @property
     def exists(self) -> bool:
-        """Whether a file is there, whose place it will take when it is started."""
+        """Whether there is a file that this one will replace when it is started."""
         return self._part is not None and self._target.exists
 
     def start(self) -> None:
-        """Let it take its place; further calls do nothing.
+        """Give the file its final name; further calls do nothing.
 
         Raises:
-            EdgeposeError: it cannot, or another file is there now.
+            EdgeposeError: it cannot be renamed, or another file has appeared there.
         """
         if self._part is None:
             return
         try:
             put_in_place(self._part, self._target.path, self._overwrite)
         except OSError as error:
-            raise self._explained(error) from error
+            raise self._writing_error(error) from error
         self._part = None
 
     def write(self, rows: bytes) -> None:
-        """Write whole rows; where that fails, a file on a disk ends with the end of one.
+        """Write complete rows; if that fails, a file on a disk is cut back to the end of a row.
 
         Raises:
-            EdgeposeError: not all of them could be written.
+            EdgeposeError: not all rows could be written.
         """
         done = 0
         try:
@@ -110,39 +110,40 @@ class GrowingFile:
                 done += self.file.write(rows[done:])
         except OSError as error:
             if self.regular:
-                _drop_end(self.file, done - (rows.rfind(self._end, 0, done) + len(self._end)))
-            raise self._explained(error) from error
+                _cut_off(self.file, done - (rows.rfind(self._end, 0, done) + len(self._end)))
+            raise self._writing_error(error) from error
 
     def sync(self) -> None:
-        """Have what is written on the disk.
+        """Force the written rows to the disk.
 
         Raises:
-            EdgeposeError: it cannot be.
+            EdgeposeError: the disk reports an error.
         """
         if self.regular:
             try:
                 os.fsync(self.file.fileno())
             except OSError as error:
-                raise self._explained(error) from error
+                raise self._writing_error(error) from error
 
     def discard(self) -> None:
-        """Close it and leave nothing behind; what it has taken the place of is gone."""
+        """Close and delete the file; a file that it has replaced is not restored."""
         self._closed = True
-        left = self._part
-        if left is None and self._stream is None and self._is_in_place():
-            left = self._target.path
-        with contextlib.suppress(OSError, EdgeposeError):  # what led here is the one to report
+        file = self._part
+        if file is None and self._stream is None and self._is_in_place():
+            file = self._target.path
+        with contextlib.suppress(OSError, EdgeposeError):  # the error that led here is the one to report
             self._close()
-        if left is not None:
-            left.unlink(missing_ok=True)
+        if file is not None:
+            file.unlink(missing_ok=True)
         self._part = None
 
     def close(self) -> None:
-        """Close it; a file that was not started is discarded if one is there already. Standard output stays
-        open.
+        """Close the output; standard output stays open.
+
+        A file that was not started is deleted if it would replace an existing one.
 
         Raises:
-            EdgeposeError: it has gone from its place, or its reader has not read all.
+            EdgeposeError: the file has been moved or deleted, or the reader has not read everything.
         """
         if self._closed:
             return
@@ -155,12 +156,12 @@ class GrowingFile:
             self.discard()
             raise
         self._closed = True
-        gone = self._stream is None and not self._is_in_place()
+        moved = self._stream is None and not self._is_in_place()
         try:
             self._close()
-        except OSError as error:  # Network file systems may report a full disk only here.
-            raise self._explained(error) from error
-        if gone:
+        except OSError as error:  # network file systems may report a full disk only here
+            raise self._writing_error(error) from error
+        if moved:
             raise EdgeposeError(
                 f"{self._target.name} was moved, removed or replaced while {self._what} were written to it"
             )
@@ -175,19 +176,19 @@ class GrowingFile:
             return False
 
 
-def _drop_end(file: Any, count: int) -> None:
-    """Take the last `count` bytes, the beginning of a row, off the file."""
-    with contextlib.suppress(OSError):  # The error that led here is the one to report.
+def _cut_off(file: Any, count: int) -> None:
+    """Remove the last `count` bytes, an incomplete row, from the file."""
+    with contextlib.suppress(OSError):  # the error that led here is the one to report
         size = file.seek(0, os.SEEK_CUR) - count
         file.truncate(size)
         file.seek(size)
 
 
 class DurableAppender:
-    """An output that grows by whole pieces.
+    """An output that grows piece by piece, written by a thread.
 
-    A thread of its own writes and syncs them about once a second: a slow card must not keep the reader of a
-    port from its work, because the system holds back only a fraction of a second for it.
+    The thread writes and syncs about once a second. A slow SD card must not delay the reader of a port, for
+    which the system buffers only a fraction of a second of data.
     """
 
     def __init__(
@@ -203,15 +204,15 @@ class DurableAppender:
         """Open the output and write its start.
 
         Args:
-            path: of the file; "-" is standard output.
-            what: what goes into it, for messages.
-            start: its first piece.
-            end: how pieces end; where the disk is full the file ends with it. Empty if it may end anywhere.
-            overwrite: whether it may take the place of a file.
+            path: name of the file; "-" is standard output.
+            what: the output's content, for messages.
+            start: the first piece.
+            end: end of a piece, with which the file ends if the disk is full. Empty if it may end anywhere.
+            overwrite: replace an existing file.
             follow: see `GrowingFile`.
 
         Raises:
-            EdgeposeError: it cannot be written.
+            EdgeposeError: the output cannot be written to.
         """
         self._closing = threading.Event()
         self._file = GrowingFile(
@@ -228,10 +229,10 @@ class DurableAppender:
         self._thread.start()
 
     def add(self, piece: bytes) -> None:
-        """Have a piece written.
+        """Queue a piece for writing.
 
         Raises:
-            EdgeposeError: an earlier one could not be written; what is there is whole.
+            EdgeposeError: an earlier piece could not be written; the file ends with a complete piece.
         """
         if self._error is not None:
             raise self._error
@@ -241,11 +242,12 @@ class DurableAppender:
         self._pieces.append(piece)
 
     def close(self) -> None:
-        """Write what is held back and close the file; a second call does nothing. Without any piece there is
-        no new file.
+        """Write the queued pieces and close the file; a second call does nothing.
+
+        If no piece was added, no new file appears.
 
         Raises:
-            EdgeposeError: something could not be written; what is there is whole.
+            EdgeposeError: something could not be written; the file ends with a complete piece.
         """
         if self._closing.is_set():
             return

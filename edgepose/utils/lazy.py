@@ -1,4 +1,4 @@
-"""Names of a package that import their modules when they are first used."""
+"""Lazy names of a package, whose modules are imported on first use."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 def lazy_names(
     package: str, modules: Mapping[str, str]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """`__getattr__` and `__dir__` for a package.
+    """Return `__getattr__` and `__dir__` for a package.
 
     Args:
-        package: its name.
-        modules: by name, the module that defines it.
+        package: name of the package.
+        modules: the defining module of each name.
     """
 
     def get(name: str) -> Any:

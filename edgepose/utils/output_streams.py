@@ -1,4 +1,4 @@
-"""Devices, pipes and standard output: they are no files on a disk, and their readers may be slow or gone."""
+"""Output to devices, pipes and standard output, whose readers may be slow or missing."""
 
 from __future__ import annotations
 
@@ -18,41 +18,41 @@ from edgepose.errors import EdgeposeError
 from edgepose.utils.output_targets import Target, descriptor, find_target, write_error_message
 
 PATIENCE_S = 1.0
-"""Time that the reader of a pipe has to take anything once the run is to end, seconds."""
+"""Longest wait for the reader of a pipe once the run is to end, seconds."""
 
-_PIECE = 4096  # a pipe that can take anything takes so much at once
+_PIECE = 4096  # a pipe that is writable accepts this many bytes at once
 _PIECE_TERMINAL = 256
 _POLL_MS = 100
 _log = logging.getLogger(__name__)
 
 
 def never() -> bool:
-    """Of a run that nobody ends."""
+    """The default for `stopped`: a run that is not stopped."""
     return False
 
 
 class OutputStream:
-    """A device, a pipe or standard output, written through without a buffer.
+    """A device, a pipe or standard output, written to without a buffer.
 
     Attributes:
         regular: standard output is a file on a disk.
-        left_out: bytes that were not written because the reader takes nothing and the run is to end.
-        file: what is written to.
+        unwritten: number of bytes not written because the reader has stopped reading and the run is to end.
+        file: the file object to write to.
     """
 
     def __init__(self, target: Target, what: str, stopped: Callable[[], bool] = never) -> None:
-        """Open it, waiting for who reads a pipe.
+        """Open the output, waiting for a reader if it is a pipe.
 
         Args:
-            target: what it is.
-            what: goes into it, for messages.
-            stopped: whether the run is to end. Then a reader that takes nothing is not waited for any more.
+            target: the output.
+            what: the output's content, for messages.
+            stopped: whether the run is to end; a reader that has stopped reading is then not waited for.
 
         Raises:
-            EdgeposeError: it cannot be opened, or nobody has read the pipe until the run was to end.
+            EdgeposeError: the output cannot be opened, or the pipe had no reader until the end of the run.
         """
         self._target, self._what, self._stopped = target, what, stopped
-        self.left_out = 0
+        self.unwritten = 0
         try:
             self.file = self._open()
         except OSError as error:
@@ -66,20 +66,19 @@ class OutputStream:
     def _open(self) -> Any:
         name = self._target.name
         if name == "-":
-            if (
-                sys.stdout is None or getattr(sys.stdout, "name", None) == os.devnull
-            ):  # see `cli.terminal.messages`
+            # A closed standard output is replaced by the null device, see `cli.terminal.messages`.
+            if sys.stdout is None or getattr(sys.stdout, "name", None) == os.devnull:
                 raise EdgeposeError(f"cannot write {self._what}: standard output is closed")
-            # Below Python's buffers: what they still held would fail at exit without a reader.
+            # Bypass Python's buffers: without a reader, flushing them would fail at exit.
             sys.stdout.flush()
             return getattr(sys.stdout.buffer, "raw", sys.stdout.buffer)
         number = descriptor(Path(name))
-        # A copy writes where the open file is, which a second opening would not.
+        # A duplicate shares the position in the open file, which reopening would not.
         return os.fdopen(self._open_path() if number is None else os.dup(number), "wb", 0)
 
     def _open_path(self) -> int:
-        """A device or pipe, once somebody reads the pipe."""
-        path, told = Path(self._target.name), False
+        """Open a device or pipe, waiting for the pipe's reader; return its descriptor."""
+        path, warned = Path(self._target.name), False
         while True:
             try:
                 number = os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
@@ -90,63 +89,63 @@ class OutputStream:
                 os.set_blocking(number, True)
                 return number
             if self._stopped():
-                raise EdgeposeError(f"nobody reads the {self._what} from {path}")
-            if not told:
-                told = True
+                raise EdgeposeError(f"no program reads the {self._what} from {path}")
+            if not warned:
+                warned = True
                 _log.warning("%s: waiting for a program that reads it", path)
             time.sleep(_POLL_MS / 1e3)
 
     def write(self, data: bytes) -> int:
-        """Write all, unless the reader takes nothing and the run is to end.
+        """Write all data, unless the reader has stopped reading and the run is to end.
 
         Returns:
-            Number of bytes.
+            Number of bytes in the data.
 
         Raises:
-            OSError: as the system tells it.
+            OSError: writing failed.
         """
         done = 0
         while done < len(data):
-            if not self._ready():
-                self.left_out += len(data) - done
+            if not self._wait_until_writable():
+                self.unwritten += len(data) - done
                 break
             piece = data[done:] if self._poll is None else data[done : done + self._piece]
             done += self.file.write(piece) or 0
         return len(data)
 
-    def _ready(self) -> bool:
-        """Whether something can be written now, waiting for that; False where nobody takes it in the end."""
-        if self.left_out:
+    def _wait_until_writable(self) -> bool:
+        """Wait until the output is writable; return False if it is not by the end of the run."""
+        if self.unwritten:
             return False
         if self._poll is None:
             return True
-        asked_s: float | None = None
+        stopped_s: float | None = None
         while not self._poll.poll(_POLL_MS):
             if self._stopped():
-                asked_s = asked_s or time.monotonic()
-                if time.monotonic() - asked_s >= PATIENCE_S:
+                stopped_s = stopped_s or time.monotonic()
+                if time.monotonic() - stopped_s >= PATIENCE_S:
                     return False
         return True
 
     def close(self) -> None:
-        """Close it; standard output stays open.
+        """Close the output; standard output stays open.
 
         Raises:
-            OSError: as the system tells it.
-            EdgeposeError: the reader has not taken all.
+            OSError: closing failed.
+            EdgeposeError: the reader has not read everything.
         """
         if self._target.name != "-":
             self.file.close()
-        if self.left_out:
+        if self.unwritten:
             name = "standard output" if self._target.name == "-" else self._target.name
             raise EdgeposeError(
-                f"the program that reads the {self._what} from {name} takes nothing: {self.left_out} bytes "
-                "were left out"
+                f"the program that reads the {self._what} from {name} has stopped reading: {self.unwritten} "
+                "bytes were not written"
             )
 
 
 def _poll_of(file: Any) -> Any:
-    """What tells whether something can be written without waiting; None where nothing does."""
+    """Return a poll object for writability; None for files without a descriptor."""
     try:
         number = file.fileno()
     except OSError:  # not a file of the operating system, such as a captured standard output
@@ -157,10 +156,10 @@ def _poll_of(file: Any) -> Any:
 
 
 def copy_to_stream(source: Path, name: str, what: str, stopped: Callable[[], bool] = never) -> None:
-    """Write a whole file to a device or pipe.
+    """Copy a complete file to a device or pipe.
 
     Raises:
-        EdgeposeError: it takes no more.
+        EdgeposeError: the device or pipe cannot be written to, or its reader has stopped reading.
     """
     stream = OutputStream(find_target(name, what), what, stopped)
     try:

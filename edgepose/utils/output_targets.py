@@ -1,7 +1,7 @@
-"""What the name of an output stands for, and whether something would be lost by writing there.
+"""Resolution of output names, and checks that writing there loses nothing.
 
-Devices, pipes and standard output are streams: they are written through, and there is nothing to lose. Of a
-link it is the file at its end that is written.
+Devices, pipes and standard output are streams, which hold nothing that could be lost. For a symbolic link,
+its target is written.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ ENDINGS = frozenset(
         *(".sensors", ".asf", ".amc", ".py"),
     )
 )
-"""Endings of files that edgepose reads or writes: a file of another kind is not to be written over."""
+"""Endings of files that edgepose reads or writes: a file of another kind is never overwritten."""
 
 _LINKS = 40
 
 
 class Target(NamedTuple):
-    """What the name of an output stands for.
+    """An output, resolved from its name.
 
     Attributes:
-        name: as the user gave it; "-" is standard output.
-        path: the file at the end of links, if it is one on a disk.
-        stream: it is none, but a device, a pipe or standard output.
-        exists: a file is there.
+        name: the user's name of it; "-" is standard output.
+        path: the path after resolving links, for a file on a disk.
+        stream: it is a device, a pipe or standard output, not a file on a disk.
+        exists: it exists already.
     """
 
     name: str
@@ -46,14 +46,14 @@ class Target(NamedTuple):
 
 
 def find_target(name: str | Path, what: str) -> Target:
-    """What a name stands for.
+    """Resolve the name of an output.
 
     Args:
-        name: of the output.
-        what: goes into it, for messages.
+        name: name of the output.
+        what: the output's content, for messages.
 
     Raises:
-        EdgeposeError: a folder, a whole disk, or a file that cannot be because its folder is not there.
+        EdgeposeError: it is a folder, a disk or a socket, or its folder does not exist.
     """
     path, text = Path(name), str(name)
     if text == "-" or descriptor(path) is not None:
@@ -76,7 +76,7 @@ def find_target(name: str | Path, what: str) -> Target:
 
 
 def descriptor(path: Path) -> int | None:
-    """The number of an open file of this process that a name stands for, such as /dev/stdout; else None."""
+    """Return the descriptor of an open file that a path names, such as /dev/stdout; None for other paths."""
     for _ in range(_LINKS):
         folder = os.path.realpath(path.parent)
         if re.fullmatch(rf"/proc/{os.getpid()}/(task/\d+/)?fd", folder) and path.name.isdigit():
@@ -89,31 +89,31 @@ def descriptor(path: Path) -> int | None:
 
 
 def identity(name: str | Path) -> object:
-    """What is the same for two names exactly if they stand for one output; "-" is standard output."""
+    """Return a value that is equal for two names exactly if they are one output; "-" is standard output."""
     number = 1 if str(name) == "-" else descriptor(Path(name))
     try:
-        own = os.fstat(number) if number is not None else Path(name).stat()
-        return own.st_dev, own.st_ino
-    except OSError:  # not there yet
+        status = os.fstat(number) if number is not None else Path(name).stat()
+        return status.st_dev, status.st_ino
+    except OSError:  # does not exist yet
         return os.path.realpath(name)
 
 
 def part_path(npz: str | Path) -> Path:
-    """Where the poses for an NPZ file are while a run goes on."""
+    """Return the file that holds the poses for an NPZ file during a run."""
     return Path(npz).with_name(f"{Path(npz).stem}.part.csv")
 
 
 def check_output(name: str | Path, what: str, endings: Collection[str], overwrite: bool) -> None:
-    """Make sure, before any work is done, that an output costs nothing that was not meant.
+    """Check, before any work is done, that writing an output would lose nothing.
 
     Args:
-        name: of the output; "-", devices and pipes are always free.
-        what: goes into it, for messages.
-        endings: of its kind of files, such as ".csv".
-        overwrite: whether a file that is there may be replaced.
+        name: name of the output; "-", devices and pipes always pass.
+        what: the output's content, for messages.
+        endings: endings of its kind of files, such as ".csv".
+        overwrite: whether an existing file may be replaced.
 
     Raises:
-        EdgeposeError: a file is there, its name is of another kind, or it cannot be written.
+        EdgeposeError: the file exists, has the ending of another kind of file, or cannot be written.
     """
     target = find_target(name, what)
     if target.stream:
@@ -122,31 +122,31 @@ def check_output(name: str | Path, what: str, endings: Collection[str], overwrit
         ending = path.suffix.lower()
         if ending in ENDINGS and ending not in endings:
             raise EdgeposeError(
-                f"{name}: a name with {ending} is of another kind of file; {what} go into one with "
+                f"{name}: {ending} is the ending of another kind of file; for {what} use "
                 f"{' or '.join(endings)}"
             )
     if target.exists and not overwrite:
-        raise EdgeposeError(f"{name} is there already; choose another name or give --overwrite")
+        raise EdgeposeError(f"{name} already exists; choose another name or give --overwrite")
 
 
 def check_free(paths: Iterable[Path], hint: str) -> None:
-    """Make sure that none of many files is there already.
+    """Check that none of several files exists.
 
     Args:
-        paths: of the files.
-        hint: what to do about it.
+        paths: the files.
+        hint: advice for the user if one exists.
 
     Raises:
-        EdgeposeError: some are.
+        EdgeposeError: some of them exist.
     """
-    there = [path for path in paths if path.exists() and not is_stream(path)]
-    if there:
-        rest = f" and {len(there) - 1} others" if there[1:] else ""
-        raise EdgeposeError(f"{there[0]}{rest}: there already; {hint}")
+    existing = [path for path in paths if path.exists() and not is_stream(path)]
+    if existing:
+        rest = f" and {len(existing) - 1} others" if existing[1:] else ""
+        raise EdgeposeError(f"{existing[0]}{rest}: already exists; {hint}")
 
 
 def is_stream(name: str | Path) -> bool:
-    """Whether an output is a device, a pipe or standard output: no file on a disk."""
+    """Whether an output is a device, a pipe or standard output, not a file on a disk."""
     try:
         return find_target(name, "").stream
     except EdgeposeError:
@@ -154,26 +154,26 @@ def is_stream(name: str | Path) -> bool:
 
 
 def is_null(name: str | Path) -> bool:
-    """Whether an output is the device in which everything vanishes."""
+    """Whether an output is the null device."""
     try:
         return Path(name).samefile(os.devnull)
-    except OSError:  # not there
+    except OSError:  # does not exist
         return False
 
 
 def has_reader(name: str | Path) -> bool:
-    """Whether somebody reads an output while it is written, who could hold up what writes it."""
+    """Whether an output is read while it is written, so that a slow reader can delay the writer."""
     number = sys.stdout.fileno() if str(name) == "-" else descriptor(Path(name))
     try:
         if number is not None:
             return not stat.S_ISREG(os.fstat(number).st_mode)
         return is_stream(name) and not is_null(name)
-    except OSError:  # told where it is opened
+    except OSError:  # reported when it is opened
         return False
 
 
 def write_error_message(error: OSError, name: str, what: str) -> str:
-    """The line for the user where writing has failed."""
+    """Return the message for the user about a failed write."""
     name = "standard output" if name == "-" else name
     if isinstance(error, BrokenPipeError):
         return f"the program that read the {what} from {name} has ended"

@@ -1,4 +1,4 @@
-"""Opening .npz files, which anybody may have made: what damaged ones raise, how large they may be."""
+"""Safe opening of untrusted .npz files: the exceptions that damaged ones raise, limits on their size."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from numpy.lib.npyio import NpzFile
 from edgepose.errors import FileFormatError
 
 MAX_BYTES = 2 << 30
-"""That a file may take in memory: hours of poses or samples."""
+"""Most memory that a file may take, enough for hours of poses or samples."""
 
-_FREE_BYTES = 256 << 20  # up to which the ratio does not matter: a simulated rest packs well
-_MAX_RATIO = 100  # real recordings and poses pack less than 3:1
+_FREE_BYTES = 256 << 20  # size below which the ratio is not limited: simulated data at rest compress well
+_MAX_RATIO = 100  # real recordings and poses compress by less than 3:1
 
 BROKEN = (
     zipfile.BadZipFile,
@@ -27,36 +27,36 @@ BROKEN = (
     ValueError,
     TypeError,
     KeyError,
-    RuntimeError,  # passwords; NotImplementedError for odd compression is one, too
+    RuntimeError,  # passwords, and its subclass NotImplementedError for unknown compression
     MemoryError,
-    # An array's header is Python text, which numpy parses.
+    # numpy parses an array's header as Python source.
     SyntaxError,
     tokenize.TokenError,
 )
-"""To be caught around reading one; OSError, of a file that is not there, apart."""
+"""Exceptions to catch around reading a file, besides OSError for one that does not exist."""
 
 
 def check_size(path: Path, size: int) -> None:
-    """Hold a file of any kind to what a true one becomes in memory, `size` bytes.
+    """Check that a compressed file of any kind does not take too much memory, `size` bytes.
 
     Raises:
-        FileFormatError: it is far too large, in itself or for a file as small as this.
+        FileFormatError: it is far too large, in itself or in relation to the file.
     """
     if size > MAX_BYTES or size > max(_FREE_BYTES, _MAX_RATIO * path.stat().st_size):
         raise FileFormatError(
-            f"{path}: unpacks to {size >> 20} MB; files are read up to {MAX_BYTES >> 20} MB, and up to "
-            f"{_MAX_RATIO} times their own size"
+            f"{path}: unpacks to {size >> 20} MB; the limits are {MAX_BYTES >> 20} MB and {_MAX_RATIO} times "
+            "the size of the file"
         )
 
 
 def _check_regular(path: Path) -> None:
-    """Raises ValueError for what has no end, such as a device."""
+    """Raise ValueError for files without an end, such as devices."""
     if path.exists() and not path.is_file():
-        raise ValueError("it is no file on a disk")
+        raise ValueError("it is not a file on a disk")
 
 
 def member_names(path: Path) -> set[str]:
-    """Names of what is in a file; those of arrays end in .npy. Raises what `open_npz` raises."""
+    """Return the names in a file; those of arrays end in .npy. Raises the same as `open_npz`."""
     _check_regular(path)
     with zipfile.ZipFile(path) as archive:
         return set(archive.namelist())
@@ -64,17 +64,17 @@ def member_names(path: Path) -> set[str]:
 
 @contextmanager
 def open_npz(path: Path) -> Iterator[NpzFile]:
-    """The arrays of a file, none of which is unpacked yet.
+    """Open a file for reading arrays, which are unpacked on access.
 
     Raises:
-        FileFormatError: together they are too large, see `check_size`.
-        OSError: it cannot be read; all of `BROKEN`: it is no such file, here or where an array is taken out.
+        FileFormatError: the arrays together are too large, see `check_size`.
+        OSError: the file cannot be read. Any of `BROKEN`: it is damaged, here or on access to an array.
     """
     _check_regular(path)
-    # A file of ours, because numpy leaves its own open where there is no archive in it.
+    # Opened here, because numpy does not close a file that is not an archive.
     with path.open("rb") as file:
         with zipfile.ZipFile(file) as archive:
-            # Sizes as declared are the most that zipfile unpacks.
+            # zipfile unpacks no more than the declared sizes.
             check_size(path, sum(member.file_size for member in archive.infolist()))
         file.seek(0)
         with np.load(file, allow_pickle=False) as arrays:

@@ -1,4 +1,4 @@
-"""Addresses of sockets, as users write them and as the system wants them."""
+"""Socket addresses: parsing of users' texts, resolution for the system."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from edgepose.errors import ConfigError
 
 
 def resolve(host: str, port: int, kind: socket.SocketKind) -> tuple[socket.AddressFamily, Any]:
-    """Family and address of a name, to listen at or to send to.
+    """Return the family and address of a host to listen on or send to.
 
-    A name with addresses of both kinds, as `localhost`, stands for its IPv4 one: senders and listeners must
-    choose alike.
+    For a name with addresses of both kinds, such as `localhost`, it is the IPv4 one: senders and listeners
+    must make the same choice.
 
     Raises:
         OSError, UnicodeError: there is no such host.
@@ -23,7 +23,7 @@ def resolve(host: str, port: int, kind: socket.SocketKind) -> tuple[socket.Addre
 
 
 class Destination(NamedTuple):
-    """Where datagrams go: host name or address, port, format "json" or "binary"."""
+    """Destination of datagrams: host name or address, port, format "json" or "binary"."""
 
     host: str
     port: int
@@ -31,10 +31,10 @@ class Destination(NamedTuple):
 
 
 def parse_address(text: str) -> tuple[str, int]:
-    """Host and port written as "HOST:PORT", an IPv6 address in brackets.
+    """Parse "HOST:PORT", with an IPv6 address in brackets.
 
     Raises:
-        ConfigError: not such a text.
+        ConfigError: the text has another form.
     """
     host, colon, port = text.rpartition(":")
     if not colon or not port or text.endswith("]"):
@@ -51,10 +51,10 @@ def parse_address(text: str) -> tuple[str, int]:
 
 
 def parse_destination(text: str) -> Destination:
-    """Destination written as "HOST:PORT[,format=json|binary]"; JSON by default, see `parse_address`.
+    """Parse "HOST:PORT[,format=json|binary]"; JSON is the default, see `parse_address`.
 
     Raises:
-        ConfigError: not such a text.
+        ConfigError: the text has another form.
     """
     address, *options = text.split(",")
     host, port = parse_address(address)

@@ -1,4 +1,4 @@
-"""Small text files of anyone, read with limits: a device has no end, and odd text keeps a parser busy."""
+"""Reading of small, untrusted text files, with limits: devices are endless, odd text can stall a parser."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ else:
     import tomli as tomllib
 
 MOST_BYTES = 1 << 20
-"""A calibration has some thousand bytes, a map of sensors some hundred."""
+"""Limit on the size of a file; a calibration has some thousand bytes, a sensor map some hundred."""
 
 MOST_TOML_BYTES, MOST_KEY_PARTS = 1 << 18, 100
-"""A key of many parts takes the parser the square of them in time and memory."""
+"""Limits for TOML; the parser's time and memory grow with the square of the number of parts of a key."""
 
 
 def read_text(path: Path, most: int = MOST_BYTES) -> str:
-    """A text file in UTF-8 of so many bytes at most.
+    """Read a text file in UTF-8 of at most `most` bytes.
 
     Raises:
-        ConfigError: it is larger.
+        ConfigError: the file is larger.
         OSError: it cannot be read.
-        UnicodeDecodeError: it is no text.
+        UnicodeDecodeError: it is not text.
     """
     with path.open("rb") as file:
         data = file.read(most + 1)
     if len(data) > most:
-        raise ConfigError(f"{path}: larger than {most >> 10} kB, as no such file is; is it another one?")
+        raise ConfigError(f"{path}: larger than {most >> 10} kB, too large for such a file; check the name")
     return data.decode()
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Content of a TOML file.
+    """Read a TOML file.
 
     Raises:
-        ConfigError: it cannot be read, or is none.
+        ConfigError: it cannot be read, or is not valid TOML.
     """
     text = ""
     try:
@@ -52,11 +52,11 @@ def read_toml(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise ConfigError(f"{path}: cannot read it: {error.strerror}") from None
     except RecursionError:
-        raise ConfigError(f"{path}: not valid TOML: brackets within brackets without end") from None
+        raise ConfigError(f"{path}: not valid TOML: brackets are nested too deeply") from None
     except ValueError as error:  # also not UTF-8
-        # The parser does not name what is there twice.
+        # The parser does not name a duplicate key.
         keys = Counter(re.findall(r"^[ \t]*(?:\[[ \t]*)?([\w-]+)[ \t]*[=\]]", text, re.MULTILINE))
-        twice = [key for key, count in keys.items() if count > 1]
-        if twice and re.search("twice|overwrite|mutate", str(error)):
-            raise ConfigError(f"{path}: {twice[0]} is there twice") from None
+        duplicates = [key for key, count in keys.items() if count > 1]
+        if duplicates and re.search("twice|overwrite|mutate", str(error)):
+            raise ConfigError(f"{path}: {duplicates[0]} is defined twice") from None
         raise ConfigError(f"{path}: not valid TOML: {error}") from None

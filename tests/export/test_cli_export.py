@@ -522,7 +522,7 @@ def output(request, made, tmp_path):
 def test_nothing_is_overwritten_unasked(output):
     out, words = output
     out.write_bytes(OLD)
-    assert "there already" in fails(*words)
+    assert "already exists" in fails(*words)
     assert out.read_bytes() == OLD
     edgepose(*words, "--overwrite")
     assert out.read_bytes()[:4] in (b"PK\x03\x04", b"\x89PNG")
@@ -558,7 +558,7 @@ def test_a_card_or_a_file_of_another_kind_is_kept(name, made, tmp_path):
     words = WRITES[name][1]
     if name == "export":
         (tmp_path / "tiny.md").write_bytes(OLD)
-        assert "tiny.md is there already" in fails(*words(folder, tmp_path / "tiny.pt"))
+        assert "tiny.md already exists" in fails(*words(folder, tmp_path / "tiny.pt"))
         assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["tiny.md"]
     else:
         (tmp_path / "prior.json").write_bytes(OLD)

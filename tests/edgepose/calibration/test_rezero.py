@@ -213,7 +213,7 @@ def test_a_sensor_that_falls_silent_is_told_once_and_when_it_is_back():
     go(6.0, 1.0, False)
     assert lines == []
     go(7.0, 5.0, True)
-    assert lines == ["head: nothing for 1 s; its last values are repeated: check its power and link"]
+    assert lines == ["head: no data for 1 s; its last values are repeated: check its power and connection"]
     go(12.0, 1.0, False)
     assert lines[1:] == ["head: back after 5.0 s"]
     # A loose plug.

@@ -157,7 +157,7 @@ def test_a_port_on_which_nothing_comes(command):
 
 
 def test_a_silent_line_is_told_once_and_does_not_end_the_others(monkeypatch, caplog):
-    monkeypatch.setattr("edgepose.sources.live.SILENCE_S", 0.2)
+    monkeypatch.setattr("edgepose.sources.line_checks.SILENCE_S", 0.2)
     sensors = set()
     with rig() as port, silent_port() as other, open_source(port=f"{port},{other}", lenient=True) as source:
         for _, batch, *_ in source:
@@ -166,7 +166,7 @@ def test_a_silent_line_is_told_once_and_does_not_end_the_others(monkeypatch, cap
                 break
         assert set(source.clocks) == sensors
     (warning,) = caplog.records
-    assert f"{other}: nothing came for 0.2 s" in warning.getMessage()
+    assert f"{other}: no data for 0.2 s" in warning.getMessage()
 
 
 # --- the page -----------------------------------------------------------------------------------------------
@@ -280,8 +280,8 @@ def test_warnings_are_on_the_page_and_stay(tmp_path):
     ):
         assert terminal.rest() == 1
     page, _, after = terminal.text.partition("\033[?1049l")
-    assert f"{port}: nothing came for 5 s" in plain(page).replace("\n  ", " ")
-    assert f"warning: {port}: nothing came for 5 s" in after
+    assert f"{port}: no data for 5 s" in plain(page).replace("\n  ", " ")
+    assert f"warning: {port}: no data for 5 s" in after
 
 
 # --- wrong use ----------------------------------------------------------------------------------------------

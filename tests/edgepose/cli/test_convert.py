@@ -298,7 +298,7 @@ def test_fifty_files_one_of_them_broken_by_two_processes(command, tmp_path):
     os.utime(out / "3.npz", (1, 1))
     result = command("convert", folder, "--to", "npz", "--out", out, "--jobs", 2, "--skip-existing")
     assert result.returncode == 1
-    assert result.stdout.count("skipped, there already") == 49
+    assert result.stdout.count("skipped, already exists") == 49
     assert (out / "3.npz").stat().st_mtime == 1
 
 
@@ -468,7 +468,7 @@ def test_no_place_to_write_and_no_standard_input(command, tmp_path):
     ("inputs", "out", "says"),
     [
         (["nothing.csv"], "out", "nothing.csv: no such file or folder"),
-        (["no*.csv"], "out", "no*.csv: no file fits this pattern"),
+        (["no*.csv"], "out", "no*.csv: no file matches this pattern"),
         (["empty"], "out", "empty: no recording in this folder; names end in .csv, .npz, .bin"),
         (["a.csv", "a.npz"], "out", "a.csv and a.npz would both become out/a.csv; convert them apart"),
         (["a.csv"], ".", "a.csv would be written over an input; choose another --out"),
@@ -496,7 +496,7 @@ def test_impossible_plans(tmp_path, monkeypatch, inputs, out, says):
         ("REAL --to csv --out o --sensors nowhere.toml", 1, "nowhere.toml: cannot read it"),
         ("nowhere.csv --to csv --out o", 1, "no such file or folder"),
         ("note.md --to csv --out o", 1, "unknown kind of file"),
-        ("noise.bin --to csv --out o", 1, "not one known packet in 5000 bytes"),
+        ("noise.bin --to csv --out o", 1, "no known packet in 5000 bytes"),
         ("REAL --to csv --out note.md", 2, "--out"),
     ],
 )

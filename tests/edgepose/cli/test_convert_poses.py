@@ -239,7 +239,7 @@ def test_broken_files_cost_only_themselves(command, tmp_path):
     assert sorted(path.name for path in out.iterdir()) == sorted(f"{i}.bvh" for i in range(12))
     check(out / "3.bvh", 9)
     result = command("convert", folder, "--to", "bvh", "--out", out, "--skip-existing")
-    assert result.stdout.count("skipped, there already") == 12
+    assert result.stdout.count("skipped, already exists") == 12
 
 
 @pytest.mark.parametrize(("at", "mended"), [(6, b"\x63"), (8, struct.pack("<H", 0x800))])
@@ -322,13 +322,13 @@ def test_small_files_of_many_poses(tmp_path):
     """They must not fill the memory."""
     path = tmp_path / "a.npz"
     np.savez_compressed(path, poses=np.zeros((200_000, 72), np.int8), mocap_framerate=60.0)
-    with pytest.raises(EdgeposeError, match=r"a\.npz: unpacks to 329 MB; files are read up to"):
+    with pytest.raises(EdgeposeError, match=r"a\.npz: unpacks to 329 MB; the limits are"):
         read_poses(path)
     still = "".join(f"JOINT j{i}\n{{\nOFFSET 0 0 0\nCHANNELS 0\n}}\n" for i in range(500))
     head = f"HIERARCHY\nROOT r\n{{\nOFFSET 0 0 0\nCHANNELS 1 Xrotation\n{still}}}\nMOTION\n"
     path = tmp_path / "a.bvh"
     path.write_text(f"{head}Frames: 50000\nFrame Time: .01\n" + "0\n" * 50_000)
-    with pytest.raises(EdgeposeError, match=r"a\.bvh: unpacks to 2293 MB; files are read up to"):
+    with pytest.raises(EdgeposeError, match=r"a\.bvh: unpacks to 2293 MB; the limits are"):
         read_poses(path)
     more = "".join(still.replace("j", letter) for letter in "abcdefghiklmnopqstuvw")
     path.write_text(path.read_text().replace("}\nMOTION", more + "}\nMOTION"))

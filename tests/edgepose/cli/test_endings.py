@@ -84,7 +84,8 @@ def test_one_signal_ends_a_run_whose_output_nobody_reads(wearer, tmp_path, numbe
         process.wait()
     assert "poses    " in errors
     assert re.search(
-        r"edgepose: the program that reads the poses from standard output takes nothing: \d+ bytes", errors
+        r"edgepose: the program that reads the poses from standard output has stopped reading: \d+ bytes",
+        errors,
     )
     count = int(re.search(r"poses    (\d+) in", errors)[1])
     assert len(read_poses(tmp_path / "p.npz").frames) == count > 20
@@ -175,7 +176,7 @@ def test_a_recording_to_a_pipe_that_nobody_reads(wearer):
         errors = process.stderr.read()
         process.stdout.close()
         process.stderr.close()
-    assert "the program that reads the samples from standard output takes nothing" in errors
+    assert "the program that reads the samples from standard output has stopped reading" in errors
 
 
 def test_a_pipe_is_waited_for_until_the_run_is_to_end(wearer, tmp_path):
@@ -185,7 +186,7 @@ def test_a_pipe_is_waited_for_until_the_run_is_to_end(wearer, tmp_path):
     process.send_signal(signal.SIGTERM)
     code, errors = ended(process)
     assert code == 1
-    assert errors == f"edgepose: nobody reads the poses from {tmp_path / 'p.csv'}\n"
+    assert errors == f"edgepose: no program reads the poses from {tmp_path / 'p.csv'}\n"
 
 
 def test_a_user_without_a_home(tmp_path):

@@ -237,7 +237,7 @@ def test_a_device_in_the_place_of_an_npz_file(command, wearer, tmp_path, name):
     }
     result = command(*words[name])
     assert result.returncode == 1
-    assert "no file on a disk" in result.stderr
+    assert "not a file on a disk" in result.stderr
     assert "Traceback" not in result.stderr
 
 
@@ -267,4 +267,6 @@ def test_a_device_without_an_end_as_a_text_file(wearer, flag):
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (20, 20)),
     )
     assert done.returncode == 1
-    assert re.fullmatch(r"edgepose: /dev/zero: larger than \d+ kB, as no such file is; .*\n", done.stderr)
+    assert re.fullmatch(
+        r"edgepose: /dev/zero: larger than \d+ kB, too large for such a file; .*\n", done.stderr
+    )

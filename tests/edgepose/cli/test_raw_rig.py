@@ -132,7 +132,7 @@ def test_without_a_filter_the_message_names_it(command, rig, wearer, tmp_path):
         "run", "--file", rig.raw, "--calibration", wearer.calibration, "--csv", tmp_path / "x.csv"
     )
     assert result.returncode == 1
-    assert result.stderr.endswith("or make it here of gyroscope and accelerometer: --filter kalman\n")
+    assert result.stderr.endswith("or compute it here from gyroscope and accelerometer: --filter kalman\n")
 
 
 @pytest.mark.parametrize(
@@ -244,7 +244,7 @@ def test_a_live_run_begins_with_the_pose_and_re_zeroes_on_request(rig, tmp_path)
         run.wait(60)
         assert run.returncode == 0, terminal.screen.decode()
         assert terminal.modes() == before
-        assert b"control  1 datagrams that ask for nothing known" in terminal.screen
+        assert b"control  1 datagrams without a known request" in terminal.screen
     finally:
         run.kill()
         run.wait()
@@ -312,7 +312,7 @@ def test_keys_without_a_terminal():
 def test_the_control_address_is_checked(command, wearer, tmp_path):
     words = ("run", "--calibration", wearer.calibration, "--csv", tmp_path / "x.csv")
     for flags, says in (
-        (("--file", wearer.short, "--control", "127.0.0.1:9000"), "--control needs sensors that send"),
+        (("--file", wearer.short, "--control", "127.0.0.1:9000"), "--control needs live sensors"),
         (("--port", "x", "--control", "127.0.0.1"), "no port"),
         (("--port", "x", "--control", "127.0.0.1:9000,format=json"), "is more than HOST:PORT"),
     ):

@@ -288,7 +288,10 @@ def test_kill_in_the_middle(command, tmp_path, name):
             assert not file.exists()
             result = command("record", file, "--port", rig.port)
             assert result.returncode == 1
-            assert f"edgepose: {growing} is of a recording that was cut short; keep it with" in result.stderr
+            assert (
+                f"edgepose: {growing} is left from a recording that was cut short; convert it with"
+                in result.stderr
+            )
             recover = re.search(r"edgepose (convert \S+ --to npz --out )DIR", result.stderr)[1].split()
             result = command(*recover, tmp_path / "saved")
             assert result.returncode == 0, result.stderr
@@ -350,19 +353,19 @@ def test_no_room_for_the_whole_file_leaves_its_journal(tmp_path):
         # No file can be put where a folder is.
         (tmp_path / "walk.npz").mkdir()
         summary = record(source, output)
-    assert f"the recording is whole in {tmp_path / 'walk.part.csv'}" in str(summary.error)
+    assert f"the complete recording is in {tmp_path / 'walk.part.csv'}" in str(summary.error)
     assert good(read_recording(tmp_path / "walk.part.csv")) == 1800
     assert sorted(path.name for path in tmp_path.iterdir()) == ["walk.npz", "walk.part.csv"]
 
 
 def test_nothing_came(tmp_path, monkeypatch):
-    monkeypatch.setattr("edgepose.sources.live.SILENCE_S", 0.2)
+    monkeypatch.setattr("edgepose.sources.line_checks.SILENCE_S", 0.2)
     for name in ("walk.csv", "walk.npz", "walk.bin"):
         with Rig() as rig:
             rig.silent = set(range(6))
             with open_source(port=rig.port) as source:
                 summary = record(source, open_output(str(tmp_path / name), {}))
-        assert "nothing came" in str(summary.error)
+        assert "no data for" in str(summary.error)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -376,7 +379,7 @@ def test_nothing_is_overwritten_unasked(command, tmp_path):
         line = ("--can", "virtual:x") if name == "walk.blf" else ("--port", "/dev/ttyNOWHERE7")
         result = command("record", file, *line)
         assert result.returncode == 1
-        assert f"edgepose: {file} is there already; choose another name or give --overwrite" in result.stderr
+        assert f"edgepose: {file} already exists; choose another name or give --overwrite" in result.stderr
         assert file.read_text() == "precious"
     result = command("record", tmp_path / "walk.csv", "--port", "/dev/ttyNOWHERE7", "--overwrite")
     assert "no such port" in result.stderr

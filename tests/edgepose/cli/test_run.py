@@ -99,7 +99,7 @@ def test_a_recording_with_the_default_model(command, wearer, tmp_path):
     assert status == ["filling window"] * past + ["ok"] * (720 - past)
     assert "poses    720 in " in result.stderr
     assert f"{past} while the window was filling" in result.stderr
-    assert "packets  7200 good, 0 lost, 0 bad; 0 samples too late or twice" in result.stderr
+    assert "packets  7200 good, 0 lost, 0 bad; 0 samples too late or duplicate" in result.stderr
     # The numbers as written, before the reader makes them rotations.
     rows = numbers(file)
     written = np.array([row[3 : 3 + 216] for row in rows[1:]], float).reshape(-1, 24, 3, 3)
@@ -198,7 +198,7 @@ def test_a_clock_that_began_anew_is_told(command, wearer, tmp_path):
         *("--csv", tmp_path / "poses.csv"),
     )
     assert result.returncode == 0, result.stderr
-    assert "clock    began anew 1 times, after all sensors were silent for a minute or more" in result.stderr
+    assert "clock    restarted 1 times, after all sensors were silent for a minute or more" in result.stderr
 
 
 def test_datagrams_that_nobody_receives_are_told(command, wearer):
@@ -444,7 +444,7 @@ def test_live_with_damage_on_the_line_a_sensor_that_pauses_and_ctrl_c(wearer, tm
     assert int(lost[2]) >= 20
     held = [i for i, text in enumerate(status) if text == "held head"]
     assert len(held) >= 30  # of about 90: a stalled machine holds the others too
-    assert "head: nothing for 1 s; its last values are repeated" in errors
+    assert "head: no data for 1 s; its last values are repeated" in errors
     assert re.search(r"^head: back after \d\.\d s$", errors, re.MULTILINE)
     assert re.search(r"^held     .*\bhead in \d+ frames", errors, re.MULTILINE)
     assert "ok" in status[: held[0]]
@@ -495,7 +495,7 @@ def test_a_line_that_is_unplugged_and_comes_back(wearer, tmp_path, monkeypatch, 
             link.unlink()
             first.unplug()
             assert run.stderr.readline().startswith("running rnn")
-            assert run.stderr.readline() == f"{name}: gone; the run goes on and waits for it\n"
+            assert run.stderr.readline() == f"{name}: disconnected; the run continues and waits for it\n"
             listener.wait_for(f"held {' '.join(PLACEMENTS)}", 30)
             with Rig(wearer.recording, wire) as second:
                 link.symlink_to(second.port)
@@ -540,9 +540,9 @@ def test_silence_a_wrong_speed_and_a_sensor_that_never_reports(wearer, tmp_path)
                 run.stderr.close()
     assert codes == (1, 1, 1)
     told = [last_line(text) for text in texts]
-    assert re.match(rf"edgepose: {quiet.port}: nothing came for \d+ s; check --port", told[0])
+    assert re.match(rf"edgepose: {quiet.port}: no data for \d+ s; check --port", told[0])
     assert re.match(
-        rf"edgepose: {noisy.port}: \d+ bytes in \d+ s and not one valid packet; check --baud \(now 115200\)",
+        rf"edgepose: {noisy.port}: \d+ bytes in \d+ s but no valid packet; check --baud \(now 115200\)",
         told[1],
     )
     assert "no samples of left_lower_leg in the first" in told[2]
@@ -557,4 +557,4 @@ def test_an_empty_capture(command, wearer, tmp_path):
         *("--csv", tmp_path / "poses.csv"),
     )
     assert result.returncode == 1
-    assert f"{file}: not one known packet in 0 bytes" in last_line(result.stderr)
+    assert f"{file}: no known packet in 0 bytes" in last_line(result.stderr)

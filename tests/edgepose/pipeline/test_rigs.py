@@ -113,7 +113,7 @@ def test_addresses_and_lines_are_read_as_flags(rig):
         ({"file": None}, "give one source: port PORT"),
         ({"port": "/dev/ttyUSB0"}, "give one source: port PORT"),
         ({"csv": None}, "give at least one output, such as csv FILE"),
-        ({"control": "127.0.0.1:9"}, "control needs sensors that send, or realtime"),
+        ({"control": "127.0.0.1:9"}, "control needs live sensors, or realtime"),
         ({"name": 3}, "name must be text in quotes on one line, not 3"),
         ({"name": " "}, "name must be text"),
         ({"name": "a\nb"}, "name must be text"),
@@ -142,7 +142,7 @@ def test_a_rig_file_that_is_not_there_or_not_toml(rig, tmp_path):
     with pytest.raises(EdgeposeError, match=r"anna\.toml: not valid TOML"):
         read_rigs([file])
     file.write_text("file = " + "[" * 100_000)
-    with pytest.raises(EdgeposeError, match=r"anna\.toml: not valid TOML: brackets within brackets"):
+    with pytest.raises(EdgeposeError, match=r"anna\.toml: not valid TOML: brackets are nested too deeply"):
         read_rigs([file])
 
 
@@ -314,7 +314,7 @@ def test_a_wearer_whose_input_is_broken_costs_only_his_own(command, wearer, rig,
     rigs = [rig("ben", file="empty.bin"), rig(), rig("cleo", file="damaged.csv")]
     result = command("run", *words(*rigs), "--model", "rnn")
     assert result.returncode == 1
-    assert f"ben: ended: {tmp_path}/empty.bin: not one known packet in 0 bytes" in result.stderr
+    assert f"ben: ended: {tmp_path}/empty.bin: no known packet in 0 bytes" in result.stderr
     told = result.stderr.splitlines()[-1]
     assert told.startswith("edgepose: 2 of 3 wearers failed: ben: ")
     assert f"; cleo: {damaged}: row 902 is cut off" in told
@@ -356,7 +356,7 @@ def test_a_port_that_is_unplugged_and_comes_back_costs_only_its_wearer(wearer, r
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 0
     told = log.read_text()
-    assert f"{link}: gone; the run goes on and waits for it" in told
+    assert f"{link}: disconnected; the run continues and waits for it" in told
     assert f"{link}: back after " in told
     poses = {name: read_poses(tmp_path / f"{name}.csv") for name in ("anna", "ben")}
     for name, own in poses.items():

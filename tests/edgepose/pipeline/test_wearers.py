@@ -16,7 +16,8 @@ from edgepose.pipeline.wearer_pipeline import WearerPipeline
 from edgepose.pose import PoseFrame
 from edgepose.sinks.base import Sink
 from edgepose.sources import Source, open_source
-from edgepose.sources.live import LineSpec, LiveSource
+from edgepose.sources.line_reader import LineSpec
+from edgepose.sources.live import LiveSource
 from edgepose_export.networks.shape import NetworkShape
 from firmware_protocols.registry import PROTOCOLS
 
@@ -85,7 +86,7 @@ def test_what_nobody_has_foreseen_in_a_library_ends_only_its_wearer(wearer, join
     first, second = (each.pipeline.summary for each in both)
     assert (second.poses, second.error) == (180, None)
     assert told == [f"ended: {first.error}"]
-    assert str(first.error).startswith("pcan:1: reading it failed (TypeError: an integer is required)")
+    assert str(first.error).startswith("pcan:1: reading failed (TypeError: an integer is required)")
     assert isinstance(first.error.__cause__, TypeError)
 
 
@@ -152,13 +153,13 @@ def test_what_nobody_has_foreseen_in_an_output_ends_only_its_wearer(wearer, join
         run_together(wearers, engine, 0.0)
     assert len(good.notes) == 180
     assert wearers[0].pipeline.summary.error is None
-    assert "an unexpected fault (KeyError: 'a fault'); please report it" in str(
+    assert "unexpected error (KeyError: 'a fault'); please report it" in str(
         wearers[1].pipeline.summary.error
     )
     assert bad.closed.is_set()
     if where == "write":
         assert len(bad.notes) == 20
-        assert told[0].startswith("ended: an unexpected fault")
+        assert told[0].startswith("ended: unexpected error")
 
 
 @pytest.mark.parametrize("place", ["clock", "headings", "orient"])

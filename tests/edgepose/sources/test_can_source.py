@@ -133,11 +133,11 @@ def test_frames_of_others_and_errors_are_passed_over(bus):
 
 def test_silence_and_strangers(bus, monkeypatch):
     sender, name = bus
-    monkeypatch.setattr("edgepose.sources.live.SILENCE_S", 0.2)
-    monkeypatch.setattr("edgepose.sources.live.NOISE_S", 0.2)
+    monkeypatch.setattr("edgepose.sources.line_checks.SILENCE_S", 0.2)
+    monkeypatch.setattr("edgepose.sources.line_checks.NOISE_S", 0.2)
     with open_source(can=name) as source, pytest.raises(EdgeposeError) as info:
         list(source)
-    assert str(info.value).startswith(f"{name}: nothing came for 0.2 s; check that the devices are on")
+    assert str(info.value).startswith(f"{name}: no data for 0.2 s; check that the devices are on")
     assert "--bitrate (now 500000)" in str(info.value)
 
     def send(message):
@@ -146,7 +146,7 @@ def test_silence_and_strangers(bus, monkeypatch):
     with (
         open_source(can=name) as source,
         Devices(send, "native-can"),
-        pytest.raises(EdgeposeError, match=r"\d+ frames in 0.2 s and not one valid packet; check --protocol"),
+        pytest.raises(EdgeposeError, match=r"\d+ frames in 0.2 s but no valid packet; check --protocol"),
     ):
         list(source)
 
@@ -192,7 +192,7 @@ def test_a_bus_that_goes_and_comes_back(tmp_path, monkeypatch, caplog):
         with Devices(adapter.send, "hipnuc-canopen"):
             before = collect(batches, 100)
         adapter.close()
-        while "gone" not in caplog.text or len(gap) < 5:
+        while "disconnected" not in caplog.text or len(gap) < 5:
             now_s, samples, *_ = next(batches)
             before += samples
             gap.append(now_s)
@@ -204,7 +204,7 @@ def test_a_bus_that_goes_and_comes_back(tmp_path, monkeypatch, caplog):
     assert {sample.sensor for sample in after} == set(range(6))
     assert max(s.time_s for s in before) < min(s.time_s for s in after)
     told = [record.getMessage() for record in caplog.records if record.name.startswith("edgepose")]
-    assert told[0] == f"slcan:{path}: gone; the run goes on and waits for it"
+    assert told[0] == f"slcan:{path}: disconnected; the run continues and waits for it"
     assert re.fullmatch(rf"slcan:{path}: back after \d+\.\d s", told[1])
 
 
@@ -297,11 +297,13 @@ def test_damaged_logs(tmp_path):
     with pytest.raises(EdgeposeError, match=r"no\.mf4: cannot read it as a log of a CAN bus"):
         everything(file=tmp_path / "no.mf4")
     (tmp_path / "empty.log").touch()
-    with pytest.raises(EdgeposeError, match=r"empty\.log: not one known packet in 0 bytes or frames"):
+    with pytest.raises(EdgeposeError, match=r"empty\.log: no known packet in 0 bytes or frames"):
         everything(file=tmp_path / "empty.log")
     with pytest.raises(EdgeposeError, match="No such file"):
         everything(file=tmp_path / "none.log")
-    with pytest.raises(EdgeposeError, match="packets only of sensor ids 1, 2, 3, 4, 5, 6, and known are"):
+    with pytest.raises(
+        EdgeposeError, match="packets come only from sensor ids 1, 2, 3, 4, 5, 6, but the expected ids are"
+    ):
         everything(file=write_log(tmp_path / "b.log", "hipnuc-canopen"), sensors=ids(tmp_path))
 
 

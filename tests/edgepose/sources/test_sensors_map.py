@@ -71,7 +71,10 @@ def test_two_hubs_and_a_bus(read):
     ]
     assert "--bitrate (now 1000000)" in found[2].check[0]
     assert [protocol.name for protocol in found[2].protocols] == ["native-can"]
-    with pytest.raises(EdgeposeError, match=r"left_lower_leg: b is none of a, virtual:x"):
+    with pytest.raises(
+        EdgeposeError,
+        match=r"left_lower_leg: b is not one of the lines given with --port and --can: a, virtual:x",
+    ):
         line_specs("a", None, "virtual:x", None, False, "auto", rig)
 
 
@@ -79,8 +82,8 @@ def test_two_hubs_and_a_bus(read):
     ("text", "says"),
     [
         ("head = ", r"rig\.toml: not valid TOML: Invalid value"),
-        (PORTS + '\nhead = { port = "x" }', r"rig\.toml: head is there twice"),
-        ("[head]\nid = 1\n[pelvis]\nid = 2\n[head]\nid = 3", r"rig\.toml: head is there twice"),
+        (PORTS + '\nhead = { port = "x" }', r"rig\.toml: head is defined twice"),
+        ("[head]\nid = 1\n[pelvis]\nid = 2\n[head]\nid = 3", r"rig\.toml: head is defined twice"),
         (PORTS.replace("head", "hat"), r"rig\.toml: unknown placement 'hat'; placements are left_forearm, "),
         (PORTS.replace("head", "#"), r"rig\.toml: no entry for head; all six"),
         (PORTS.replace("USB3", "USB2"), "right_lower_leg and left_lower_leg are the same device"),
@@ -88,7 +91,7 @@ def test_two_hubs_and_a_bus(read):
         (PORTS.replace('port = "/dev/ttyUSB1"', 'port = "/dev/ttyUSB0", id = 3'), "are the same device"),
         (PORTS.replace('port = "/dev/ttyUSB1"', 'prot = "x"'), "right_forearm: unknown key 'prot'; keys are"),
         (PORTS.replace('{ port = "/dev/ttyUSB1" }', "1"), "right_forearm: must be a table"),
-        (PORTS.replace('port = "/dev/ttyUSB1"', ""), "right_forearm: say where its samples come from"),
+        (PORTS.replace('port = "/dev/ttyUSB1"', ""), "right_forearm: no device named; give its port"),
         (PORTS.replace('"/dev/ttyUSB1"', "1"), "right_forearm: port must be text in quotes, not 1"),
         (IDS.replace("21", '"21"'), "right_forearm: id must be a whole number, not '21'"),
         (IDS.replace("21", "true"), "right_forearm: id must be a whole number, not True"),
@@ -195,7 +198,7 @@ def test_a_capture_with_ids_of_its_own(read, tmp_path):
         got = [sample.sensor for _, samples, *_ in source for sample in samples]
     assert got == [5, 4, 3, 2, 1, 0] * 30
     assert source.counters.unknown == 30
-    with open_source(file=file) as source, pytest.raises(EdgeposeError, match="only of sensor ids 7, 20, 21"):
+    with open_source(file=file) as source, pytest.raises(EdgeposeError, match="from sensor ids 7, 20, 21"):
         list(source)
 
 
@@ -203,7 +206,7 @@ def test_a_capture_does_not_say_of_which_port_it_is(read, tmp_path):
     rig = read(PORTS)
     with (
         open_source(file=capture(tmp_path / "a.bin", [0]), sensors=rig.path) as source,
-        pytest.raises(EdgeposeError, match="tells sensors apart by their ports"),
+        pytest.raises(EdgeposeError, match="distinguishes sensors by port"),
     ):
         list(source)
 

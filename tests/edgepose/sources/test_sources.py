@@ -125,7 +125,7 @@ def test_a_source_that_does_not_wait(port, caplog):
         with Device(port, chunks(300)):
             look_until(lambda: len(got) > 300)
         port.unplug()
-        look_until(lambda: "gone; the run goes on" in caplog.text)
+        look_until(lambda: "disconnected; the run continues" in caplog.text)
     assert {s.sensor for s in got} == set(range(6))
     for sensor in range(6):
         assert all(b > a for a, b in pairwise(s.time_s for s in got if s.sensor == sensor))
@@ -216,14 +216,14 @@ def test_unknown_ids_are_counted_and_told_once(port, caplog):
                 break
     assert source.counters.packets > 10
     assert [r.getMessage() for r in caplog.records] == [
-        f"{name}: packets of sensor id 9 are left out; ids are 0 to 5"
+        f"{name}: ignoring packets of sensor id 9; expected ids are 0 to 5"
     ]
 
 
 def drain(name, monkeypatch, seconds=0.3, **options):
     """The error in which a port ends, with the time-outs made short."""
-    monkeypatch.setattr("edgepose.sources.live.SILENCE_S", seconds)
-    monkeypatch.setattr("edgepose.sources.live.NOISE_S", seconds)
+    monkeypatch.setattr("edgepose.sources.line_checks.SILENCE_S", seconds)
+    monkeypatch.setattr("edgepose.sources.line_checks.NOISE_S", seconds)
     got = []
     with open_source(port=name, baud=9600, **options) as source, pytest.raises(EdgeposeError) as info:
         got.extend(sample for _, batch, *_ in source for sample in batch)
@@ -234,7 +234,7 @@ def drain(name, monkeypatch, seconds=0.3, **options):
 
 def test_silence(port, monkeypatch):
     message, _ = drain(port.name, monkeypatch)
-    assert "nothing came" in message
+    assert "no data for" in message
 
 
 def test_noise(port, monkeypatch):
@@ -250,7 +250,7 @@ def test_noise(port, monkeypatch):
 def test_only_unknown_ids(port, monkeypatch):
     with Device(port, chunks(200, ids=(7, 9))):
         message, _ = drain(port.name, monkeypatch)
-    assert "only of sensor ids 7, 9" in message
+    assert "only from sensor ids 7, 9" in message
 
 
 def test_frame_with_z_down_is_refused(port, monkeypatch):
@@ -289,7 +289,7 @@ def test_a_port_that_goes_and_comes_back(link, caplog):
             while len(before) < 200:
                 before += next(batches)[1]
         link.unplug()
-        while "gone" not in caplog.text or len(gap) < 10:
+        while "disconnected" not in caplog.text or len(gap) < 10:
             now_s, batch, *_ = next(batches)
             before += batch
             gap.append(now_s)
@@ -301,7 +301,7 @@ def test_a_port_that_goes_and_comes_back(link, caplog):
     assert {s.sensor for s in after} == set(range(6))
     told = [r.getMessage() for r in caplog.records]
     assert len(told) == 2
-    assert told[0] == f"{link.path}: gone; the run goes on and waits for it"
+    assert told[0] == f"{link.path}: disconnected; the run continues and waits for it"
     assert re.fullmatch(rf"{link.path}: back after \d+\.\d s", told[1])
 
 
@@ -452,11 +452,11 @@ def test_two_devices_with_one_id_are_told_once(port, caplog):
     both = zip(chunks(250), chunks(250, start_us=900_000_000, ids=[2]), strict=True)
     with open_source(port=name, protocol="native") as source, Device(port, [a + b for a, b in both]):
         for _ in source:
-            if "to and fro" in caplog.text:
+            if "back and forth" in caplog.text:
                 break
     assert [r.getMessage() for r in caplog.records] == [
-        f"{name}: the clock of the sensor for left_lower_leg jumps to and fro; "
-        "are there two devices with its id?"
+        f"{name}: the clock of the sensor for left_lower_leg jumps back and forth; "
+        "do two devices have the same id?"
     ]
 
 
@@ -506,7 +506,7 @@ def test_a_capture_without_times(tmp_path):
     assert len(times) >= 98
     assert np.diff(times) == pytest.approx(0.01, abs=1e-3)
     times_path(file).unlink()
-    with pytest.raises(EdgeposeError, match=r"walk\.bin: its packets carry no time"):
+    with pytest.raises(EdgeposeError, match=r"walk\.bin: neither its packets nor the capture hold times"):
         everything(file=file)
 
 
@@ -661,14 +661,14 @@ def test_options():
             open_source(**options, protocol="x")
     with pytest.raises(EdgeposeError, match="unknown kind"):
         open_source(file="a.txt")
-    with pytest.raises(EdgeposeError, match="a is there twice"):
+    with pytest.raises(EdgeposeError, match="a is given twice"):
         open_source(port="a,b,a")
     with pytest.raises(EdgeposeError, match="empty name"):
         open_source(port="a,,b")
     with pytest.raises(EdgeposeError, match="INTERFACE:CHANNEL"):
         open_source(can="can0")
-    with pytest.raises(EdgeposeError, match="protocol native is one of serial lines; use it with --port"):
+    with pytest.raises(EdgeposeError, match="protocol native is for serial lines; use it with --port"):
         open_source(can="virtual:a", protocol="native")
-    with pytest.raises(EdgeposeError, match="protocol native-can is one of CAN; use it with --can"):
+    with pytest.raises(EdgeposeError, match="protocol native-can is for CAN buses; use it with --can"):
         open_source(port="a", protocol="native-can")
     assert len(PLACEMENTS) == 6

@@ -38,10 +38,10 @@ def test_names_of_open_files(tmp_path):
 def test_a_file_made_meanwhile_is_not_taken(tmp_path):
     output = GrowingFile(tmp_path / "a.csv", "poses", overwrite=False)
     (tmp_path / "a.csv").write_bytes(OLD)
-    with pytest.raises(EdgeposeError, match="made by another program meanwhile"):
+    with pytest.raises(EdgeposeError, match="another program has just created it"):
         output.start()
     output.discard()
-    with pytest.raises(EdgeposeError, match="made by another program meanwhile"):
+    with pytest.raises(EdgeposeError, match="another program has just created it"):
         write_whole(tmp_path / "a.csv", "new", "text", overwrite=False)
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [OLD]
 
@@ -69,7 +69,7 @@ def test_a_part_file_that_goes_during_a_run_is_told(tmp_path):
 
 def test_a_part_file_that_is_a_link_is_not_followed(tmp_path):
     (tmp_path / "a.part.csv").symlink_to(tmp_path / "elsewhere.csv")
-    with pytest.raises(EdgeposeError, match="is there already"):
+    with pytest.raises(EdgeposeError, match="already exists"):
         NpzSink(tmp_path / "a.npz")
     assert not (tmp_path / "elsewhere.csv").exists()
 

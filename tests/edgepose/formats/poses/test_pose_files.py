@@ -377,7 +377,7 @@ def test_unwritable(tmp_path, kind):
         kind(tmp_path / "no" / "a")
     with pytest.raises(EdgeposeError, match=r"cannot write \w+ to"):
         kind(tmp_path)
-    with pytest.raises(EdgeposeError, match=r"must be a file|needs a file's name"):
+    with pytest.raises(EdgeposeError, match=r"must be a file|needs the name of a file"):
         kind("-")
     assert list(tmp_path.iterdir()) == []
 
@@ -433,7 +433,7 @@ def test_poses_of_a_run_that_was_cut_off_are_not_written_over(tmp_path):
     with CsvSink(part) as sink:
         sink.write(standing(0))
     before = part.read_bytes()
-    with pytest.raises(EdgeposeError, match=r"walk\.part\.csv is there already.*edgepose convert"):
+    with pytest.raises(EdgeposeError, match=r"walk\.part\.csv already exists.*edgepose convert"):
         NpzSink(tmp_path / "walk.npz")
     assert part.read_bytes() == before
 

@@ -1,0 +1,73 @@
+"""Checks of live lines: nothing usable at the start, clocks that restart, devices that share an id."""
+
+from __future__ import annotations
+
+import logging
+
+from edgepose.errors import DeviceError
+from edgepose.placements import PLACEMENTS
+from edgepose.sources.line_reader import LineReader
+
+_log = logging.getLogger(__name__)
+
+SILENCE_S = 5.0
+"""Longest time without any data at the start, seconds."""
+
+NOISE_S = 3.0
+"""Longest time with data but no usable packet at the start, seconds."""
+
+_DUPLICATE_JUMPS = 20  # resets of a clock within a second that a single device does not make
+
+
+def check_start(line: LineReader, now_s: float, start_s: float) -> None:
+    """Check that usable packets come from a line.
+
+    Args:
+        line: the line to check.
+        now_s: present time on the source's clock, seconds.
+        start_s: time at which the source was started, seconds.
+
+    Raises:
+        DeviceError: no data, or no usable packet, for too long since the start.
+    """
+    decoder, spec = line.decoder, line.spec
+    if decoder.first_s is None:
+        if now_s - start_s > SILENCE_S and line.transport is not None:
+            raise DeviceError(f"{spec.name}: no data for {SILENCE_S:g} s; check {spec.check[0]}")
+    elif now_s - decoder.first_s > NOISE_S and not decoder.counters.packets:
+        if decoder.unknown_ids:
+            ids = ", ".join(map(str, decoder.unknown_ids))
+            raise DeviceError(
+                f"{spec.name}: packets come only from sensor ids {ids}; set the ids to {decoder.ids}, "
+                "or assign them to placements with --sensors"
+            )
+        kind = "" if decoder.protocol is None else f"{decoder.protocol.name} "
+        raise DeviceError(
+            f"{spec.name}: {decoder.amount} {spec.unit} in {NOISE_S:g} s but no valid {kind}packet; "
+            f"check {spec.check[1]}"
+        )
+
+
+def warn_about_clock_resets(line: LineReader) -> None:
+    """Log a warning for each device clock that was reset since the last call, about a second ago.
+
+    Two devices with one id look like a single clock that jumps back and forth; that is reported once.
+    """
+    devices = {} if line.clocks is None else line.clocks.devices
+    for placement, clock in devices.items():
+        before = line.clock_resets.get(placement, 0)
+        if clock.resets - before >= _DUPLICATE_JUMPS and not line.duplicate_ids:
+            line.duplicate_ids = True
+            _log.warning(
+                "%s: the clock of the sensor for %s jumps back and forth; do two devices have the same id?",
+                line.spec.name,
+                PLACEMENTS[placement],
+            )
+        elif clock.resets > before:
+            _log.warning(
+                "%s: the clock of the sensor for %s restarted; if it was switched off, its heading may have "
+                "changed: calibrate again",
+                line.spec.name,
+                PLACEMENTS[placement],
+            )
+        line.clock_resets[placement] = clock.resets

@@ -1,0 +1,210 @@
+"""One live line: the interface of an open port or bus, and the reader that collects its data."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Sequence
+from queue import SimpleQueue
+from typing import NamedTuple, Protocol
+
+from edgepose.errors import DeviceError, EdgeposeError
+from edgepose.sources.clock_sync import HostClocks
+from edgepose.sources.line_decoder import Clock, LineDecoder, PlacementById
+from edgepose.sources.protocol_detection import Chunk
+from firmware_protocols import registry
+
+_log = logging.getLogger(__name__)
+
+BACKLOG_S = 0.5
+"""Longest time spent discarding old data, seconds; a line that is never empty is read from then on."""
+
+REOPEN_S = 0.5
+"""Time between two attempts to open a line that has disappeared, seconds."""
+
+_SETTLE_S = 0.1
+"""Shortest time spent discarding: data that the system has buffered comes in several pieces."""
+
+
+class LineDisconnectedError(Exception):
+    """The port or bus has disappeared."""
+
+
+class Transport(Protocol):
+    """An open port or bus."""
+
+    def read(self) -> tuple[Chunk, bool]:
+        """Return the available data, waiting up to POLL_S for the first of it, and whether more is waiting.
+
+        Raises:
+            LineDisconnectedError: the port or bus no longer exists.
+        """
+
+    def close(self) -> None:
+        """Release the port or bus."""
+
+    @property
+    def waiting(self) -> Callable[[], tuple[Chunk, bool]] | None:
+        """A non-blocking `read`; None if the transport has none.
+
+        It returns all data that was available unless it says that more may be waiting.
+        """
+
+
+class LineSpec(NamedTuple):
+    """One line to read from.
+
+    Attributes:
+        name: port or bus, for messages.
+        open: opens it.
+        protocols: wire formats that the line may use.
+        placements: the line's map from ids to placements, once the protocol is known.
+        unit: "bytes" or "frames", for messages.
+        check: advice for the user if no data comes, and if none of it can be decoded.
+    """
+
+    name: str
+    open: Callable[[], Transport]
+    protocols: Sequence[registry.Protocol]
+    placements: Callable[[registry.Protocol], PlacementById]
+    unit: str
+    check: tuple[str, str]
+
+
+class LineReader:
+    """Reads one line, and reopens it after a disconnect.
+
+    In blocking mode a thread reads the line all the time. Otherwise, if the transport can be polled, the
+    thread only empties the line at the start and reopens it after a disconnect.
+
+    Attributes:
+        spec: the line's name, protocols and advice.
+        transport: the open port or bus; None while it is disconnected.
+        clocks: clocks of the line's devices; None until the protocol is known.
+        decoder: turns the line's data into samples.
+        clock_resets: resets of each device's clock at the last check, by placement.
+        duplicate_ids: the user has been warned about two devices with one id.
+        warned: the user has been warned that nothing usable comes.
+    """
+
+    def __init__(
+        self,
+        spec: LineSpec,
+        transport: Transport,
+        placement_owner: dict[int, str],
+        queue: SimpleQueue,
+        now: Callable[[], float],
+        blocking: bool,
+    ) -> None:
+        """Prepare to read; `start` begins.
+
+        Args:
+            spec: the line.
+            transport: the open line, closed by this reader.
+            placement_owner: see `LineDecoder`.
+            queue: gets (reader, arrival time, data) from the thread, or the error that ended it as the data.
+            now: the source's clock, seconds.
+            blocking: see `edgepose.sources.open_source`.
+        """
+        self.spec = spec
+        self.transport: Transport | None = transport
+        self.clocks: HostClocks | None = None
+        self.decoder = LineDecoder(spec.name, spec.protocols, spec.placements, self._clock, placement_owner)
+        self.clock_resets: dict[int, int] = {}
+        self.duplicate_ids = False
+        self.warned = False
+        self._queue = queue
+        self._now = now
+        self._blocking = blocking
+        self._poll: Callable[[], tuple[Chunk, bool]] | None = None  # None while the thread reads
+        self._stop = threading.Event()
+        self._thread = self._thread_from(self._drain)
+
+    def _clock(self, wrap_us: int) -> Clock:
+        self.clocks = HostClocks(wrap_us)
+        return self.clocks.time
+
+    def _thread_from(self, first: Callable[[], None]) -> threading.Thread:
+        return threading.Thread(target=self._run, args=(first,), daemon=True, name=self.spec.name)
+
+    def start(self) -> None:
+        """Start the thread that empties the line and then reads it."""
+        self._thread.start()
+
+    def poll(self) -> tuple[Chunk, bool]:
+        """Return the data waiting on the line and whether more may follow; nothing while the thread reads."""
+        if self._poll is None:
+            return b"", False
+        try:
+            return self._poll()
+        except LineDisconnectedError:
+            self._poll = None
+            self._thread = self._thread_from(self._reopen)
+            self._thread.start()
+            return b"", False
+
+    def _run(self, first: Callable[[], None]) -> None:
+        try:
+            first()
+            while not self._stop.is_set():
+                assert self.transport is not None
+                if not self._blocking and self.transport.waiting is not None:
+                    self._poll = self.transport.waiting
+                    return
+                try:
+                    chunk, _ = self.transport.read()
+                    if chunk:
+                        self._queue.put((self, self._now(), chunk))
+                except LineDisconnectedError:
+                    self._reopen()
+        except BaseException as error:  # raised again in the thread that iterates over the source
+            self._queue.put((self, self._now(), _reading_error(self.spec, error)))
+
+    def _drain(self) -> None:
+        # Data buffered before the line was opened is of unknown age, and full buffers have lost parts of it.
+        start_s = self._now()
+        while self.transport is not None and (passed_s := self._now() - start_s) < BACKLOG_S:
+            try:
+                if not self.transport.read()[1] and passed_s >= _SETTLE_S:
+                    return
+            except LineDisconnectedError:  # the next read raises it again
+                return
+
+    def _reopen(self) -> None:
+        disconnected_s = self._now()
+        assert self.transport is not None
+        self.transport.close()
+        self.transport = None
+        _log.warning("%s: disconnected; the run continues and waits for it", self.spec.name)
+        while not self._stop.wait(REOPEN_S):
+            try:
+                self.transport = self.spec.open()
+            except EdgeposeError:
+                continue
+            _log.warning("%s: back after %.1f s", self.spec.name, self._now() - disconnected_s)
+            self._drain()
+            return
+
+    def stop(self) -> None:
+        """Stop reading, without waiting for a read in progress."""
+        self._stop.set()
+
+    def close(self) -> None:
+        """Stop reading and close the line."""
+        self.stop()
+        if self._thread.is_alive():
+            self._thread.join()
+        if self.transport is not None:
+            self.transport.close()
+
+
+def _reading_error(spec: LineSpec, error: BaseException) -> EdgeposeError:
+    """Return the error to report for a failed read; vendor libraries raise arbitrary exceptions."""
+    if isinstance(error, EdgeposeError):
+        return error
+    text = (str(error).splitlines() or [""])[0]
+    reported = DeviceError(
+        f"{spec.name}: reading failed ({type(error).__name__}: {text}); edgepose --debug shows where"
+    )
+    reported.__cause__ = error
+    return reported
