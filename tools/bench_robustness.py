@@ -47,7 +47,7 @@ class Fault(NamedTuple):
     counts: Callable[[int], NDArray[np.bool_]]
 
 
-def lost(frames: int) -> NDArray[np.bool_]:
+def lost_frames(frames: int) -> NDArray[np.bool_]:
     """Return a mask (frames,) of the times at which a sensor is lost: the second half of a short take."""
     time_s = np.arange(frames) / RATE
     if time_s[-1] < BACK_S:
@@ -55,11 +55,11 @@ def lost(frames: int) -> NDArray[np.bool_]:
     return time_s % (BACK_S + LOST_S) >= BACK_S
 
 
-def without(sensor: int) -> Fault:
+def sensor_lost(sensor: int) -> Fault:
     """Return the fault of a sensor that is lost now and then; its bone is extrapolated as in a run."""
 
     def apply(take: Take) -> Take:
-        missing = lost(len(take.pose))
+        missing = lost_frames(len(take.pose))
         last = np.maximum.accumulate(np.where(missing, 0, np.arange(len(missing))))
         orientation, acceleration = take.orientation.copy(), take.acceleration.copy()
         orientation[:, sensor], acceleration[:, sensor] = (
@@ -72,10 +72,10 @@ def without(sensor: int) -> Fault:
             orientation[t] = before
         return take._replace(orientation=orientation, acceleration=acceleration)
 
-    return Fault(apply, lost)
+    return Fault(apply, lost_frames)
 
 
-def always(frames: int) -> NDArray[np.bool_]:
+def all_frames(frames: int) -> NDArray[np.bool_]:
     """Return a mask (frames,) of all frames."""
     return np.ones(frames, bool)
 
@@ -84,7 +84,7 @@ def _random(take: Take) -> np.random.Generator:
     return np.random.default_rng([*take.name.encode()])
 
 
-def slipped(take: Take) -> Take:
+def with_slipped_sensors(take: Take) -> Take:
     """Return the take with each sensor rotated on its bone about a random axis, drawn for each take."""
     axes = _random(take).normal(size=(len(PLACEMENTS), 3))
     axes *= np.radians(ERROR_DEG) / np.linalg.norm(axes, axis=-1, keepdims=True)
@@ -92,7 +92,7 @@ def slipped(take: Take) -> Take:
     return take._replace(orientation=rotated.astype(np.float32))
 
 
-def misheaded(take: Take) -> Take:
+def with_wrong_headings(take: Take) -> Take:
     """Return the take with all headings except the pelvis' wrong, to random sides drawn for each take."""
     vectors = np.zeros((len(PLACEMENTS), 3))
     vectors[:ROOT, 1] = np.radians(ERROR_DEG) * _random(take).choice([-1.0, 1.0], ROOT)
@@ -104,9 +104,9 @@ def misheaded(take: Take) -> Take:
 
 
 FAULTS = {
-    **{f"{name} lost": without(i) for i, name in enumerate(PLACEMENTS)},
-    f"each sensor slipped by {ERROR_DEG:g} deg": Fault(slipped, always),
-    f"each heading wrong by {ERROR_DEG:g} deg": Fault(misheaded, always),
+    **{f"{name} lost": sensor_lost(i) for i, name in enumerate(PLACEMENTS)},
+    f"each sensor slipped by {ERROR_DEG:g} deg": Fault(with_slipped_sensors, all_frames),
+    f"each heading wrong by {ERROR_DEG:g} deg": Fault(with_wrong_headings, all_frames),
 }
 
 

@@ -53,7 +53,7 @@ SETTLE_S = 2.0
 """Time at the start that is not measured, seconds: caches fill, and all wearers begin together."""
 
 
-class Whole(NamedTuple):
+class ProgramRun(NamedTuple):
     """Result of a run of the whole program.
 
     Attributes:
@@ -189,7 +189,7 @@ def wait_for_all(receiver: socket.socket, wearers: int) -> None:
             raise TimeoutError
 
 
-def whole(model: str, wearers: int, seconds: float, core: int) -> Whole:
+def measure_program(model: str, wearers: int, seconds: float, core: int) -> ProgramRun:
     """Run the program on simulated wearers.
 
     Raises:
@@ -238,7 +238,7 @@ def whole(model: str, wearers: int, seconds: float, core: int) -> Whole:
         numbers[datagram.port].append(pose.index)
     expected = sum(indices[-1] - indices[0] + 1 for indices in numbers.values())
     p50, p99 = np.percentile(1e3 * ages, [50, 99])
-    return Whole(
+    return ProgramRun(
         spent_s / passed_s,
         p50,
         p99,
@@ -251,7 +251,7 @@ def whole(model: str, wearers: int, seconds: float, core: int) -> Whole:
 # --- the page -----------------------------------------------------------------------------------------------
 
 
-def draw(file: Path, rows: dict[str, dict[int, tuple[float, Whole]]]) -> None:
+def draw(file: Path, rows: dict[str, dict[int, tuple[float, ProgramRun]]]) -> None:
     """Draw the share of the core and the ages against the number of wearers."""
     import matplotlib.pyplot as plt
 
@@ -300,13 +300,13 @@ def main(
     if not others:
         raise click.ClickException("this machine has only one core; the simulator needs another one")
     os.sched_setaffinity(0, others)
-    rows: dict[str, dict[int, tuple[float, Whole]]] = {}
+    rows: dict[str, dict[int, tuple[float, ProgramRun]]] = {}
     heads = ["model", "wearers", "network us", "all us", "core", "p50 ms", "p99 ms", "late", "lost", "holds"]
     click.echo("| " + " | ".join(heads) + " |\n" + "|---" * len(heads) + "|")
     for model in models or ("rnn", "birnn"):
         results = rows[model] = {}
         for count in counts or (1, 2, 4, 8, 16, 32, 48, 64):
-            us, run = network_us(model, count), whole(model, count, seconds, core)
+            us, run = network_us(model, count), measure_program(model, count, seconds, core)
             results[count] = us, run
             all_us = 1e6 * run.core / (count * run.per_s)
             cells = [model, count, f"{us:.0f}", f"{all_us:.0f}", f"{run.core:.0%}"]

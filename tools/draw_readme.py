@@ -40,7 +40,7 @@ SENSOR = "#E69F00"
 GROUND = "#DDDDDD"
 FRONT = 0.0
 
-WHERE = {
+DESCRIPTIONS = {
     "left_forearm": "back of the forearm,\njust above the wrist",
     "right_forearm": "back of the forearm,\njust above the wrist",
     "left_lower_leg": "front of the shin,\nbelow the knee",
@@ -76,7 +76,7 @@ def canvas(width_m: float, height_m: float, width_in: float, dpi: float = DPI) -
     return figure, axes, 72.0 * scale
 
 
-def places() -> Figure:
+def placements() -> Figure:
     """Draw the six sensor placements on a wearer who faces the reader."""
     figure, axes, scale = canvas(2.9, 2.06, 7.5)
     axes.set_ylim(-0.17, 1.89)
@@ -122,7 +122,7 @@ def mark(axes: Any, at: Array, label: Array, name: str) -> None:
     axes.add_patch(box)
     align = "left" if side > 0 else "right"
     axes.text(*label, name, ha=align, va="center", fontsize=11, color=INK, weight="bold", family="monospace")
-    axes.text(label[0], label[1] - 0.05, WHERE[name], ha=align, va="top", fontsize=9, color=INK)
+    axes.text(label[0], label[1] - 0.05, DESCRIPTIONS[name], ha=align, va="top", fontsize=9, color=INK)
 
 
 def calibration_poses() -> Figure:
@@ -238,7 +238,7 @@ def still(draw: Callable[[], Figure]) -> Callable[[Path], None]:
 
 
 PICTURES: dict[str, tuple[str, Callable[[Path], None]]] = {
-    "places": ("places.png", still(places)),
+    "places": ("places.png", still(placements)),
     "calibration-poses": ("calibration-poses.png", still(calibration_poses)),
     "run": ("run.gif", film),
 }

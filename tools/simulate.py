@@ -91,7 +91,7 @@ def read_input(path: Path, rig: Rig = IDEAL) -> Recording:
     Raises:
         EdgeposeError: the file is neither, or the clip has jumps.
     """
-    recording = of_clip(path, rig) if is_motion(path) else read_recording(path)
+    recording = simulate_clip(path, rig) if is_motion(path) else read_recording(path)
     if rig.raw is None:
         return recording
     from edgepose_export.synthesis.imu_errors import BMI270, raw
@@ -105,7 +105,7 @@ def read_input(path: Path, rig: Rig = IDEAL) -> Recording:
     return recording._replace(sensors=sensors)
 
 
-def of_clip(path: Path, rig: Rig) -> Recording:
+def simulate_clip(path: Path, rig: Rig) -> Recording:
     """Simulate ideal sensors on the body of a clip; the wearer stands straight first."""
     from edgepose_export.mocap import pieces, read_motion, resample
     from edgepose_export.synthesis.heading_routine import with_exercises

@@ -221,8 +221,10 @@ def test_windows_with_made_sitting_keep_their_pelvis(takes, monkeypatch, joined)
     config = replace(SMALL, sequences=64, seated_share=0.5, free_share=0.0, joined=joined, augmentation=how)
     one = Trainer(config, tape(made), tape(takes), ABOUT)
     first, length = len(made[0].pose), len(made[1].pose)
-    sitting = [start for start in range(len(one.sits)) if first - config.window < start < first + length]
-    assert one.sits.nonzero().flatten().tolist() == sitting
+    sitting = [
+        start for start in range(len(one.has_sitting)) if first - config.window < start < first + length
+    ]
+    assert one.has_sitting.nonzero().flatten().tolist() == sitting
     batches = []
 
     def recorded(batch, how, generator):

@@ -99,8 +99,8 @@ def export(
 ) -> None:
     """Turn a checkpoint of `edgepose train` into an archive for `edgepose run --model FILE --trust`.
 
-    The weights of several checkpoints are averaged if each was trained further from another (`train --init`).
-    The mean often does better on unseen motion than any of them. Everything else is taken from the first.
+    Several checkpoints, each trained further from another one (`train --init`), are averaged: mean weights
+    often do better on unseen motion than any of them. Everything else is taken from the first checkpoint.
 
     \b
     Examples:
@@ -161,8 +161,9 @@ def _read(checkpoints: tuple[Path, ...], name: str, past: int, future: int, roun
 def _measured_module(
     trained: _Trained, data: Path | None, others: Mapping[str, Archive], file_name: str
 ) -> torch.jit.ScriptModule:
-    """Return the archive's module; with a folder of takes, fit its deviations and add its measures to the
-    metadata.
+    """Return the archive's module.
+
+    With a folder of takes, fit the standard deviations and add the measures to the metadata.
     """
     import torch
 

@@ -30,11 +30,10 @@ RATE = 6.0
 )
 @overwrite_option
 def learn_prior(inputs: tuple[Path, ...], out: Path, about: str, overwrite: bool) -> None:
-    """Learn a pose prior for `edgepose solve` from motion capture (.bvh, .amc, AMASS .npz, or folders of
-    these).
+    """Learn a pose prior for `edgepose solve` from motion capture (.bvh, .amc, AMASS .npz, or folders).
 
-    The prior holds mean, covariance and limits of poses. Takes of the held-out parts are recognised by their
-    names and left out.
+    The prior holds mean, covariance and limits of poses. Takes of the held-out parts, which are recognised by
+    their names, are left out.
 
     \b
     Example:

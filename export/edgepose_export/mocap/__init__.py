@@ -36,8 +36,7 @@ def read_motion(path: str | Path) -> Motion:
         if has_names(CMU_BVH, recording):
             return from_cmu_bvh(recording, path)
         if has_names(BANDAI, recording):
-            # Both datasets share one skeleton but differ in the zero of the collars; the name tells them
-            # apart.
+            # Both datasets share one skeleton; the zero of the collars differs, which only the name reveals.
             return from_bandai(recording, path, collars_back=not path.name.startswith("dataset-1_"))
     else:
         raise EdgeposeError(f"{path}: motion is read from .npz, .amc and .bvh files")

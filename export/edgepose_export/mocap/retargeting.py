@@ -172,8 +172,9 @@ _BANDAI_TOES = 23.0
 
 
 def from_bandai(recording: JointTree, path: object, collars_back: bool = True) -> Motion:
-    """Retarget a Bandai-Namco file, whose zero pose is no T-pose: G0 follows from the directions of bone
-    axes.
+    """Retarget a Bandai-Namco file.
+
+    Its zero pose is no T-pose, so G0 follows from the directions of its bone axes.
 
     Args:
         recording: content of the file.

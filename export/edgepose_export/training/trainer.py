@@ -120,7 +120,7 @@ class Trainer:
         seated = train.seated if config.seated_share else [False] * len(train.names)
         self.starts = window_starts(train, config.window, config.joined, lambda take: not seated[take])
         self.seated_starts = window_starts(train, config.window, config.joined, seated.__getitem__)
-        self.sits = windows_with_sitting(train, config.window)
+        self.has_sitting = windows_with_sitting(train, config.window)
         counts = processes.gathered(len(torch.cat(self.starts)))
         if not all(counts):
             where = f"process {counts.index(0)} has " if processes.size > 1 else ""
@@ -207,9 +207,9 @@ class Trainer:
 
     def _batch(self, starts: Tensor) -> Batch:
         """Return augmented windows by their first frames; those with synthetic sitting come last."""
-        sizes = self.config.augmentation
+        sizes, sitting = self.config.augmentation, self.has_sitting[starts]
         # The pitch of the pelvis tells sitting from standing, so it must not be disturbed there.
-        groups = ((~self.sits[starts], sizes), (self.sits[starts], sizes._replace(pelvis_pitch_deg=0.0)))
+        groups = ((~sitting, sizes), (sitting, sizes._replace(pelvis_pitch_deg=0.0)))
         parts = [
             augment(self._windows(starts[rows]), chosen, self.generator)
             for rows, chosen in groups
