@@ -1,11 +1,12 @@
-"""How much of the errors is constant within an actor.
+"""Measures which part of the errors is constant within an actor.
 
     OMP_NUM_THREADS=1 python tools/bench_actors.py --data recordings --model birnn --model rnn
 
 Held-out takes of CMU (recordings of `edgepose synthesize`) run through an archive as `edgepose run` runs
-them. Then one turn for each actor and joint without a sensor, behind its rotation, is fitted to the truth and
-taken out: what would be left if it were known how trunk, thighs and upper arms of an actor's skeleton stand
-to the bones with sensors. No measurement of a walk tells that; a calibration in a straight pose does.
+them. Then one rotation per actor and joint without a sensor is fitted to the true poses and removed. The
+errors that remain are those of a network that knows how trunk, thighs and upper arms of the actor's skeleton
+are aligned with the bones that carry sensors. A recording of a walk does not show this; a calibration in a
+straight pose does.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ from edgepose_export.evaluation.evaluate import Mode, modes_of, run_archive, tak
 Array = NDArray[np.float64]
 
 ACTOR = slice(0, 2)
-"""Where CMU's names of takes say whose they are: "07_01"."""
+"""Part of a CMU take's name that identifies the actor, as in "07_01"."""
 
 
 def without_constants(poses: Sequence[Array], true: Sequence[Array]) -> list[Array]:
-    """Local poses (T, 24, 3, 3) of one actor without what is constant in their errors against true ones."""
+    """Return local poses (T, 24, 3, 3) of one actor without the constant part of their errors."""
     joints = list(UNOBSERVED)
     predicted, reference = ([_rotations(pose) for pose in some] for some in (poses, true))
     errors = [p[:, joints].swapaxes(-1, -2) @ t[:, joints] for p, t in zip(predicted, reference, strict=True)]
@@ -45,7 +46,7 @@ def _rotations(pose: Array) -> Array:
 
 
 def errors(poses: Sequence[Array], true: Sequence[Array]) -> Array:
-    """(N, 3) of all frames: error of 15 joints, SIP error, degrees, position error, cm."""
+    """Return errors (N, 3) of all frames: 15 joints, deg; SIP error, deg; position error, cm."""
     offsets = default_body().offsets
     rows = [
         (joint_angle_error(pose, t), sip_error(pose, t), position_error(pose, t, offsets))
@@ -55,13 +56,17 @@ def errors(poses: Sequence[Array], true: Sequence[Array]) -> Array:
 
 
 @click.command()
-@click.option("--data", type=click.Path(path_type=Path), required=True, help="What synthesize wrote.")
+@click.option("--data", type=click.Path(path_type=Path), required=True, help="Folder written by synthesize.")
 @click.option("--model", "models", multiple=True, default=["birnn", "rnn"], help="Name or path; repeatable.")
 @click.option(
-    "--part", "parts", multiple=True, default=["cmu-walk-run", "cmu-02"], help="Of CMU; repeatable."
+    "--part",
+    "parts",
+    multiple=True,
+    default=["cmu-walk-run", "cmu-02"],
+    help="Part with CMU's takes; repeatable.",
 )
 def main(data: Path, models: tuple[str, ...], parts: tuple[str, ...]) -> None:
-    """How much of the errors is constant within an actor."""
+    """Measure which part of the errors is constant within an actor."""
     click.echo("| | 15 joints, deg / SIP error, deg / position, cm | without an actor's constants | frames |")
     click.echo("|---|---|---|---|")
     for model in models:

@@ -1,7 +1,7 @@
-"""How long `edgepose convert` takes for many files, one of them broken: recordings to NPZ, poses to BVH, NPZ.
+"""Measures `edgepose convert` on many files, one of them broken: recordings to NPZ, poses to BVH and NPZ.
 
-Sensors that lie still and joints that turn slowly are written once as CSV; the files are links to that, so
-that the disk is not measured. The broken one ends in its middle, soon after a row of nonsense.
+Sensors at rest and slowly rotating joints are written to one CSV file each. The other files are links to it,
+so that the disk is not measured. The broken file has a row of nonsense in the middle and ends soon after it.
 """
 
 from __future__ import annotations
@@ -27,29 +27,35 @@ RATE, POSE_RATE = 100, 60
 
 
 @click.command()
-@click.option("--files", type=click.IntRange(2), default=500, show_default=True, help="Of each kind.")
-@click.option("--seconds", type=click.FloatRange(1.0), default=30.0, show_default=True, help="In each file.")
-@click.option("--jobs", type=click.IntRange(1), default=2, show_default=True, help="As of the command.")
+@click.option(
+    "--files", type=click.IntRange(2), default=500, show_default=True, help="Number of files of each kind."
+)
+@click.option(
+    "--seconds", type=click.FloatRange(1.0), default=30.0, show_default=True, help="Length of each file."
+)
+@click.option(
+    "--jobs", type=click.IntRange(1), default=2, show_default=True, help="Passed on to edgepose convert."
+)
 def bench(files: int, seconds: float, jobs: int) -> None:
-    """Make the files, convert them, and tell how long that took."""
+    """Make the files, convert them, and print how long that took."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write_recording(folder / "recording.csv", seconds)
         write_poses(folder / "poses.csv", seconds)
-        for what, to in (("recording", "npz"), ("poses", "bvh"), ("poses", "npz")):
-            inputs = folder / f"{what}-{to}"
-            spread(folder / f"{what}.csv", inputs, files)
+        for kind, to in (("recording", "npz"), ("poses", "bvh"), ("poses", "npz")):
+            inputs = folder / f"{kind}-{to}"
+            fill(folder / f"{kind}.csv", inputs, files)
             megabytes = sum(path.stat().st_size for path in inputs.iterdir()) / 1e6
-            taken_s, results = convert(inputs, to, folder / f"out-{what}-{to}", jobs)
+            taken_s, results = convert(inputs, to, folder / f"out-{kind}-{to}", jobs)
             whole = sum(line.endswith("  ok") for line in results)
             click.echo(
-                f"{files} files of {what}, {megabytes:.0f} MB, to {to} with --jobs {jobs}: {taken_s:.0f} s, "
+                f"{files} files of {kind}, {megabytes:.0f} MB, to {to} with --jobs {jobs}: {taken_s:.0f} s, "
                 f"{whole} whole, {files - whole} damaged"
             )
 
 
 def write_recording(path: Path, seconds: float) -> None:
-    """Six sensors that lie still."""
+    """Write a recording of six sensors at rest."""
     count = round(seconds * RATE)
     noise = np.random.default_rng(0).normal(scale=0.05, size=(2, count, 3))
     quat = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
@@ -58,15 +64,15 @@ def write_recording(path: Path, seconds: float) -> None:
 
 
 def write_poses(path: Path, seconds: float) -> None:
-    """All joints turn slowly."""
+    """Write poses in which all joints rotate slowly."""
     with CsvSink(path) as sink:
         for i in range(round(seconds * POSE_RATE)):
-            turns = 0.3 * np.sin(np.arange(72).reshape(24, 3) + i / POSE_RATE)
-            sink.write(PoseFrame(i, i / POSE_RATE, rotvec_to_matrix(turns), np.zeros(24)))
+            vectors = 0.3 * np.sin(np.arange(72).reshape(24, 3) + i / POSE_RATE)
+            sink.write(PoseFrame(i, i / POSE_RATE, rotvec_to_matrix(vectors), np.zeros(24)))
 
 
-def spread(path: Path, folder: Path, count: int) -> None:
-    """Links to a file, and one broken file."""
+def fill(path: Path, folder: Path, count: int) -> None:
+    """Make links to a file, and one broken file."""
     folder.mkdir()
     for i in range(count - 1):
         os.link(path, folder / f"{i:03d}.csv")
@@ -76,7 +82,7 @@ def spread(path: Path, folder: Path, count: int) -> None:
 
 
 def convert(inputs: Path, to: str, out: Path, jobs: int) -> tuple[float, list[str]]:
-    """Seconds that the command took, and the rows of its table."""
+    """Return the seconds that the command took, and the rows of its table."""
     command = [
         sys.executable,
         "-m",
@@ -93,7 +99,7 @@ def convert(inputs: Path, to: str, out: Path, jobs: int) -> tuple[float, list[st
     ]
     started = time.monotonic()
     result = subprocess.run([*map(str, command)], text=True, capture_output=True, check=False)
-    if result.returncode != 1:  # there is the broken one
+    if result.returncode != 1:  # because of the broken file
         raise click.ClickException(result.stderr)
     return time.monotonic() - started, result.stdout.splitlines()[1:]
 

@@ -1,7 +1,7 @@
-"""Prints what decoding costs: every format of the registry, six sensors, samples fed as they come in.
+"""Prints the cost of decoding for every format of the registry, with six sensors and one sample at a time.
 
-Only the decoder is measured: no port, no bus, no mapping of clocks. The best of several runs counts: all else
-that this machine does can only add to it.
+Only the decoder is measured: no port, no bus, no mapping of clocks. The best of several runs counts, because
+other programs can only add to the time.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ SENSORS, RATE = 6, 200
 SAMPLES = 2400
 RUNS = 7
 
-# Bits of a CAN 2.0 frame around its data, with the three bits of silence, before stuffing.
+# Bits of a CAN 2.0 frame without its data, by extended id, including three bits of silence, before stuffing.
 CAN_BITS = {False: 47, True: 67}
 
 
-def wires(spoken: Protocol) -> list[Any]:
-    """The packets of all samples, in the order they come."""
-    ids = [0] if spoken.single_device else list(spoken.ids)
-    encode = spoken.encoder()
+def wires(protocol: Protocol) -> list[Any]:
+    """Return the packets of all samples, in order of arrival."""
+    ids = [0] if protocol.single_device else list(protocol.ids)
+    encode = protocol.encoder()
     result = []
     for number in range(SAMPLES):
         seq, which = divmod(number, len(ids))
@@ -46,39 +46,39 @@ def wires(spoken: Protocol) -> list[Any]:
     return result
 
 
-def microseconds(spoken: Protocol, packets: list[Any]) -> float:
-    """Microseconds a sample, the best of a few runs.
+def microseconds(protocol: Protocol, packets: list[Any]) -> float:
+    """Return microseconds per sample, the best of several runs.
 
     Raises:
         AssertionError: samples are missing.
     """
     best = float("inf")
     for _ in range(RUNS):
-        decoder = spoken.decoder()
+        decoder = protocol.decoder()
         feed = decoder.feed
-        given = 0
+        count = 0
         start = time.perf_counter()
-        if spoken.transport == "bytes":
+        if protocol.transport == "bytes":
             for wire in packets:
-                given += len(feed(wire))
+                count += len(feed(wire))
         else:
             for frames in packets:
                 for can_id, data, extended, _ in frames:
-                    given += len(feed(can_id, data, extended))
+                    count += len(feed(can_id, data, extended))
         best = min(best, time.perf_counter() - start)
-        assert given > SAMPLES - 50, f"{spoken.name}: {given} of {SAMPLES} samples"
+        assert count > SAMPLES - 50, f"{protocol.name}: {count} of {SAMPLES} samples"
     return best / SAMPLES * 1e6
 
 
-def line_bits(spoken: Protocol, packets: list[Any]) -> float:
-    """Bits of a sample on its line: 8N1, or CAN frames before stuffing."""
-    if spoken.transport == "bytes":
+def line_bits(protocol: Protocol, packets: list[Any]) -> float:
+    """Return the bits per sample on the line: 8N1, or CAN frames before stuffing."""
+    if protocol.transport == "bytes":
         return 10 * sum(map(len, packets)) / SAMPLES
     return sum(CAN_BITS[extended] + 8 * len(data) for _, data, extended, _ in chain(*packets)) / SAMPLES
 
 
 def processor() -> str:
-    """Name of the processor, as far as the system tells."""
+    """Return the name of the processor, if the system provides it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -89,16 +89,16 @@ def processor() -> str:
 
 @click.command(help=__doc__)
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     print(f"Python {platform.python_version()}, {processor()}; {SENSORS} sensors at {RATE} Hz\n")
     print("| format | line | kbit/s for six | us a sample | share of one core |")
     print("|---|---|---|---|---|")
-    for name, spoken in PROTOCOLS.items():
-        packets = wires(spoken)
-        cost = microseconds(spoken, packets)
+    for name, protocol in PROTOCOLS.items():
+        packets = wires(protocol)
+        cost = microseconds(protocol, packets)
         per_s = SENSORS * RATE
-        kbit = line_bits(spoken, packets) * per_s / 1000
-        line = "CAN" if spoken.transport == "can" else "six ports" if spoken.single_device else "one port"
+        kbit = line_bits(protocol, packets) * per_s / 1000
+        line = "CAN" if protocol.transport == "can" else "six ports" if protocol.single_device else "one port"
         print(f"| {name} | {line} | {kbit:.0f} | {cost:.1f} | {cost * per_s / 1e4:.2f} % |", flush=True)
 
 

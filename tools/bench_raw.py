@@ -1,8 +1,9 @@
-"""What orientations made here cost in accuracy: a clip on ideal sensors, and on chips without a filter.
+"""Measures the accuracy of poses from raw sensors: a clip on ideal sensors, and on chips without a filter.
 
 Simulated sensors sit at random angles on a body that stands, does the exercises of `edgepose calibrate
---heading-reset motion`, and then moves as a clip does. Each row changes one thing; errors are those of the
-poses against the clip's own. Of the filters only the heading and the tilt of the measured bones are shown.
+--heading-reset motion`, and then moves as in a clip. Each row changes one thing. The first table has the
+errors of the poses against those of the clip, the second one the heading and tilt errors of the measured
+bones.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ EXERCISES_S = len(calibration.ROUTINE) * calibration.EXERCISE_S
 QUIET = ImuErrorModel(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-class Way(NamedTuple):
-    """How orientations are made and headings come together: a chip, a filter, a magnetometer, a reset."""
+class Setup(NamedTuple):
+    """Source of orientations and headings: a chip, a filter, a magnetometer, a heading reset."""
 
     chip: ImuErrorModel | None = None
     filter: str = "none"
@@ -42,19 +43,19 @@ class Way(NamedTuple):
     reset: str | None = None
 
 
-WAYS = {
-    "ideal orientations": Way(),
-    "ideal, headings from motion": Way(reset="motion"),
-    "kalman, ideal chip, true headings": Way(QUIET, "kalman", reset="true"),
-    "kalman, BMI270, true headings": Way(BMI270, "kalman", reset="true"),
-    "kalman, BMI270, headings from motion": Way(BMI270, "kalman", reset="motion"),
-    "vqf, BMI270, headings from motion": Way(BMI270, "vqf", reset="motion"),
-    "kalman, BMI270 and magnetometer": Way(BMI270, "kalman", magnetometer=True),
+SETUPS = {
+    "ideal orientations": Setup(),
+    "ideal, headings from motion": Setup(reset="motion"),
+    "kalman, ideal chip, true headings": Setup(QUIET, "kalman", reset="true"),
+    "kalman, BMI270, true headings": Setup(BMI270, "kalman", reset="true"),
+    "kalman, BMI270, headings from motion": Setup(BMI270, "kalman", reset="motion"),
+    "vqf, BMI270, headings from motion": Setup(BMI270, "vqf", reset="motion"),
+    "kalman, BMI270 and magnetometer": Setup(BMI270, "kalman", magnetometer=True),
 }
 
 
 def ideal(motion: Motion, mounting: Array) -> Recording:
-    """What perfect sensors record."""
+    """Return the recording of ideal sensors."""
     imus = virtual_imus(motion, default_body(), mounting)
     time_s = np.arange(len(motion.rotations)) / motion.rate
     sensors = {
@@ -64,33 +65,33 @@ def ideal(motion: Motion, mounting: Array) -> Recording:
     return Recording(sensors, {})
 
 
-def oriented(recording: Recording, way: Way, seed: int) -> Recording:
-    """What is left of it after the chip and the filter."""
+def oriented(recording: Recording, setup: Setup, seed: int) -> Recording:
+    """Return the recording as it is after the chip and the filter."""
     from edgepose.formats.recordings.base import recording_from_samples
     from edgepose.orientation import OrientationEstimator
 
-    if way.chip is None:
+    if setup.chip is None:
         return recording
     chips = {
-        name: raw(data, way.chip, seed + i, way.magnetometer)
+        name: raw(data, setup.chip, seed + i, setup.magnetometer)
         for i, (name, data) in enumerate(recording.sensors.items())
     }
-    orienter = OrientationEstimator(way.filter, way.magnetometer)
+    orienter = OrientationEstimator(setup.filter, setup.magnetometer)
     return recording_from_samples(orienter.orient(list(iter_samples(Recording(chips, {})))))
 
 
-def calibrated(recording: Recording, way: Way, truth: Recording) -> calibration.Calibration:
-    """The calibration from the standing and the exercises."""
+def calibrated(recording: Recording, setup: Setup, truth: Recording) -> calibration.Calibration:
+    """Calibrate with the parts of standing and of the exercises."""
     everything = calibration.hold_from_recording(recording)
     held = calibration.check_hold(calibration.trim(everything, *HOLD))
     offset = None
-    if way.reset == "motion":
+    if setup.reset == "motion":
         moving = calibration.trim(everything, STAND_S, STAND_S + EXERCISES_S)
         offset = calibration.headings_from_motion(moving, held.orientation).offset
-    elif way.reset == "true":
+    elif setup.reset == "true":
         true = calibration.check_hold(calibration.trim(calibration.hold_from_recording(truth), *HOLD))
         offset = rot.yaw_of_quat(rot.quat_multiply(true.orientation, rot.quat_conjugate(held.orientation)))
-    elif way.magnetometer:  # the field points along Y of the inertial frame, as headings count here
+    elif setup.magnetometer:  # headings count from Y of the inertial frame, where the field points
         offset = np.zeros(len(PLACEMENTS))
     return calibration.calibrate(
         held, pose="straight", body_frame="heading:0", created="", heading_offset=offset
@@ -98,7 +99,7 @@ def calibrated(recording: Recording, way: Way, truth: Recording) -> calibration.
 
 
 def run(recording: Recording, found: calibration.Calibration, model: str) -> tuple[Array, Array, Array]:
-    """Times (T,), poses (T, 24, 3, 3) and measured bones (T, 6, 3, 3)."""
+    """Return times (T,), poses (T, 24, 3, 3) and measured bones (T, 6, 3, 3)."""
     from edgepose.inference.engine import StreamEngine
     from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 
@@ -118,26 +119,26 @@ def run(recording: Recording, found: calibration.Calibration, model: str) -> tup
 
 @click.command(help=__doc__)
 @click.option("--model", default="birnn", show_default=True, help="Shipped model.")
-@click.option("--rigs", default=3, show_default=True, help="Mountings and chips to take the mean over.")
+@click.option("--rigs", default=3, show_default=True, help="Number of mountings and chips to average over.")
 def main(model: str, rigs: int) -> None:
-    """The command line."""
+    """Run the command line."""
     motion = with_exercises(resample(read_motion(CLIP), RATE), STAND_S)
-    clip_s = STAND_S + EXERCISES_S + 3.0  # from there on it is the clip
+    clip_s = STAND_S + EXERCISES_S + 3.0  # the clip starts here
     offsets = default_body().offsets
     summaries, bone_lines = {}, []
-    for name, way in WAYS.items():
-        poses, true, apart = [], [], []
+    for name, setup in SETUPS.items():
+        poses, true, bone_errors = [], [], []
         for seed in range(rigs):
             truth = ideal(motion, random_mounting(7 + seed))
-            recording = oriented(truth, way, 100 * seed)
-            times, found, bones = run(recording, calibrated(recording, way, truth), model)
+            recording = oriented(truth, setup, 100 * seed)
+            times, found, bones = run(recording, calibrated(recording, setup, truth), model)
             rows = times >= clip_s
             nearest = np.round(times[rows] * RATE).astype(int).clip(max=len(motion.rotations) - 1)
             poses.append(found[rows])
             true.append(local_from_global(motion.rotations[nearest]))
-            apart.append(np.degrees(errors(bones[rows], forward_kinematics(true[-1], offsets)[0])))
+            bone_errors.append(np.degrees(errors(bones[rows], forward_kinematics(true[-1], offsets)[0])))
         summaries[name] = summary(np.concatenate(poses), np.concatenate(true), offsets, 60.0)
-        mean = np.concatenate(apart).mean(axis=0)
+        mean = np.concatenate(bone_errors).mean(axis=0)
         bone_lines.append(f"{name:38}" + "".join(f"{h:7.1f}/{t:4.1f}" for h, t in mean))
     click.echo(format_table(summaries))
     click.echo(f"\nmeasured bones, mean error of heading / tilt, deg: {', '.join(PLACEMENTS)}")
@@ -145,7 +146,7 @@ def main(model: str, rigs: int) -> None:
 
 
 def errors(bones: Array, true: Array) -> Array:
-    """Heading and tilt errors (T, 6, 2) of measured bones (T, 6, 3, 3), rad, against all true ones."""
+    """Return heading and tilt errors (T, 6, 2), rad, of measured bones (T, 6, 3, 3) against all true ones."""
     between = rot.matrix_to_quat(bones @ rot.transpose(true[:, list(BONES)]))
     w, x, y, z = np.moveaxis(between, -1, 0)
     heading = 2.0 * np.arctan2(np.abs(y), np.abs(w))  # Y of T is up

@@ -1,10 +1,10 @@
-"""What a lost sensor, a slipped sensor or a wrong heading costs in accuracy.
+"""Measures how much accuracy a lost sensor, slipped sensors or wrong headings cost.
 
     OMP_NUM_THREADS=1 python tools/bench_robustness.py --data recordings --model birnn --model rnn
 
 Held-out takes (recordings of `edgepose synthesize`) run through an archive as `edgepose run` runs them, once
-as they are and once with each fault. Of the rows of a lost sensor only the frames in which it is lost count;
-what the same frames give without the fault stands beside.
+unchanged and once with each fault. The rows of a lost sensor count only the frames in which it is lost. The
+errors of the same frames without the fault stand beside them.
 """
 
 from __future__ import annotations
@@ -29,54 +29,54 @@ from edgepose_export.training.splits import HELD_OUT
 Array = NDArray[np.float64]
 
 LOST_S, BACK_S = 5.0, 5.0
-"""How long a sensor is lost, and there again, by turns; a take begins with all sensors."""
+"""Alternating times for which a sensor is lost and present; a take begins with all sensors."""
 
 ERROR_DEG = 10.0
-"""Of each sensor against its bone, or of each heading against the pelvis'."""
+"""Misalignment of each sensor with its bone, or error of each heading relative to the pelvis."""
 
 
 class Fault(NamedTuple):
-    """Something that goes wrong.
+    """A fault of the sensors.
 
     Attributes:
-        apply: gives the take as the sensors then measure it.
-        counts: (T,) which frames of a take of T frames show it.
+        apply: returns a take with the fault.
+        counts: returns a mask (T,) of the frames with the fault, for a take of T frames.
     """
 
     apply: Callable[[Take], Take]
     counts: Callable[[int], NDArray[np.bool_]]
 
 
-def lost(frames: int) -> NDArray[np.bool_]:
-    """(frames,) whether a sensor that goes and comes is lost; a short take loses its second half."""
+def lost_frames(frames: int) -> NDArray[np.bool_]:
+    """Return a mask (frames,) of the times at which a sensor is lost: the second half of a short take."""
     time_s = np.arange(frames) / RATE
     if time_s[-1] < BACK_S:
         return time_s > 0.5 * time_s[-1]
     return time_s % (BACK_S + LOST_S) >= BACK_S
 
 
-def without(sensor: int) -> Fault:
-    """A sensor that is lost now and then; the bone is then treated as in a run."""
+def sensor_lost(sensor: int) -> Fault:
+    """Return the fault of a sensor that is lost now and then; its bone is extrapolated as in a run."""
 
     def apply(take: Take) -> Take:
-        gone = lost(len(take.pose))
-        last = np.maximum.accumulate(np.where(gone, 0, np.arange(len(gone))))
+        missing = lost_frames(len(take.pose))
+        last = np.maximum.accumulate(np.where(missing, 0, np.arange(len(missing))))
         orientation, acceleration = take.orientation.copy(), take.acceleration.copy()
         orientation[:, sensor], acceleration[:, sensor] = (
             orientation[last, sensor],
             acceleration[last, sensor],
         )
-        here, before = np.arange(len(PLACEMENTS)) == sensor, None
-        for t, held in enumerate(gone[:, None] & here):
+        column, before = np.arange(len(PLACEMENTS)) == sensor, None
+        for t, held in enumerate(missing[:, None] & column):
             before, acceleration[t] = extrapolate_dropouts(orientation[t], acceleration[t], held, before)
             orientation[t] = before
         return take._replace(orientation=orientation, acceleration=acceleration)
 
-    return Fault(apply, lost)
+    return Fault(apply, lost_frames)
 
 
-def always(frames: int) -> NDArray[np.bool_]:
-    """(frames,) all of them."""
+def all_frames(frames: int) -> NDArray[np.bool_]:
+    """Return a mask (frames,) of all frames."""
     return np.ones(frames, bool)
 
 
@@ -84,34 +84,34 @@ def _random(take: Take) -> np.random.Generator:
     return np.random.default_rng([*take.name.encode()])
 
 
-def slipped(take: Take) -> Take:
-    """Each sensor turned against its bone about a random axis, another in each take."""
+def with_slipped_sensors(take: Take) -> Take:
+    """Return the take with each sensor rotated on its bone about a random axis, drawn for each take."""
     axes = _random(take).normal(size=(len(PLACEMENTS), 3))
     axes *= np.radians(ERROR_DEG) / np.linalg.norm(axes, axis=-1, keepdims=True)
-    turned = take.orientation @ rot.rotvec_to_matrix(axes)
-    return take._replace(orientation=turned.astype(np.float32))
+    rotated = take.orientation @ rot.rotvec_to_matrix(axes)
+    return take._replace(orientation=rotated.astype(np.float32))
 
 
-def misheaded(take: Take) -> Take:
-    """The heading of each sensor but the pelvis' turned to a random side, other sides in each take."""
+def with_wrong_headings(take: Take) -> Take:
+    """Return the take with all headings except the pelvis' wrong, to random sides drawn for each take."""
     vectors = np.zeros((len(PLACEMENTS), 3))
     vectors[:ROOT, 1] = np.radians(ERROR_DEG) * _random(take).choice([-1.0, 1.0], ROOT)
-    turns = rot.rotvec_to_matrix(vectors)
+    rotations = rot.rotvec_to_matrix(vectors)
     return take._replace(
-        orientation=(turns @ take.orientation).astype(np.float32),
-        acceleration=np.einsum("sij,tsj->tsi", turns, take.acceleration).astype(np.float32),
+        orientation=(rotations @ take.orientation).astype(np.float32),
+        acceleration=np.einsum("sij,tsj->tsi", rotations, take.acceleration).astype(np.float32),
     )
 
 
 FAULTS = {
-    **{f"{name} lost": without(i) for i, name in enumerate(PLACEMENTS)},
-    f"each sensor slipped by {ERROR_DEG:g} deg": Fault(slipped, always),
-    f"each heading wrong by {ERROR_DEG:g} deg": Fault(misheaded, always),
+    **{f"{name} lost": sensor_lost(i) for i, name in enumerate(PLACEMENTS)},
+    f"each sensor slipped by {ERROR_DEG:g} deg": Fault(with_slipped_sensors, all_frames),
+    f"each heading wrong by {ERROR_DEG:g} deg": Fault(with_wrong_headings, all_frames),
 }
 
 
 def errors(poses: Sequence[Array], takes: Sequence[Take], fault: Fault) -> list[Array]:
-    """(N, 2) for each take: error of 15 joints and SIP error, degrees, of the frames that show the fault."""
+    """Return, for each take, 15-joint and SIP errors (N, 2), deg, of the frames with the fault."""
     return [
         np.stack([joint_angle_error(pose, take.pose), sip_error(pose, take.pose)], 1)[
             fault.counts(len(take.pose))
@@ -121,12 +121,12 @@ def errors(poses: Sequence[Array], takes: Sequence[Take], fault: Fault) -> list[
 
 
 @click.command()
-@click.option("--data", type=click.Path(path_type=Path), required=True, help="What synthesize wrote.")
+@click.option("--data", type=click.Path(path_type=Path), required=True, help="Folder written by synthesize.")
 @click.option("--model", "models", multiple=True, default=["birnn", "rnn"], help="Name or path; repeatable.")
-@click.option("--part", "parts", multiple=True, default=list(HELD_OUT), help="Of the split; repeatable.")
-@click.option("--every", default=1, help="Take only every so many takes.")
+@click.option("--part", "parts", multiple=True, default=list(HELD_OUT), help="Part of the split; repeatable.")
+@click.option("--every", default=1, metavar="N", help="Use every Nth take only.")
 def main(data: Path, models: tuple[str, ...], parts: tuple[str, ...], every: int) -> None:
-    """What a lost sensor, a slipped sensor or a wrong heading costs in accuracy."""
+    """Measure how much accuracy a lost sensor, slipped sensors or wrong headings cost."""
     for model in models:
         info = archive.read_info(archive.find_archive(model))
         module = archive.load(info, trust=True)
@@ -136,15 +136,15 @@ def main(data: Path, models: tuple[str, ...], parts: tuple[str, ...], every: int
             for group in groups(list(takes_of(data, part))[::every]):
                 healthy = run_archive(module, group, mode)
                 for name, fault in FAULTS.items():
-                    ill = run_archive(module, [fault.apply(take) for take in group], mode)
+                    faulty = run_archive(module, [fault.apply(take) for take in group], mode)
                     pairs.setdefault(name, []).extend(
-                        zip(errors(healthy, group, fault), errors(ill, group, fault), strict=True)
+                        zip(errors(healthy, group, fault), errors(faulty, group, fault), strict=True)
                     )
             table(f"{model}, {mode}, {part}", pairs)
 
 
 def table(title: str, pairs: dict[str, list[tuple[Array, Array]]]) -> None:
-    """Prints means without and with each fault."""
+    """Print means without and with each fault."""
     click.echo(f"\n{title}\n")
     click.echo("| fault | 15 joints, deg | without it | costs | SIP, deg | without it | costs | frames |")
     click.echo("|---|---|---|---|---|---|---|---|")

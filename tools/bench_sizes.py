@@ -1,6 +1,6 @@
-"""Prints `edgepose bench` for networks of any size with random weights: speed does not ask what they know.
+"""Runs `edgepose bench` on networks of any size with random weights, on which speed does not depend.
 
-Kinds and sizes as KIND:UNITS, `birnn:512` and `rnn:512`, the papers', by default.
+Give kinds and sizes as KIND:UNITS; the default is the paper's, `birnn:512` and `rnn:512`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ UNTRAINED = {
 
 
 def write(folder: Path, kind: str, hidden: int) -> Path:
-    """An archive of the shipped networks' form with random weights."""
+    """Write an archive with the structure of the shipped networks and random weights."""
     shape = NetworkShape(kind, hidden, "global-6d", "passed", "tilt")
     network = new_network(shape).eval()
     inputs, targets = torch.zeros(shape.inputs), torch.zeros(shape.pose_outputs)
@@ -37,7 +37,7 @@ def write(folder: Path, kind: str, hidden: int) -> Path:
 @click.command(help=__doc__)
 @click.argument("sizes", nargs=-1, metavar="[KIND:UNITS]...")
 def main(sizes: tuple[str, ...]) -> None:
-    """The command line."""
+    """Run the command line."""
     with tempfile.TemporaryDirectory() as folder:
         words = []
         for size in sizes or ("birnn:512", "rnn:512"):

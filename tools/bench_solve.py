@@ -4,10 +4,10 @@
     OMP_NUM_THREADS=1 python tools/bench_solve.py table --data recordings/ --part cmu-walk-run
     OMP_NUM_THREADS=1 python tools/bench_solve.py table --published DIP_IMU/s_09
 
-`speed` solves made-up motion of 500 to 8000 frames and counts the seconds that one core is busy. `table` is
-SIP's table 2 on held-out motion capture (recordings of `edgepose synthesize`), with the shipped networks on
-the same sensors: the wearer has a body of their own, the sensors noise and bias. With --published it is that
-of real sensors, of DIP-IMU or TotalCapture, and of the default body.
+`speed` solves synthetic motion of 500 to 8000 frames and measures CPU seconds of one core. `table` is SIP's
+table 2 on held-out motion capture (recordings of `edgepose synthesize`), with the shipped networks on the
+same sensors. The wearer's body differs from the default, and the sensors have noise and bias. With
+--published the table is for real sensors, from DIP-IMU or TotalCapture, and the default body.
 """
 
 from __future__ import annotations
@@ -41,35 +41,35 @@ FRAMES = (500, 1000, 2000, 4000, 8000)
 EVALUATIONS = 20
 
 HEIGHT_M, SEX, WEIGHT_KG, WORDS = 1.82, "male", 88.0, ("long-legged", "broad-shouldered")
-"""The wearer of the table, as their friends describe them."""
+"""The wearer of the table, in the words of a description."""
 OWN_SHAPE = 0.03
-"""What that leaves out: spread of each bone's length about it, as a share."""
+"""Relative standard deviation of each bone's length, which the description does not tell."""
 
 ACC_NOISE, ACC_BIAS, ACC_SCALE = 0.1, 0.05, 0.01
-"""Of the accelerometers: spread of a frame, of the bias of each axis (m/s^2), of each axis' scale."""
+"""Standard deviations of the accelerometers' noise per frame, bias per axis (both m/s^2), scale per axis."""
 TURN_NOISE_DEG, TURN_BIAS_DEG = 0.3, 1.5
-"""Of the orientations: spread of a frame, and of what calibration leaves, degrees an axis."""
+"""Standard deviations of the orientations' noise per frame and of calibration errors, deg per axis."""
 
 
 Method = Callable[[Measurements], Array]
-"""Local rotations (T, 24, 3, 3) of what sensors measured."""
+"""A function that returns local rotations (T, 24, 3, 3) from measurements."""
 
 
 # --- sensors ------------------------------------------------------------------------------------------------
 
 
 def sensors_of(local: Array, translation: Array, body: Body, rng: np.random.Generator) -> Measurements:
-    """What six imperfect sensors measure on a body in poses (T, 24, 3, 3) along a path (T, 3), metres."""
+    """Simulate six imperfect sensors on a body in poses (T, 24, 3, 3) along a path (T, 3), metres."""
     rotations, joints = forward_kinematics(local, body.offsets, translation)
     bones = rotations[:, list(BONES)]
-    places = joints[:, list(BONES)] + np.einsum("tsij,sj->tsi", bones, body.sensors)
+    points = joints[:, list(BONES)] + np.einsum("tsij,sj->tsi", bones, body.sensors)
     gravity = np.array([0.0, -GRAVITY, 0.0])
-    force = np.einsum("tsji,tsj->tsi", bones, second_difference(places, RATE) - gravity)
+    force = np.einsum("tsji,tsj->tsi", bones, second_difference(points, RATE) - gravity)
     shape = (1, len(BONES), 3)
     force = force * (1.0 + ACC_SCALE * rng.normal(size=shape)) + ACC_BIAS * rng.normal(size=shape)
     force += ACC_NOISE * rng.normal(size=force.shape)
-    turned = TURN_BIAS_DEG * rng.normal(size=shape) + TURN_NOISE_DEG * rng.normal(size=force.shape)
-    bones = bones @ rot.rotvec_to_matrix(np.deg2rad(turned))
+    errors_deg = TURN_BIAS_DEG * rng.normal(size=shape) + TURN_NOISE_DEG * rng.normal(size=force.shape)
+    bones = bones @ rot.rotvec_to_matrix(np.deg2rad(errors_deg))
     acceleration = np.einsum("tsij,tsj->tsi", bones, force) + gravity
     frames = len(local)
     valid = np.ones((frames, len(BONES)), bool)
@@ -79,7 +79,7 @@ def sensors_of(local: Array, translation: Array, body: Body, rng: np.random.Gene
 
 
 def own_body(rng: np.random.Generator) -> Body:
-    """The wearer's body: that of the description, with every bone a little longer or shorter."""
+    """Return the wearer's body: as described, but with every bone a little longer or shorter."""
     body = shaped_body(HEIGHT_M, SEX, WEIGHT_KG, WORDS)
     share = 1.0 + OWN_SHAPE * rng.normal(size=(24, 1))
     for right in (2, 5, 8, 11, 14, 17, 19, 21, 23):
@@ -91,7 +91,7 @@ def own_body(rng: np.random.Generator) -> Body:
 
 
 def made_up_motion(frames: int) -> tuple[Array, Array]:
-    """Poses (T, 24, 3, 3) and path (T, 3) of somebody who swings arms and legs."""
+    """Return poses (T, 24, 3, 3) and path (T, 3) of a wearer who swings arms and legs."""
     t = np.arange(frames) / RATE
     angles = np.zeros((frames, 24, 3))
     for phase, leg, knee, arm in ((0.0, 1, 4, 17), (np.pi, 2, 5, 16)):
@@ -104,10 +104,10 @@ def made_up_motion(frames: int) -> tuple[Array, Array]:
 
 
 def speed(plot: Path | None) -> None:
-    """Print seconds of a core and memory by number of frames; every chunk takes all its evaluations."""
+    """Print CPU seconds and memory by number of frames; every chunk uses all its evaluations."""
     import edgepose.sip.levenberg_marquardt as minimise
 
-    minimise.ENOUGH = -1.0  # never enough
+    minimise.ENOUGH = -1.0  # never stop early
     prior, rows = load_prior(), []
     print(f"frames  seconds  evaluations a frame  memory MB   ({EVALUATIONS} evaluations of SIP after SOP)")
     for frames in FRAMES:
@@ -141,14 +141,14 @@ def _draw(path: Path, rows: Array) -> None:
 
 
 class Sample(NamedTuple):
-    """A take: sensors, and local rotations (T, 24, 3, 3) that are to be found."""
+    """A take: measurements, and the true local rotations (T, 24, 3, 3)."""
 
     measurements: Measurements
     pose: Array
 
 
 def takes(data: Path, part: str, every: int, body: Body) -> Iterator[Sample]:
-    """Every so many takes of a part of the split, on the wearer's body."""
+    """Yield every `every`-th take of a part of the split, on the wearer's body."""
     from edgepose_export.training.splits import part_of
 
     paths = sorted((p for p in data.rglob("*.npz") if part_of(p.stem) == part), key=lambda p: p.stem)
@@ -160,7 +160,7 @@ def takes(data: Path, part: str, every: int, body: Body) -> Iterator[Sample]:
 
 
 def published(folder: Path) -> Iterator[Sample]:
-    """Takes of DIP-IMU or TotalCapture below a folder."""
+    """Yield the takes of DIP-IMU or TotalCapture below a folder."""
     from edgepose_export.datasets import read_published
 
     for take in read_published(folder):
@@ -176,13 +176,13 @@ def published(folder: Path) -> Iterator[Sample]:
 
 
 def solver(method: str, rig: PoseParameterisation, body: Body, weights: Weights) -> Method:
-    """Poses (T, 24, 3, 3) that SIP or SOP finds."""
+    """Return SIP or SOP as a method."""
     settings = Settings(method, rig, sensor_points(body, PLACEMENTS), weights)
     return lambda measurements: np.concatenate([p.rotations for p in solve(measurements, settings)])
 
 
 def network(name: str, mode: str) -> Method:
-    """Poses of a shipped model, run as `edgepose run` runs it."""
+    """Return a shipped model as a method, run as `edgepose run` runs it."""
     from edgepose.inference import archive
     from edgepose_export.evaluation.evaluate import modes_of, run_archive
     from edgepose_export.training.dataset import Take
@@ -192,7 +192,7 @@ def network(name: str, mode: str) -> Method:
     chosen = next(m for m in modes_of(info.metadata) if m.name == mode)
 
     def run(measurements: Measurements) -> Array:
-        # A frame of a run holds the mean over the time since the frame before.
+        # In a run a frame holds the mean since the previous frame.
         mean = measurements.acceleration.copy()
         mean[1:] = 0.5 * (mean[1:] + mean[:-1])
         pose = np.zeros((len(mean), 24, 3, 3), np.float32)
@@ -203,7 +203,7 @@ def network(name: str, mode: str) -> Method:
 
 
 def methods(prior: Prior, body: Body, described: Body, weights: Weights) -> dict[str, Method]:
-    """The rows of the table, for a wearer's body and what is said of it."""
+    """Return the rows of the table, for a wearer's body and the described body."""
     smpl = smpl_rig(prior, BONES)
     return {
         "SOP": solver("sop", smpl, body, weights),
@@ -219,7 +219,7 @@ def methods(prior: Prior, body: Body, described: Body, weights: Weights) -> dict
 
 
 def table(samples: Iterable[Sample], body: Body, rows: dict[str, Method]) -> None:
-    """Print mean and deviation of the errors of every method; positions are those of a body."""
+    """Print mean and deviation of the errors of every method; positions are those of the body."""
     values: dict[str, dict[str, list[Array]]] = {name: {} for name in rows}
     count = 0
     for sample in samples:
@@ -229,7 +229,7 @@ def table(samples: Iterable[Sample], body: Body, rows: dict[str, Method]) -> Non
             for key, column in metrics.per_frame(poses, sample.pose, body.offsets, RATE).items():
                 values[name].setdefault(key, []).append(column)
     if not count:
-        raise SystemExit("no takes there; make them with edgepose synthesize")
+        raise SystemExit("no takes found; make them with edgepose synthesize")
     print(f"{count} takes")
     print(
         metrics.format_table(
@@ -242,18 +242,20 @@ def table(samples: Iterable[Sample], body: Body, rows: dict[str, Method]) -> Non
 
 
 def main() -> None:
-    """Run what is asked for."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description="speed, memory and accuracy of edgepose solve")
     commands = parser.add_subparsers(dest="command", required=True)
     fast = commands.add_parser("speed", help="seconds and memory from 500 to 8000 frames")
     fast.add_argument("--plot", type=Path, help="picture to draw")
     good = commands.add_parser("table", help="SIP's table 2 on held-out motion capture")
     source = good.add_mutually_exclusive_group(required=True)
-    source.add_argument("--data", type=Path, help="folder that edgepose synthesize wrote")
+    source.add_argument("--data", type=Path, help="folder written by edgepose synthesize")
     source.add_argument("--published", type=Path, help="folder of DIP-IMU or TotalCapture")
     good.add_argument("--part", default="cmu-walk-run", help="part of the split")
-    good.add_argument("--every", type=int, default=1, help="take only every so many takes")
-    good.add_argument("--prior", type=Path, help="file of edgepose learn-prior instead of the shipped one")
+    good.add_argument("--every", type=int, default=1, metavar="N", help="use every Nth take only")
+    good.add_argument(
+        "--prior", type=Path, help="file written by edgepose learn-prior, instead of the shipped prior"
+    )
     good.add_argument("--mahal", type=float, default=Weights().mahal, help="weight of the prior")
     flags = parser.parse_args()
     if flags.command == "speed":

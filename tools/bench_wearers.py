@@ -1,14 +1,14 @@
-"""Measures how many wearers one core holds: the network alone, and `edgepose run --rig ... --rig ...` whole.
+"""Measures how many wearers one core handles: the network alone, and the whole of `edgepose run`.
 
 \b
     bench_wearers.py                           both shipped models, 1 to 64 wearers
     bench_wearers.py --model rnn --seconds 5 8 16 32
 
-Six sensors of 100 Hz a wearer send native packets over a pseudo terminal each; `edgepose run` has one core
-to itself and sends binary datagrams, and what simulates and listens has the others. A pose's age is counted
-from the instant that it shows, without the frames that the model looks ahead, to its arrival. A run holds if
-no pose is lost and 99 of 100 arrive within two frames. Costs are processor time; ages are times of the clock:
-leave the machine alone.
+For each wearer six sensors at 100 Hz send native packets over a pseudo terminal. `edgepose run` has one core
+to itself and sends binary datagrams; the simulator and the receiver use the other cores. A pose's age on
+arrival is counted from the instant that it shows, minus the model's look-ahead. A run holds if no pose is
+lost and 99 of 100 arrive within two frames. Costs are processor time, ages are wall-clock time: run nothing
+else meanwhile.
 """
 
 from __future__ import annotations
@@ -47,22 +47,22 @@ RATE = 60.0
 PERIOD_S = 0.01
 LATE_S = 2.0 / RATE
 START_S = 60.0
-"""How long the program may take until its first pose, seconds."""
+"""Longest time until the first poses, seconds."""
 
 SETTLE_S = 2.0
-"""Left out at the start: caches fill, and all wearers begin at once."""
+"""Time at the start that is not measured, seconds: caches fill, and all wearers begin together."""
 
 
-class Whole(NamedTuple):
-    """A run of the whole program.
+class ProgramRun(NamedTuple):
+    """Result of a run of the whole program.
 
     Attributes:
-        core: share of a core.
-        p50_ms: age of poses, median.
-        p99_ms: 99 of 100 are younger.
+        core: share of the core.
+        p50_ms: median age of the poses.
+        p99_ms: 99th percentile of the ages.
         late: share of poses that are older than two frames.
-        lost: poses that did not come.
-        per_s: poses of a wearer a second.
+        lost: number of missing poses.
+        per_s: poses per second and wearer.
     """
 
     core: float
@@ -74,12 +74,12 @@ class Whole(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether poses keep coming at their pace."""
+        """Whether all poses arrive, in time and at the full rate."""
         return not self.lost and self.p99_ms <= 1e3 * LATE_S and self.per_s > 0.99 * RATE
 
 
 def network_us(model: str, wearers: int) -> float:
-    """Processor time of a step of the network a frame a wearer, microseconds; median over rounds."""
+    """Return the network's processor time per frame and wearer, microseconds, as the median over rounds."""
     info = archive.read_info(archive.find_archive(model))
     module = archive.load(info)
     quantise_weights(module, info)
@@ -99,7 +99,7 @@ def network_us(model: str, wearers: int) -> float:
 
 
 def packets(seconds: float) -> list[bytes]:
-    """What the six sensors of a wearer send, a chunk each hundredth of a second; the clip over and over."""
+    """Return the packets of a wearer's six sensors, one chunk per 10 ms; the clip repeats."""
     sensors = [simulate.rows_of(data) for data in simulate.read_input(CLIP).sensors.values()]
     encode = PROTOCOLS["native"].encode
     return [
@@ -112,7 +112,7 @@ def packets(seconds: float) -> list[bytes]:
 
 
 def send(wearers: int, seconds: float, names: Connection) -> None:
-    """Sends for so many wearers, each at its own phase, until this process is ended."""
+    """Send for several wearers, each with its own phase, until the data end or this process is terminated."""
     chunks = packets(seconds)
     masters = []
     for _ in range(wearers):
@@ -125,7 +125,7 @@ def send(wearers: int, seconds: float, names: Connection) -> None:
     for k, chunk in enumerate(chunks):
         for i, (master, _) in enumerate(masters):
             left_s = start_s + (k + i / wearers) * PERIOD_S - time.monotonic()
-            # Sensors are not late: what cannot be sent in time, or is not read, is lost as on a real line.
+            # As on a real line, data that cannot be sent in time, or that are not read, are lost.
             if left_s > -PERIOD_S:
                 time.sleep(max(0.0, left_s))
                 with contextlib.suppress(BlockingIOError):
@@ -133,7 +133,7 @@ def send(wearers: int, seconds: float, names: Connection) -> None:
 
 
 def write_rigs(folder: Path, ports: list[str], address: str) -> list[str]:
-    """Rig files; gives the words that name them."""
+    """Write rig files; return the command-line arguments that name them."""
     none, zero = np.tile([1.0, 0.0, 0.0, 0.0], (len(PLACEMENTS), 1)), np.zeros(len(PLACEMENTS))
     up = np.array([0.5, -0.5, -0.5, -0.5])
     save(Calibration(up, zero, none, zero, "t-pose", "heading:0", "", {}), folder / "calib.json")
@@ -152,13 +152,13 @@ def write_rigs(folder: Path, ports: list[str], address: str) -> list[str]:
 
 
 def processor_s(process: int) -> float:
-    """Processor time of a process so far, seconds."""
+    """Return the processor time of a process so far, seconds."""
     fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 class Datagram(NamedTuple):
-    """A pose as it came: the sender's port, which tells wearers apart, the bytes, and Unix time, seconds."""
+    """A received pose: the sender's port, which identifies the wearer, the bytes, the Unix time (s)."""
 
     port: int
     data: bytes
@@ -166,34 +166,34 @@ class Datagram(NamedTuple):
 
 
 def listen(receiver: socket.socket, seconds: float) -> list[Datagram]:
-    """What comes in some seconds."""
-    came = []
+    """Return the datagrams received within some seconds."""
+    received = []
     end_s = time.monotonic() + seconds
     while time.monotonic() < end_s:
         data, (_, port) = receiver.recvfrom(2048)
-        came.append(Datagram(port, data, time.time()))
-    return came
+        received.append(Datagram(port, data, time.time()))
+    return received
 
 
-def all_begin(receiver: socket.socket, wearers: int) -> None:
-    """Returns when poses of so many wearers have come.
+def wait_for_all(receiver: socket.socket, wearers: int) -> None:
+    """Wait until poses of all wearers have arrived.
 
     Raises:
-        TimeoutError: they do not.
+        TimeoutError: some wearers' poses do not arrive.
     """
     end_s = time.monotonic() + START_S
-    begun: set[int] = set()
-    while len(begun) < wearers:
-        begun.add(receiver.recvfrom(2048)[1][1])
+    ports: set[int] = set()
+    while len(ports) < wearers:
+        ports.add(receiver.recvfrom(2048)[1][1])
         if time.monotonic() > end_s:
             raise TimeoutError
 
 
-def whole(model: str, wearers: int, seconds: float, core: int) -> Whole:
-    """Runs the program on simulated wearers.
+def measure_program(model: str, wearers: int, seconds: float, core: int) -> ProgramRun:
+    """Run the program on simulated wearers.
 
     Raises:
-        click.ClickException: it ends early.
+        click.ClickException: some wearers' poses do not arrive.
     """
     context = multiprocessing.get_context("spawn")
     names, at_sender = context.Pipe(duplex=False)
@@ -215,30 +215,30 @@ def whole(model: str, wearers: int, seconds: float, core: int) -> Whole:
             stderr=subprocess.DEVNULL,
         )
         try:
-            all_begin(receiver, wearers)
+            wait_for_all(receiver, wearers)
             listen(receiver, SETTLE_S)
             started_s, before_s = time.monotonic(), processor_s(process.pid)
-            came = listen(receiver, seconds)
+            received = listen(receiver, seconds)
             passed_s, spent_s = time.monotonic() - started_s, processor_s(process.pid) - before_s
         except TimeoutError:
             process.kill()
-            raise click.ClickException(f"{wearers} wearers: not all give poses") from None
+            raise click.ClickException(f"{wearers} wearers: no poses of some of them") from None
         finally:
             process.send_signal(signal.SIGINT)
             process.wait()
             sender.terminate()
             sender.join()
-    poses = [decode_binary(datagram.data) for datagram in came]
+    poses = [decode_binary(datagram.data) for datagram in received]
     ahead_s = archive.read_info(archive.find_archive(model)).metadata["future"] / RATE
     ages = np.array(
-        [datagram.at_s - pose.time_s - ahead_s for datagram, pose in zip(came, poses, strict=True)]
+        [datagram.at_s - pose.time_s - ahead_s for datagram, pose in zip(received, poses, strict=True)]
     )
     numbers: defaultdict[int, list[int]] = defaultdict(list)
-    for datagram, pose in zip(came, poses, strict=True):
+    for datagram, pose in zip(received, poses, strict=True):
         numbers[datagram.port].append(pose.index)
-    expected = sum(own[-1] - own[0] + 1 for own in numbers.values())
+    expected = sum(indices[-1] - indices[0] + 1 for indices in numbers.values())
     p50, p99 = np.percentile(1e3 * ages, [50, 99])
-    return Whole(
+    return ProgramRun(
         spent_s / passed_s,
         p50,
         p99,
@@ -251,19 +251,25 @@ def whole(model: str, wearers: int, seconds: float, core: int) -> Whole:
 # --- the page -----------------------------------------------------------------------------------------------
 
 
-def draw(file: Path, rows: dict[str, dict[int, tuple[float, Whole]]]) -> None:
-    """Share of the core and ages against the number of wearers."""
+def draw(file: Path, rows: dict[str, dict[int, tuple[float, ProgramRun]]]) -> None:
+    """Draw the share of the core and the ages against the number of wearers."""
     import matplotlib.pyplot as plt
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
-    for model, own in rows.items():
-        counts = list(own)
-        line = left.plot(counts, [100 * run.core for _, run in own.values()], "o-", label=f"{model}, whole")
+    for model, results in rows.items():
+        counts = list(results)
+        line = left.plot(
+            counts, [100 * run.core for _, run in results.values()], "o-", label=f"{model}, whole"
+        )
         color = line[0].get_color()
-        share = [us * RATE * count / 1e4 for count, (us, _) in own.items()]
+        share = [us * RATE * count / 1e4 for count, (us, _) in results.items()]
         left.plot(counts, share, ":", color=color, label=f"{model}, network")
-        right.plot(counts, [run.p99_ms for _, run in own.values()], "o-", color=color, label=f"{model}, p99")
-        right.plot(counts, [run.p50_ms for _, run in own.values()], ":", color=color, label=f"{model}, p50")
+        right.plot(
+            counts, [run.p99_ms for _, run in results.values()], "o-", color=color, label=f"{model}, p99"
+        )
+        right.plot(
+            counts, [run.p50_ms for _, run in results.values()], ":", color=color, label=f"{model}, p50"
+        )
     right.axhline(1e3 * LATE_S, color="grey", linewidth=0.8, label="two frames")
     right.set_yscale("log")
     left.set_ylabel("% of a core")
@@ -280,35 +286,36 @@ def draw(file: Path, rows: dict[str, dict[int, tuple[float, Whole]]]) -> None:
 @click.command(help=__doc__)
 @click.argument("counts", nargs=-1, type=click.IntRange(1), metavar="[WEARERS]...")
 @click.option("--model", "models", multiple=True, help="[default: rnn and birnn]")
-@click.option("--seconds", type=click.FloatRange(1), default=10.0, show_default=True, help="Of each run.")
-@click.option("--core", type=click.IntRange(0), default=0, show_default=True, help="That the program has.")
-@click.option("--draw", "picture", type=click.Path(path_type=Path), metavar="FILE", help="Draw a curve.")
+@click.option(
+    "--seconds", type=click.FloatRange(1), default=10.0, show_default=True, help="Measured time of each run."
+)
+@click.option("--core", type=click.IntRange(0), default=0, show_default=True, help="Core for edgepose run.")
+@click.option("--draw", "picture", type=click.Path(path_type=Path), metavar="FILE", help="Picture to draw.")
 def main(
     counts: tuple[int, ...], models: tuple[str, ...], seconds: float, core: int, picture: Path | None
 ) -> None:
-    """The command line."""
+    """Run the command line."""
     torch.set_num_threads(1)
     others = os.sched_getaffinity(0) - {core}
     if not others:
-        raise click.ClickException("this machine has one core; the simulator needs another")
+        raise click.ClickException("this machine has only one core; the simulator needs another one")
     os.sched_setaffinity(0, others)
-    rows: dict[str, dict[int, tuple[float, Whole]]] = {}
+    rows: dict[str, dict[int, tuple[float, ProgramRun]]] = {}
     heads = ["model", "wearers", "network us", "all us", "core", "p50 ms", "p99 ms", "late", "lost", "holds"]
     click.echo("| " + " | ".join(heads) + " |\n" + "|---" * len(heads) + "|")
     for model in models or ("rnn", "birnn"):
-        own = rows[model] = {}
+        results = rows[model] = {}
         for count in counts or (1, 2, 4, 8, 16, 32, 48, 64):
-            us, run = network_us(model, count), whole(model, count, seconds, core)
-            own[count] = us, run
+            us, run = network_us(model, count), measure_program(model, count, seconds, core)
+            results[count] = us, run
             all_us = 1e6 * run.core / (count * run.per_s)
             cells = [model, count, f"{us:.0f}", f"{all_us:.0f}", f"{run.core:.0%}"]
             cells += [f"{run.p50_ms:.1f}", f"{run.p99_ms:.1f}", f"{run.late:.1%}", run.lost]
             cells.append("yes" if run.holds else "no")
             click.echo("| " + " | ".join(map(str, cells)) + " |")
-    for model, own in rows.items():
-        click.echo(
-            f"{model}: most that hold {max((n for n, (_, run) in own.items() if run.holds), default=0)}"
-        )
+    for model, results in rows.items():
+        most = max((count for count, (_, run) in results.items() if run.holds), default=0)
+        click.echo(f"{model}: holds for up to {most} wearers")
     if picture is not None:
         draw(picture, rows)
 

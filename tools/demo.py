@@ -1,8 +1,8 @@
-"""The main job from end to end: six simulated IMUs on a serial port, calibration, poses, and their error.
+"""Demo from end to end: six simulated IMUs on a serial port, calibration, poses, and their errors.
 
-A motion-capture clip that no shipped model has seen moves a body; six virtual sensors, strapped on at random
-angles, send native packets over a pty in real time, or another wire format over one pty, six ptys, or a CAN
-adapter on a pty. The commands that are run are those a wearer would run.
+A body moves as in a motion-capture clip that no shipped model was trained on. Six virtual sensors, strapped
+on at random angles, send native packets over a pty in real time, or another wire format over one pty, six
+ptys, or a CAN adapter on a pty. The demo runs the same commands as a real wearer.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ Array = NDArray[np.float64]
 
 
 class Truth(NamedTuple):
-    """True local poses (T, 24, 3, 3) at times (T,), seconds since the clip began to play."""
+    """True local poses (T, 24, 3, 3) at times (T,), seconds since the start of the clip."""
 
     time_s: Array
     pose: Array
 
     def at(self, time_s: Array) -> Array:
-        """Poses at other times, by slerp."""
+        """Interpolate poses at other times, by slerp."""
         i = np.clip(np.searchsorted(self.time_s, time_s) - 1, 0, len(self.time_s) - 2)
         share = (time_s - self.time_s[i]) / (self.time_s[i + 1] - self.time_s[i])
         quats = rot.matrix_to_quat(self.pose)
@@ -52,7 +52,7 @@ class Truth(NamedTuple):
 
 
 def edgepose(*words: object) -> list[str]:
-    """A command line of edgepose in this environment; prints it as a user would type it."""
+    """Return a command line for edgepose in this environment; print it as a user would type it."""
     text = [str(word) for word in words]
     click.echo("\n$ " + " ".join(["edgepose", *text]), err=True)
     return [sys.executable, "-m", "edgepose", *text]
@@ -60,13 +60,13 @@ def edgepose(*words: object) -> list[str]:
 
 @contextmanager
 def simulator(recording: Path, protocol: str) -> Iterator[tuple[subprocess.Popen[str], list[str]]]:
-    """The simulated sensors, standing still, and the flags that name the lines they send to."""
+    """Start the simulated sensors, standing still; yield the process and the flags that name its lines."""
     words = [sys.executable, str(Path(__file__).parent / "simulate.py"), str(recording), "--stand"]
     words += ["--protocol", protocol]
     process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     kind = "can" if PROTOCOLS[protocol].transport == "can" else "port"
     try:
-        yield process, [f"--{kind}", said(process, kind)]
+        yield process, [f"--{kind}", read_reply(process, kind)]
     finally:
         assert process.stdin
         assert process.stdout
@@ -75,20 +75,20 @@ def simulator(recording: Path, protocol: str) -> Iterator[tuple[subprocess.Popen
         process.stdout.close()
 
 
-def said(process: subprocess.Popen[str], word: str) -> str:
-    """What the simulator says after a word; waits for it."""
+def read_reply(process: subprocess.Popen[str], word: str) -> str:
+    """Wait for the simulator to print a line that starts with a word; return the next word."""
     assert process.stdout
     for line in process.stdout:
         if line.startswith(word + " "):
             return line.split()[1]
-    raise SystemExit(f"the simulator ended before it said {word!r}")
+    raise SystemExit(f"the simulator ended before it printed {word!r}")
 
 
 class Listener(threading.Thread):
-    """Receives the datagrams of a run: (Unix time of arrival, pose as sent)."""
+    """Receiver of a run's datagrams, as pairs of Unix arrival time and pose."""
 
     def __init__(self) -> None:
-        """Binds to a free port of this machine."""
+        """Bind to a free local port."""
         super().__init__(daemon=True)
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.bind(("127.0.0.1", 0))
@@ -97,7 +97,7 @@ class Listener(threading.Thread):
         self.received: list[tuple[float, dict[str, object]]] = []
 
     def run(self) -> None:
-        """Receives until the process ends."""
+        """Receive until the process ends."""
         while True:
             data = self.socket.recv(65536)
             self.received.append((time.time(), json.loads(data)))
@@ -105,15 +105,15 @@ class Listener(threading.Thread):
 
 
 def follow(process: subprocess.Popen[str], source: list[str], out: Path) -> tuple[float, float, Listener]:
-    """Calibrates, starts a run, lets the clip play.
+    """Calibrate, start a run, and let the clip play.
 
     Args:
         process: the simulated sensors.
-        source: flags that name their lines.
+        source: flags that name the sensors' lines.
         out: folder for results.
 
     Returns:
-        When the clip began and ended, Unix time, and what came by UDP.
+        Unix times of the start and end of the clip, and the receiver of the UDP datagrams.
     """
     calibration = out / "calibration.json"
     hold = ("--body-frame", "heading:0", "--hold", 3, "--countdown", 1)
@@ -125,12 +125,12 @@ def follow(process: subprocess.Popen[str], source: list[str], out: Path) -> tupl
     try:
         while not listener.first.wait(0.5):
             if run.poll() is not None:
-                raise SystemExit("edgepose run ended before it gave a pose")
+                raise SystemExit("edgepose run ended before the first pose")
         assert process.stdin
         process.stdin.write("go\n")
         process.stdin.flush()
-        begin, end = float(said(process, "started")), float(said(process, "ended"))
-        time.sleep(0.5)  # the last frames still wait for their future
+        begin, end = float(read_reply(process, "started")), float(read_reply(process, "ended"))
+        time.sleep(0.5)  # the last frames still wait for their future frames
     finally:
         run.send_signal(signal.SIGINT)
         code = run.wait(20)
@@ -140,12 +140,12 @@ def follow(process: subprocess.Popen[str], source: list[str], out: Path) -> tupl
 
 
 def report(begin: float, end: float, listener: Listener, truth: Truth, out: Path) -> None:
-    """Prints error, latency and rate over the clip and draws it."""
+    """Print errors, latencies and rates over the clip, and draw it."""
     read = read_poses(out / "poses.csv")
     frames, time_s, status, poses = read.frames, read.time_s, read.status, read.rotations
     missing = np.sum(np.diff(frames) - 1)
     click.echo(
-        f"\nposes.csv: {len(frames)} frames at 60 Hz, {missing} numbers missing between first and last"
+        f"\nposes.csv: {len(frames)} frames at 60 Hz, {missing} frames missing between the first and the last"
     )
     clip = (time_s >= begin + HOLD_S + 1.0) & (time_s <= end)
     seconds = time_s[clip] - begin
@@ -153,12 +153,12 @@ def report(begin: float, end: float, listener: Listener, truth: Truth, out: Path
     offsets = default_body().offsets
     ok = np.mean(np.array(status)[clip] == "ok")
     click.echo(f"clip: {clip.sum()} frames in {seconds[-1] - seconds[0]:.1f} s; status ok in {ok:.1%}")
-    click.echo("\nError against the clip's true pose:")
+    click.echo("\nError against the clip's true poses:")
     click.echo(format_table({"birnn, online": summary(poses[clip], true, offsets, 60.0)}))
     delays = np.array([arrived - float(str(pose["time_s"])) for arrived, pose in listener.received]) * 1e3
     p50, p99 = np.percentile(delays, [50, 99])
     click.echo(f"\nFrom measurement to the pose's arrival by UDP: {p50:.0f} ms median, {p99:.0f} ms p99")
-    click.echo("(83 ms of it are the network's 5 future frames; --model rnn waits for none)")
+    click.echo("(83 ms of that are the network's 5 future frames; --model rnn waits for none)")
     wanted = np.linspace(0, len(seconds) - 1, 10).round().astype(int)
     picture = out / "skeletons.png"
     skeleton_strip(
@@ -180,7 +180,7 @@ def report(begin: float, end: float, listener: Listener, truth: Truth, out: Path
     help="Wire format of the sensors.",
 )
 def main(out: Path, protocol: str) -> None:
-    """The command line."""
+    """Run the command line."""
     out.mkdir(parents=True, exist_ok=True)
     recording = out / CLIP.with_suffix(".npz").name
     rig = ("--hold", HOLD_S, "--rate", RATE, "--mounting", 7)
@@ -189,7 +189,7 @@ def main(out: Path, protocol: str) -> None:
         truth = Truth(data["t"], rot.rotvec_to_matrix(data["poses"].reshape(-1, 24, 3)))
     with simulator(recording, protocol) as (process, source):
         click.echo(
-            f"\nsix simulated IMUs stand still and send {RATE:g} times a second to {source[1]}", err=True
+            f"\nsix simulated IMUs are at rest and send {RATE:g} samples per second to {source[1]}", err=True
         )
         if protocol != "native":
             source += ["--protocol", protocol]

@@ -1,9 +1,9 @@
-"""Error against cost: each model in each precision, so that one sees which are worth having.
+"""Draws error against cost for each model in each precision, to show which are worthwhile.
 
     python tools/draw_front.py --data recordings --out front.png birnn rnn runs/dip-rnn.pt
 
 Error is the mean over the frames of the chosen parts of the split (recordings of `edgepose synthesize`),
-streamed as `edgepose run` streams; cost is processor time a frame of one core.
+streamed as `edgepose run` streams. Cost is processor time per frame on one core.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ KEY = "sip_error_deg"
 
 @click.command()
 @click.argument("models", nargs=-1, required=True)
-@click.option("--data", type=click.Path(path_type=Path), required=True, help="What synthesize wrote.")
+@click.option("--data", type=click.Path(path_type=Path), required=True, help="Folder written by synthesize.")
 @click.option("--part", "parts", multiple=True, default=["cmu-walk-run", "cmu-02"], show_default=True)
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Picture to write.")
 def main(models: tuple[str, ...], data: Path, parts: tuple[str, ...], out: Path) -> None:
@@ -46,20 +46,20 @@ def main(models: tuple[str, ...], data: Path, parts: tuple[str, ...], out: Path)
 
 
 def draw(points: dict[str, dict[str, tuple[float, float]]], title: str, out: Path) -> None:
-    """The picture: a line a model, a point a precision (us, degrees)."""
+    """Draw the picture: a line per model, a point (us, degrees) per precision."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
-    for name, ways in points.items():
-        axes.plot(*zip(*ways.values(), strict=True), "o-", label=name)
-        for precision, point in ways.items():
+    for name, precisions in points.items():
+        axes.plot(*zip(*precisions.values(), strict=True), "o-", label=name)
+        for precision, point in precisions.items():
             axes.annotate(
                 precision, point, xytext=(0, 6), textcoords="offset points", fontsize=8, rotation=45
             )
-    axes.set(xlabel="microseconds a frame", ylabel=f"SIP error, deg ({title})")
+    axes.set(xlabel="microseconds per frame", ylabel=f"SIP error, deg ({title})")
     axes.margins(x=0.1, y=0.15)
     axes.grid(alpha=0.3)
     axes.legend()

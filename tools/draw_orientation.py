@@ -1,4 +1,4 @@
-"""Draws docs/images/orientation.png: the error over time in a trial of BROAD, of our filters and of VQF."""
+"""Draws docs/images/orientation.png: errors of our filters and of VQF over time in a trial of BROAD."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from edgepose.orientation import OrientationFilter, smooth
 
 ROOT = Path(__file__).parents[1]
 TRIAL = ROOT / "tests" / "data" / "broad" / "28_disturbed_stationary_magnet_A_95Hz.npz"
-EVERY = 5  # rows: no line is finer than that
+EVERY = 5  # draw every 5th row, which is as fine as the picture
 
 
 def main() -> None:
-    """Draw."""
+    """Draw the picture."""
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 

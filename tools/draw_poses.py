@@ -1,4 +1,4 @@
-"""Draw poses of a CSV file as a strip of stick figures, beside reference poses if there are any."""
+"""Draws poses of a CSV file as a strip of stick figures, with reference poses if there are any."""
 
 from __future__ import annotations
 
@@ -17,7 +17,11 @@ HEIGHT_M = 1.75
 
 
 def nearest(times: NDArray[np.float64], wanted: NDArray[np.float64], name: str) -> NDArray[np.intp]:
-    """Index of the time nearest to each wanted one, seconds since the first pose; none may lie outside."""
+    """Return the index of the time nearest to each wanted one.
+
+    Raises:
+        EdgeposeError: a wanted time lies outside `times`; both are seconds since the first pose.
+    """
     for t in wanted:
         if not times.min() - 0.5 <= t <= times.max() + 0.5:
             raise EdgeposeError(
@@ -27,7 +31,7 @@ def nearest(times: NDArray[np.float64], wanted: NDArray[np.float64], name: str) 
 
 
 def draw(poses: str, out: Path, wanted: list[float] | None, count: int, reference: str | None) -> None:
-    """Read, choose the instants (seconds since the first pose) and draw."""
+    """Read the poses, choose the instants (seconds since the first pose) and draw."""
     _, times, rotations = read_poses(poses)[:3]
     start = times[0]
     times = times - start
@@ -47,7 +51,7 @@ def _times(context: click.Context, option: click.Parameter, text: str | None) ->
     try:
         return [float(t) for t in text.split(",")] if text else None
     except ValueError as error:
-        raise click.BadParameter("write numbers with commas between them, for example 0,1.5,3") from error
+        raise click.BadParameter("give numbers separated by commas, for example 0,1.5,3") from error
 
 
 @click.command()
@@ -61,7 +65,7 @@ def _times(context: click.Context, option: click.Parameter, text: str | None) ->
     type=click.IntRange(1, 50),
     default=8,
     show_default=True,
-    help="Evenly spaced instants without --times.",
+    help="Number of evenly spaced instants, without --times.",
 )
 @click.option(
     "--out", type=click.Path(path_type=Path), required=True, help="Picture to write: .png, .svg or .pdf."

@@ -1,9 +1,9 @@
-"""Draw the pictures of the README: the six sensor places, the two calibration poses, and a run as a film.
+"""Draws the pictures of the README: sensor placements, calibration poses, and a run as an animation.
 
     python tools/draw_readme.py                 # all three, into docs/images
     python tools/draw_readme.py --only places --only calibration-poses --out .
 
-`run.gif` is made of what `edgepose synthesize`, `calibrate` and `run` make of the clip of tools/demo.
+`run.gif` shows the output of `edgepose synthesize`, `calibrate` and `run` for the clip of tools/demo.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SENSOR = "#E69F00"
 GROUND = "#DDDDDD"
 FRONT = 0.0
 
-WHERE = {
+DESCRIPTIONS = {
     "left_forearm": "back of the forearm,\njust above the wrist",
     "right_forearm": "back of the forearm,\njust above the wrist",
     "left_lower_leg": "front of the shin,\nbelow the knee",
@@ -53,11 +53,11 @@ BEHIND = ("head", "pelvis")
 HOLD_S = 6.0
 FILM_FROM_S, FILM_S, FILM_FPS = 10.0, 4.0, 15
 FILM_PIXELS, FILM_METRES = (640, 440), 3.1
-"""Width and height of the film, and the metres that its width shows."""
+"""Width and height of the animation in pixels, and its width in metres."""
 
 
 def arms_down(degrees: float) -> Array:
-    """The T-pose (24, 3, 3) with both arms lowered at the shoulders."""
+    """Return the T-pose (24, 3, 3) with both arms lowered at the shoulders."""
     pose = np.tile(np.eye(3), (24, 1, 1))
     pose[16] = rot.rotation_about_axis("z", -np.deg2rad(degrees))
     pose[17] = rot.rotation_about_axis("z", np.deg2rad(degrees))
@@ -65,7 +65,7 @@ def arms_down(degrees: float) -> Array:
 
 
 def canvas(width_m: float, height_m: float, width_in: float, dpi: float = DPI) -> tuple[Figure, Any, float]:
-    """An empty picture: the figure, its axes in metres with the ground at y = 0, points a metre."""
+    """Return an empty figure, its axes in metres with the ground at y = 0, and the points per metre."""
     from matplotlib.figure import Figure
 
     scale = width_in / width_m
@@ -76,8 +76,8 @@ def canvas(width_m: float, height_m: float, width_in: float, dpi: float = DPI) -
     return figure, axes, 72.0 * scale
 
 
-def places() -> Figure:
-    """The six places on a wearer who faces the reader."""
+def placements() -> Figure:
+    """Draw the six sensor placements on a wearer who faces the reader."""
     figure, axes, scale = canvas(2.9, 2.06, 7.5)
     axes.set_ylim(-0.17, 1.89)
     body = default_body()
@@ -96,7 +96,7 @@ def places() -> Figure:
         "right_lower_leg": (-0.5, 0.45), "head": (0.5, 1.72), "pelvis": (0.5, 0.8),
     }  # fmt: skip
     for name, spot in zip(PLACEMENTS, spots, strict=True):
-        at = spot[:2] + flat.points[0]  # the pelvis is the origin of both
+        at = spot[:2] + flat.points[0]  # both have the pelvis as origin
         mark(axes, at, np.array(labels[name]), name)
     text = "The wearer faces you; left limbs are light. Dashed: behind. White dots: elbows, wrists, knees."
     axes.text(0.0, -0.09, text, ha="center", va="center", fontsize=9, color=INK)
@@ -104,7 +104,7 @@ def places() -> Figure:
 
 
 def mark(axes: Any, at: Array, label: Array, name: str) -> None:
-    """A sensor and its name at the end of a line."""
+    """Draw a sensor, and its name at the end of a line."""
     from matplotlib.patches import FancyBboxPatch
 
     half = np.array([0.045, 0.036])
@@ -122,15 +122,15 @@ def mark(axes: Any, at: Array, label: Array, name: str) -> None:
     axes.add_patch(box)
     align = "left" if side > 0 else "right"
     axes.text(*label, name, ha=align, va="center", fontsize=11, color=INK, weight="bold", family="monospace")
-    axes.text(label[0], label[1] - 0.05, WHERE[name], ha=align, va="top", fontsize=9, color=INK)
+    axes.text(label[0], label[1] - 0.05, DESCRIPTIONS[name], ha=align, va="top", fontsize=9, color=INK)
 
 
 def calibration_poses() -> Figure:
-    """Both poses that `edgepose calibrate` can ask for."""
+    """Draw both poses that `edgepose calibrate` supports."""
     figure, axes, scale = canvas(3.4, 2.39, 7.5)
     axes.set_ylim(-0.3, 2.09)
     offsets = default_body().offsets
-    # Arms that hang are drawn a little apart, so that hands do not vanish behind the thighs.
+    # Hanging arms are drawn slightly spread, so that the hands are not hidden by the thighs.
     columns = (
         (
             -0.95, 86.0, "Straight pose (N-pose)", "--pose straight, the default",
@@ -150,11 +150,11 @@ def calibration_poses() -> Figure:
     return figure
 
 
-# --- the film --------------------------------------------------------------------------------------------
+# --- the animation ------------------------------------------------------------------------------------------
 
 
 def poses_of_the_clip(folder: Path) -> tuple[Array, Array]:
-    """Predicted and true local poses (K, 24, 3, 3) of each frame of the film."""
+    """Return predicted and true local poses (K, 24, 3, 3), one per frame of the animation."""
 
     def edgepose(*words: object) -> None:
         subprocess.run([sys.executable, "-m", "edgepose", *map(str, words)], check=True, cwd=ROOT)
@@ -173,12 +173,12 @@ def poses_of_the_clip(folder: Path) -> tuple[Array, Array]:
 
 
 def nearest(times: Array, wanted: Array) -> NDArray[np.intp]:
-    """Index of the time nearest to each wanted one."""
+    """Return the index of the time nearest to each wanted one."""
     return np.abs(times[None, :] - wanted[:, None]).argmin(axis=1)
 
 
 def film_frame(predicted: FlatBody, true: FlatBody, second: float) -> NDArray[np.uint8]:
-    """One picture of the film, (rows, columns, 3)."""
+    """Draw one frame of the animation, (rows, columns, 3)."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     dpi = 100
@@ -202,20 +202,20 @@ def film_frame(predicted: FlatBody, true: FlatBody, second: float) -> NDArray[np
 
 
 def film_colours() -> list[int]:
-    """Red, green and blue of every colour of the film and of its edges, where it fades into white."""
+    """Return red, green and blue of every colour in the animation, and of its blends with white."""
     from matplotlib.colors import to_rgb
 
     pure = np.array([to_rgb(c) for c in (*PREDICTION.values(), *REFERENCE.values(), INK, GROUND)])
     share = np.linspace(0.0, 1.0, 9)[1:, None, None]
     shades = (1.0 - share * (1.0 - pure)).reshape(-1, 3)
-    shades = shades[shades.min(axis=1) < 0.94]  # Pillow would take what is nearly white for white
+    shades = shades[shades.min(axis=1) < 0.94]  # Pillow would confuse nearly white colours with white
     colours = np.concatenate([np.ones((1, 3)), shades]) * 255.0
     levels: list[int] = colours.round().astype(int).ravel().tolist()
     return levels
 
 
 def film(path: Path) -> None:
-    """Write the GIF; all frames share one palette, so that nothing flickers."""
+    """Write the GIF; all frames share one palette, which avoids flicker."""
     from PIL import Image
 
     with tempfile.TemporaryDirectory() as folder:
@@ -226,19 +226,19 @@ def film(path: Path) -> None:
     palette = Image.new("P", (1, 1))
     palette.putpalette(film_colours())
     frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
-    # GIF counts hundredths of a second: durations differ by one so that none of the time is lost.
+    # GIF counts hundredths of a second, so durations are rounded such that errors do not add up.
     ends = np.round(np.arange(len(frames) + 1) * 100 / FILM_FPS) * 10
     durations = np.diff(ends).astype(int).tolist()
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True)
 
 
 def still(draw: Callable[[], Figure]) -> Callable[[Path], None]:
-    """Writes a picture that does not move."""
+    """Return a function that writes a picture."""
     return lambda path: save_picture(draw(), path, overwrite=True, dpi=DPI)
 
 
 PICTURES: dict[str, tuple[str, Callable[[Path], None]]] = {
-    "places": ("places.png", still(places)),
+    "places": ("places.png", still(placements)),
     "calibration-poses": ("calibration-poses.png", still(calibration_poses)),
     "run": ("run.gif", film),
 }
@@ -246,16 +246,19 @@ PICTURES: dict[str, tuple[str, Callable[[Path], None]]] = {
 
 @click.command(help=__doc__.split("\n")[0])
 @click.option(
-    "--only", type=click.Choice(list(PICTURES)), multiple=True, help="Draw this one; may be repeated."
+    "--only",
+    type=click.Choice(list(PICTURES)),
+    multiple=True,
+    help="Draw only this picture; may be repeated.",
 )
 @click.option(
     "--out",
     type=click.Path(path_type=Path, file_okay=False),
     default=ROOT / "docs" / "images",
-    help="Folder for the pictures; docs/images of the repository if left out.",
+    help="Folder for the pictures  [default: docs/images of the repository]",
 )
 def main(only: tuple[str, ...], out: Path) -> None:
-    """The command line."""
+    """Run the command line."""
     out.mkdir(parents=True, exist_ok=True)
     try:
         for name in only or PICTURES:

@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# Follows docs/guide/install.md word by word on an emulated 64-bit ARM computer, and compares its poses with this machine's.
+# Runs the commands of docs/guide/install.md on an emulated 64-bit ARM computer, and compares its poses with this machine's.
 #
 #   sudo tools/emulate_arm64.sh [bookworm|trixie] [CPU...]
 #
-# CPU: as qemu names them, by default cortex-a72 (Raspberry Pi 4) and cortex-a76 (Raspberry Pi 5).
-# Needs root, Debian's packages qemu-user-static, binfmt-support and mmdebstrap, and a .venv here (tools/demo makes it).
-# Takes half an hour and 3 GB below FOLDER (/var/tmp/edgepose-arm64); what is installed there is used again.
+# CPU: qemu's name of a processor; the default is cortex-a72 (Raspberry Pi 4) and cortex-a76 (Raspberry Pi 5).
+# Needs root, Debian's packages qemu-user-static, binfmt-support and mmdebstrap, and a .venv here (created by tools/demo).
+# Takes half an hour and 3 GB below FOLDER (/var/tmp/edgepose-arm64). An existing installation there is reused.
 set -eu
 cd "$(dirname "$0")/.."
 suite=${1:-bookworm}
@@ -16,7 +16,7 @@ home=/home/rig  # in the emulated root
 repository=$home/repository
 log=$folder.log
 
-register() {  # programs for ARM are run by qemu, from inside a root without it, too
+register() {  # let qemu run ARM programs, also in a root that does not contain qemu
   [ -e /proc/sys/fs/binfmt_misc/register ] || mount -t binfmt_misc binfmt_misc /proc/sys/fs/binfmt_misc
   [ -e /proc/sys/fs/binfmt_misc/qemu-aarch64 ] || cat /usr/lib/binfmt.d/qemu-aarch64.conf > /proc/sys/fs/binfmt_misc/register
 }
@@ -24,7 +24,7 @@ register() {  # programs for ARM are run by qemu, from inside a root without it,
 make_root() {
   mkdir -p "$folder"
   mmdebstrap --quiet --arch=arm64 --variant=apt --include=ca-certificates,sudo "$suite" "$folder" || return 1
-  # The network as here, also behind a proxy with certificates of its own.
+  # The same network settings as here, including the certificates of a proxy.
   cp /etc/resolv.conf "$folder/etc/resolv.conf"
   cp /etc/ssl/certs/ca-certificates.crt "$folder/etc/ssl/certs/ca-certificates.crt"
 }
@@ -34,7 +34,7 @@ inside() {  # CPU, COMMANDS
     PIP_CERT=/etc/ssl/certs/ca-certificates.crt chroot "$folder" bash -ec "cd $home; $2"
 }
 
-block() {  # N: the Nth block of commands of the install page
+block() {  # N: print the Nth block of commands of the install page
   awk -v wanted="$1" '/^```/ { inside = !inside; if (inside) count++; next } inside && count == wanted' docs/guide/install.md
 }
 
@@ -49,7 +49,7 @@ trap 'umount "$folder/proc"' EXIT
 
 rm -rf "$folder$repository"
 git clone --quiet --bare . "$folder$repository"
-if [ -e "$folder$home/edgepose" ]; then  # what is installed stays, the sources are today's
+if [ -e "$folder$home/edgepose" ]; then  # keep the installation, update the sources
   inside "$1" "cd edgepose && git fetch --quiet $repository HEAD && git reset --quiet --hard FETCH_HEAD &&
     .venv/bin/pip install --quiet --constraint constraints.txt ." > "$log" 2>&1
 else

@@ -1,6 +1,7 @@
-"""Feeds every decoder of the registry noise and damaged packets, and counts what it makes of them.
+"""Feeds noise and damaged packets to every decoder of the registry, and counts the samples that come out.
 
-Nothing may raise, hang or grow without end, and every good packet that no damage has touched must be found.
+No decoder may raise, hang or grow without limit, and each must find every packet that the damage did not
+touch.
 """
 
 from __future__ import annotations
@@ -20,33 +21,33 @@ from firmware_protocols.registry import PROTOCOLS, Decoder, Protocol
 from firmware_protocols.sample import Sample
 
 ROUND = 300
-"""Samples sent between two counts."""
+"""Samples per round."""
 
 REST = 20
-"""Samples at the end of a round that are left whole and not judged: some decoders give a sample late."""
+"""Samples at the end of a round that are neither damaged nor judged, because some decoders are late."""
 
 DAMAGED = 0.15
 """Share of the samples that are damaged."""
 
 STEP = 0.1
-"""m/s^2 between the forces of two samples, by which they are told apart."""
+"""Difference between the forces of two samples, by which they are identified, m/s^2."""
 
 FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
 
 
 LINES = ("adafruit", "razor", "openlog", "openlog-dmp")
-"""Formats in which a line without its end spoils the next one: they have no mark of where a line begins."""
+"""Formats in which a line without its end corrupts the next one, because line starts are not marked."""
 
 
 class Result(NamedTuple):
-    """What a decoder made of its input.
+    """Result of fuzzing a decoder.
 
     Attributes:
-        fed: bytes (data bytes on CAN).
-        good: samples that no damage touched.
-        missed: of these, how many were not given.
-        grown: bytes of memory that the decoder holds more than after the first round.
-        slowest_us: longest time that one piece of input took, microseconds a byte.
+        fed: number of bytes (data bytes on CAN).
+        good: number of undamaged samples.
+        missed: number of undamaged samples that the decoder did not return.
+        grown: growth of the memory in use since the first round, bytes.
+        slowest_us: longest time for a piece of input, microseconds per byte.
     """
 
     fed: int
@@ -57,9 +58,9 @@ class Result(NamedTuple):
 
 
 def sample_of(number: int, sensor: int, time_us: int) -> Sample:
-    """A sample that can be told from the others of its round by its force or its heading."""
+    """Return a sample that differs from the others of its round in force and heading."""
     half = pi * number / ROUND
-    # Less than 16 g.
+    # Below 16 g.
     acc = (STEP * (number - ROUND / 2), 1.0, 9.0)
     return Sample(
         sensor, time_us, (cos(half), 0.0, 0.0, sin(half)), acc, (0.1, 0.2, 0.3), (20.0, 1.0, -40.0), 25.0
@@ -67,28 +68,28 @@ def sample_of(number: int, sensor: int, time_us: int) -> Sample:
 
 
 def number_of(sample: Sample) -> int:
-    """Inverse of `sample_of`; any number for a sample that is none of those."""
+    """Return the number of a sample made by `sample_of`; any number for other samples."""
     if sample.acc is not None:
         return round(sample.acc[0] / STEP + ROUND / 2)
     if sample.quat is not None:
         w, _, _, z = sample.quat
-        # q and -q are the same.
+        # q and -q are the same rotation.
         return round(atan2(z, w) / pi * ROUND) % ROUND
     return -1
 
 
 class Sender:
-    """Packets of six sensors (or of one, where a sensor has a line to itself), one sample after the other."""
+    """Source of packets of six sensors, or of one if each sensor has its own line."""
 
     def __init__(self, protocol: Protocol) -> None:
-        """Nothing sent yet."""
+        """Create the encoder."""
         self._encode = protocol.encoder()
         self._ids = [0] if protocol.single_device else list(protocol.ids)
         self._bytes = protocol.transport == "bytes"
         self._count = 0
 
     def round(self) -> list[list[Any]]:
-        """The pieces (bytes, or CAN frames) of each sample of a round."""
+        """Return the pieces (bytes, or CAN frames) of each sample of a round."""
         result = []
         for number in range(ROUND):
             seq, which = divmod(self._count, len(self._ids))
@@ -102,7 +103,7 @@ class Sender:
 
 
 def damage_bytes(rng: random.Random, piece: bytes) -> bytes:
-    """A packet after something happened to it on its way."""
+    """Return a packet with random damage: flipped, lost, inserted, changed or repeated bytes."""
     data = bytearray(piece)
     kind = rng.randrange(5)
     at = rng.randrange(len(data))
@@ -121,7 +122,7 @@ def damage_bytes(rng: random.Random, piece: bytes) -> bytes:
 
 
 def damage_frames(rng: random.Random, frames: list[Any], used: set[tuple[int, bool]]) -> list[Any]:
-    """The CAN frames of a sample after something happened to one of them."""
+    """Return the CAN frames of a sample with random damage to one of them."""
     at = rng.randrange(len(frames))
     can_id, data, extended, fd = frames[at]
     kind = rng.randrange(5)
@@ -139,7 +140,7 @@ def damage_frames(rng: random.Random, frames: list[Any], used: set[tuple[int, bo
 
 
 def foreign_frame(rng: random.Random, used: set[tuple[int, bool]]) -> Any:
-    """A frame of somebody else on the bus."""
+    """Return a frame of another device on the bus."""
     while True:
         extended = rng.random() < 0.5
         can_id = rng.getrandbits(29 if extended else 11)
@@ -148,7 +149,7 @@ def foreign_frame(rng: random.Random, used: set[tuple[int, bool]]) -> Any:
 
 
 def noise(rng: random.Random, protocol: Protocol, pieces: list[list[Any]]) -> Iterator[Any]:
-    """Input without meaning: bytes of any kind, or only of those that the format uses; frames of any kind."""
+    """Yield random input: arbitrary bytes, bytes that occur in the format, or arbitrary frames."""
     if protocol.transport == "bytes":
         alphabet = b"".join(chain.from_iterable(pieces[:20]))
         for _ in range(10):
@@ -163,27 +164,27 @@ def noise(rng: random.Random, protocol: Protocol, pieces: list[list[Any]]) -> It
 
 
 def damaged(rng: random.Random, protocol: Protocol, pieces: list[list[Any]]) -> tuple[list[Any], set[int]]:
-    """The input of a round, and the numbers of the samples in it that nothing happened to."""
+    """Return the input of a round, and the numbers of the undamaged samples in it."""
     used = (
         {frame[0::2][:2] for frame in chain.from_iterable(pieces)} if protocol.transport == "can" else set()
     )
     out: list[Any] = []
     good = set()
-    spoilt = False
+    corrupted = False
     for number, sample in enumerate(pieces):
         if number < ROUND - REST and rng.random() < DAMAGED:
             if protocol.transport == "can":
                 out += damage_frames(rng, sample, used)
             else:
                 out.append(damage_bytes(rng, sample[0]))
-                spoilt = protocol.name in LINES and not out[-1].endswith(b"\n")
+                corrupted = protocol.name in LINES and not out[-1].endswith(b"\n")
         else:
             if protocol.transport == "can" and rng.random() < 0.1:
                 out.append(foreign_frame(rng, used))
             out += sample
-            if not spoilt:
+            if not corrupted:
                 good.add(number)
-            spoilt = False
+            corrupted = False
     return out, good
 
 
@@ -191,17 +192,17 @@ def damaged(rng: random.Random, protocol: Protocol, pieces: list[list[Any]]) -> 
 
 
 class Feeder:
-    """Feeds a decoder in pieces of any size and keeps the slowest time a byte."""
+    """Feeds a decoder in pieces of random size and records the longest time per byte."""
 
     def __init__(self, decoder: Decoder, rng: random.Random) -> None:
-        """Nothing fed yet; rng chooses the sizes of the pieces."""
+        """Wrap a decoder; `rng` chooses the sizes of the pieces."""
         self.fed = 0
         self.slowest_us = 0.0
         self._decoder = decoder
         self._rng = rng
 
     def feed(self, pieces: list[Any]) -> list[Sample]:
-        """Samples of the pieces."""
+        """Feed the pieces and return their samples."""
         if not pieces:
             return []
         if isinstance(pieces[0], tuple):
@@ -221,7 +222,7 @@ class Feeder:
     def _timed(self, size: int, *words: Any) -> list[Sample]:
         start = time.perf_counter()
         samples = self._decoder.feed(*words)
-        # Short pieces show the interruptions of this machine.
+        # For short pieces, interruptions by other programs would dominate.
         if size >= 1024:
             self.slowest_us = max(self.slowest_us, (time.perf_counter() - start) * 1e6 / size)
         self.fed += size
@@ -229,11 +230,11 @@ class Feeder:
 
 
 def fuzz(protocol: Protocol, size: int, seed: int) -> Result:
-    """Feeds at least `size` bytes to a fresh decoder: rounds of damaged packets, with noise between them."""
+    """Feed at least `size` bytes to a new decoder: rounds of damaged packets, with noise between them."""
     rng = random.Random(seed)
     sender = Sender(protocol)
     feeder = Feeder(protocol.decoder(), rng)
-    first = list(chain.from_iterable(sender.round()[:REST]))  # with the header, where a format has one
+    first = list(chain.from_iterable(sender.round()[:REST]))  # with the header, if the format has one
     feeder.feed(first)
     judged = missed = held = rounds = 0
     tracemalloc.start()
@@ -243,7 +244,7 @@ def fuzz(protocol: Protocol, size: int, seed: int) -> Result:
             feeder.feed(list(noise(rng, protocol, pieces)))
             feeder.feed(
                 list(chain.from_iterable(sender.round()[:REST]))
-            )  # an end to whatever the noise began
+            )  # completes whatever the noise began
             pieces = sender.round()
             known = expected(protocol, first, pieces)
             stream, good = damaged(rng, protocol, pieces)
@@ -261,13 +262,13 @@ def fuzz(protocol: Protocol, size: int, seed: int) -> Result:
 
 
 def held_bytes() -> int:
-    """Memory in use, bytes."""
+    """Return the memory in use, bytes."""
     gc.collect()
     return tracemalloc.get_traced_memory()[0]
 
 
 def expected(protocol: Protocol, first: list[Any], pieces: list[list[Any]]) -> set[int]:
-    """Numbers of the samples that come out of a round without any damage."""
+    """Return the numbers of the samples that come out of an undamaged round."""
     feeder = Feeder(protocol.decoder(), random.Random(0))
     feeder.feed(first)
     return {number_of(sample) for sample in feeder.feed(list(chain.from_iterable(pieces)))}
@@ -275,12 +276,17 @@ def expected(protocol: Protocol, first: list[Any], pieces: list[list[Any]]) -> s
 
 @click.command(help=__doc__)
 @click.option(
-    "--bytes", "size", type=click.IntRange(1), default=1_000_000, show_default=True, help="For each decoder."
+    "--bytes",
+    "size",
+    type=click.IntRange(1),
+    default=1_000_000,
+    show_default=True,
+    help="Input for each decoder.",
 )
 @click.option("--seed", type=int, default=0, show_default=True)
 @click.argument("names", nargs=-1, type=click.Choice(list(PROTOCOLS)))
 def main(size: int, seed: int, names: tuple[str, ...]) -> None:
-    """The command line."""
+    """Run the command line."""
     print(f"{'format':<18}{'bytes':>9}{'good':>8}{'missed':>8}{'held more, B':>14}{'slowest, us/B':>15}")
     for name in names or PROTOCOLS:
         r = fuzz(PROTOCOLS[name], size, seed)

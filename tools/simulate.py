@@ -1,16 +1,16 @@
-"""Plays an IMU recording or a motion-capture clip as six devices, in real time, in any wire format.
+"""Plays an IMU recording or a motion-capture clip as six devices in real time, in any wire format.
 
 \b
-    simulate.py recording.npz                         plays native packets, then stands at the last sample
-    simulate.py recording.npz --stand                 stands at the first sample until a line comes on stdin
-    simulate.py walk.bvh --protocol xsens             six ptys with one device on each
+    simulate.py recording.npz                         play native packets, then repeat the last sample
+    simulate.py recording.npz --stand                 repeat the first sample until a line arrives on stdin
+    simulate.py walk.bvh --protocol xsens             six ptys with one device each
     simulate.py walk.bvh --protocol native-can        CAN frames of a slcan adapter on a pty
     simulate.py walk.bvh --protocol native-can --can socketcan:can0
-    simulate.py walk.bvh --exercises --mounting 7 --raw 6    sensors without a filter, strapped on anyhow
+    simulate.py walk.bvh --exercises --mounting 7 --raw 6    sensors without a filter at random angles
 
-Prints `port NAME[,NAME...]` ready for --port (or `can NAME` ready for --can), `started UNIX_TIME` and
-`ended UNIX_TIME`. A clip stands straight for 6 s first. Ends when standard input closes, though not in the
-middle of the recording, or at Ctrl-C.
+Prints `port NAME[,NAME...]` for use with --port (or `can NAME` for --can), `started UNIX_TIME` and `ended
+UNIX_TIME`. Before a clip, the wearer stands straight for 6 s. Ends at Ctrl-C, or when standard input closes
+and the recording, if it has started, is over.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ from firmware_protocols.sample import Sample
 
 CLIP_RATE, CLIP_HOLD_S = 100.0, 6.0
 ANSWER_BITS_S = 115_200
-"""Speed of a line on which devices are asked; a pty alone has none, and they would answer at once."""
+"""Simulated speed of a line on which devices are polled, because a pty transfers answers at once."""
 
 FIELD_UT = (0.0, 20.0, -40.0)
-"""Magnetic field in the inertial frame, for formats that cannot do without one."""
+"""Magnetic field in the inertial frame, for formats that require one."""
 
 
 class Faults(NamedTuple):
-    """What goes wrong; fields are the command's flags."""
+    """Simulated faults; the fields are the command's flags."""
 
     loss: float = 0.0
     corrupt: float = 0.0
@@ -66,13 +66,13 @@ class Faults(NamedTuple):
 
 
 class Rig(NamedTuple):
-    """What is simulated; fields are the command's flags.
+    """The simulated sensors; the fields are the command's flags.
 
     Attributes:
-        exercises: the wearer of a clip does those of `edgepose calibrate --heading-reset motion` before it.
-        mounting: seed of the angles at which the sensors of a clip are strapped on; None is along the bones.
-        raw: axes of a chip without a filter, 6 or 9; None is an ideal sensor with orientation.
-        seed: of that chip's errors.
+        exercises: whether the exercises of `edgepose calibrate --heading-reset motion` precede a clip.
+        mounting: seed of the mounting angles for a clip; None aligns the sensors with the bones.
+        raw: number of axes, 6 or 9, of chips without a filter; None for ideal sensors with orientation.
+        seed: seed of the chips' errors.
     """
 
     exercises: bool = False
@@ -82,16 +82,16 @@ class Rig(NamedTuple):
 
 
 IDEAL = Rig()
-"""Ideal sensors with orientation, along the bones."""
+"""Ideal sensors with orientation, aligned with the bones."""
 
 
 def read_input(path: Path, rig: Rig = IDEAL) -> Recording:
-    """A recording, or what sensors on the body of a motion-capture clip would have recorded.
+    """Read a recording, or simulate sensors on the body of a motion-capture clip.
 
     Raises:
-        EdgeposeError: the file is neither, or the clip jumps in the middle.
+        EdgeposeError: the file is neither, or the clip has jumps.
     """
-    recording = of_clip(path, rig) if is_motion(path) else read_recording(path)
+    recording = simulate_clip(path, rig) if is_motion(path) else read_recording(path)
     if rig.raw is None:
         return recording
     from edgepose_export.synthesis.imu_errors import BMI270, raw
@@ -105,8 +105,8 @@ def read_input(path: Path, rig: Rig = IDEAL) -> Recording:
     return recording._replace(sensors=sensors)
 
 
-def of_clip(path: Path, rig: Rig) -> Recording:
-    """What ideal sensors would have recorded; the wearer stands straight first."""
+def simulate_clip(path: Path, rig: Rig) -> Recording:
+    """Simulate ideal sensors on the body of a clip; the wearer stands straight first."""
     from edgepose_export.mocap import pieces, read_motion, resample
     from edgepose_export.synthesis.heading_routine import with_exercises
     from edgepose_export.synthesis.virtual_imus import (
@@ -119,7 +119,7 @@ def of_clip(path: Path, rig: Rig) -> Recording:
     takes = pieces(read_motion(path))
     if len(takes) != 1:
         raise EdgeposeError(
-            f"{path}: jumps; make recordings of its {len(takes)} parts with edgepose synthesize"
+            f"{path}: has jumps; make recordings of its {len(takes)} parts with edgepose synthesize"
         )
     motion = resample(takes[0], CLIP_RATE)
     motion = (with_exercises if rig.exercises else with_hold)(motion, CLIP_HOLD_S)
@@ -135,18 +135,18 @@ def of_clip(path: Path, rig: Rig) -> Recording:
 
 
 def is_motion(path: Path) -> bool:
-    """Whether a file is motion capture; an NPZ is if it has poses and no sensors."""
+    """Return whether a file is motion capture, which in .npz files means poses and no sensors."""
     if path.suffix.lower() != ".npz":
         return path.suffix.lower() in (".bvh", ".amc")
     try:
         with np.load(path, allow_pickle=False) as arrays:
             return "poses" in arrays.files and f"{PLACEMENTS[0]}_acc" not in arrays.files
     except (OSError, ValueError):
-        return False  # for the reader of recordings to explain
+        return False  # the reader of recordings reports the error
 
 
 def rows_of(data: SensorData) -> list[Sample]:
-    """A sensor's rows without id and time."""
+    """Return a sensor's rows without id and time."""
     columns = [
         [None] * len(data.time_s)
         if rows is None
@@ -157,7 +157,7 @@ def rows_of(data: SensorData) -> list[Sample]:
 
 
 def with_field(sample: Sample) -> Sample:
-    """A sample with a magnetic field, if its orientation is known."""
+    """Add a magnetic field to a sample if its orientation is known."""
     if sample.mag is not None or sample.quat is None:
         return sample
     return sample._replace(mag=rotate_back(sample.quat, FIELD_UT))
@@ -167,25 +167,25 @@ def with_field(sample: Sample) -> Sample:
 
 
 class Line(Protocol):
-    """Where packets go."""
+    """A line that packets are sent over."""
 
     name: str
 
     def send(self, wire: Any) -> None:
-        """Sends a packet, or loses it if nobody takes it."""
+        """Send a packet, or lose it if no one reads the line."""
 
     def receive(self) -> bytes:
-        """What the other side has sent."""
+        """Return what the other side has sent."""
 
     def close(self) -> None:
-        """Gives it free."""
+        """Release the line."""
 
 
 class Pty:
-    """A pseudo terminal that takes whole packets or nothing: what nobody reads is lost, as on a real line."""
+    """A pseudo terminal that takes whole packets only; as on a real line, unread packets are lost."""
 
     def __init__(self, slcan: bool = False) -> None:
-        """Opens it; with slcan, packets are CAN frames in the text form of an adapter."""
+        """Open a pseudo terminal; with `slcan`, packets are CAN frames in the text form of an adapter."""
         self.master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self.master, False)
@@ -194,7 +194,7 @@ class Pty:
         self._rest = b""
 
     def send(self, wire: Any) -> None:
-        """Sends a packet."""
+        """Send a packet, unless an earlier one is still waiting."""
         self._write()
         if not self._rest:
             self._rest = b"".join(map(slcan_line, wire)) if self._slcan else wire
@@ -208,14 +208,14 @@ class Pty:
             pass
 
     def receive(self) -> bytes:
-        """Requests to a device, or the commands of an adapter's user."""
+        """Return requests to a device, or commands to an adapter."""
         try:
             return os.read(self.master, 4096)
         except BlockingIOError:
             return b""
 
     def close(self) -> None:
-        """Hangs up."""
+        """Close both ends."""
         os.close(self.master)
         os.close(self._slave)
 
@@ -224,10 +224,10 @@ class Bus:
     """A bus of python-can."""
 
     def __init__(self, name: str, bitrate: int) -> None:
-        """Opens it; the name is INTERFACE:CHANNEL.
+        """Open the bus INTERFACE:CHANNEL.
 
         Raises:
-            EdgeposeError: it cannot be opened.
+            EdgeposeError: the bus cannot be opened.
         """
         interface, _, channel = name.partition(":")
         self.name = name
@@ -236,10 +236,10 @@ class Bus:
                 channel=channel, interface=interface, bitrate=bitrate, receive_own_messages=False
             )
         except (can.CanError, OSError, ValueError, ImportError) as error:
-            raise EdgeposeError(f"{name}: cannot open it: {error}") from None
+            raise EdgeposeError(f"{name}: cannot be opened: {error}") from None
 
     def send(self, wire: Sequence[Frame]) -> None:
-        """Sends the frames of a sample; a full bus loses them."""
+        """Send the frames of a sample; lose the rest if the bus is full."""
         for can_id, data, extended, fd in wire:
             try:
                 self._bus.send(
@@ -249,16 +249,16 @@ class Bus:
                 return
 
     def receive(self) -> bytes:
-        """Nothing."""
+        """Return nothing: devices on the bus are not polled."""
         return b""
 
     def close(self) -> None:
-        """Leaves the bus."""
+        """Leave the bus."""
         self._bus.shutdown()
 
 
 def slcan_line(frame: Frame) -> bytes:
-    """A frame as slcan adapters write it; CAN FD as the newer ones do."""
+    """Format a frame as slcan adapters do, CAN FD as the newer ones do."""
     can_id, data, extended, fd = frame
     kind = ("d" if fd else "t").upper() if extended else ("d" if fd else "t")
     lengths = (*range(9), 12, 16, 20, 24, 32, 48, 64)
@@ -267,32 +267,30 @@ def slcan_line(frame: Frame) -> bytes:
     )
 
 
-def open_lines(spoken: Format, bus: str | None) -> list[Line]:
-    """One line for all six sensors, or six."""
+def open_lines(wire_format: Format, bus: str | None) -> list[Line]:
+    """Open one line for all six sensors, or six lines."""
     if bus is not None:
-        return [Bus(bus, spoken.default_bitrate)]
-    if spoken.transport == "can":
+        return [Bus(bus, wire_format.default_bitrate)]
+    if wire_format.transport == "can":
         return [Pty(slcan=True)]
-    return [Pty() for _ in range(len(PLACEMENTS) if spoken.single_device else 1)]
+    return [Pty() for _ in range(len(PLACEMENTS) if wire_format.single_device else 1)]
 
 
 # --- playing ------------------------------------------------------------------------------------------------
 
 
 class Sensor:
-    """One simulated device: what it sends and when."""
+    """A simulated device: its samples and their times."""
 
     def __init__(
         self, index: int, data: SensorData, start_s: float, encode: Callable[[Sample, int], Any]
     ) -> None:
-        """Nothing sent yet; `start_s` is the time of the recording's first sample."""
+        """Start at the first row; `start_s` is the time of the recording's first sample."""
         self.index = index
         self.rows = rows_of(data)
         self.times = (data.time_s - start_s).tolist()
         if len(self.times) < 2 or not (np.diff(data.time_s) > 0).all():
-            raise EdgeposeError(
-                f"{PLACEMENTS[index]}: it needs two instants or more, each later than the one before"
-            )
+            raise EdgeposeError(f"{PLACEMENTS[index]}: needs at least two samples with increasing times")
         self.period = float(np.median(np.diff(data.time_s)))
         self.row = 0
         self.count = 0
@@ -301,24 +299,24 @@ class Sensor:
         self._encode = encode
         self._add_field = False
 
-    def prepare(self, spoken: Format, sensor_id: int) -> None:
-        """Makes sure that the format can hold the first sample.
+    def prepare(self, wire_format: Format, sensor_id: int) -> None:
+        """Set the sensor's id, and check that the format can represent the first sample.
 
         Raises:
-            EdgeposeError: it cannot.
+            EdgeposeError: the format cannot represent it.
         """
         self.rows = [row._replace(sensor=sensor_id) for row in self.rows]
         try:
             for self._add_field in (False, True):
                 try:
-                    spoken.encoder()(self._sample(0), 0)
+                    wire_format.encoder()(self._sample(0), 0)
                     return
                 except ValueError:
                     if self._add_field:
                         raise
         except ValueError as error:
             raise EdgeposeError(
-                f"{PLACEMENTS[self.index]}: {spoken.name} cannot hold its samples: {error}"
+                f"{PLACEMENTS[self.index]}: {wire_format.name} cannot represent its samples: {error}"
             ) from None
 
     def _sample(self, t_us: int) -> Sample:
@@ -326,7 +324,7 @@ class Sensor:
         return with_field(sample) if self._add_field else sample
 
     def measure(self, t_us: int) -> None:
-        """Makes the packet of the present row; none if the format cannot hold it."""
+        """Make the packet of the current row, if the format can represent it."""
         try:
             self.wire = self._encode(self._sample(t_us), self.count)
         except ValueError:
@@ -334,7 +332,7 @@ class Sensor:
         self.count += 1
 
     def step(self, played_s: float | None) -> None:
-        """Goes to the next row; `played_s` is when the recording began to play, None if it has not."""
+        """Go to the next row; `played_s` is the time at which the recording started, None before that."""
         if played_s is None or self.row + 1 == len(self.rows):
             self.due += self.period
         else:
@@ -343,45 +341,45 @@ class Sensor:
 
 
 class Player:
-    """Sends the packets of six sensors until standard input closes."""
+    """Sender of the packets of six sensors, until standard input closes."""
 
-    def __init__(self, sensors: list[Sensor], lines: list[Line], spoken: Format, faults: Faults) -> None:
-        """Nothing sent yet."""
+    def __init__(self, sensors: list[Sensor], lines: list[Line], wire_format: Format, faults: Faults) -> None:
+        """Prepare the queues of the lines and the sensors' clocks."""
         self._sensors, self._lines, self._faults = sensors, lines, faults
         self._rng = random.Random(0)
         self._queues: list[deque[tuple[float, Any]]] = [deque() for _ in lines]
         self._requests: dict[bytes, Sensor] = {}
-        if spoken.request is not None:
+        if wire_format.request is not None:
             ids = [sensor.rows[0].sensor for sensor in sensors]
-            self._requests = {spoken.request(i)[0]: s for i, s in zip(ids, sensors, strict=True)}
-        self._asked = [b"" for _ in lines]
-        # The six clocks run apart evenly.
+            self._requests = {wire_format.request(i)[0]: s for i, s in zip(ids, sensors, strict=True)}
+        self._received = [b"" for _ in lines]
+        # The rates of the six clocks are evenly spaced.
         self._clocks = [1.0 + faults.drift_ppm * 1e-6 * (sensor.index / 2.5 - 1.0) for sensor in sensors]
         self._start = 0.0
         self._played_s: float | None = None
 
     def play(self, stand: bool) -> None:
-        """Runs to the end; with stand, the recording begins when a line comes on standard input."""
+        """Run to the end; with `stand`, the recording starts when a line arrives on standard input."""
         self._start = time.monotonic()
         unix = time.time() - self._start
         for sensor in self._sensors:
             sensor.due = self._start
         watched = [sys.stdin]
-        begun, announced, ended = not stand, False, False
+        started, announced, ended = not stand, False, False
         while True:
-            if begun and self._played_s is None:
+            if started and self._played_s is None:
                 self._played_s = min(sensor.due for sensor in self._sensors)
                 for sensor in self._sensors:
                     sensor.due = self._played_s + sensor.times[0]
             if self._played_s is not None and not announced:
                 print(f"started {unix + self._played_s:.6f}", flush=True)
                 announced = True
-            came = self._wait(watched)
-            if came == "":
+            line = self._wait(watched)
+            if line == "":
                 watched = []
-                if not begun:
+                if not started:
                     return
-            begun = begun or bool(came)
+            started = started or bool(line)
             for sensor in self._sensors:
                 if sensor.due <= time.monotonic():
                     self._measure(sensor)
@@ -395,14 +393,14 @@ class Player:
                 return
 
     def _at_end(self) -> bool:
-        """Whether all last rows have been measured."""
+        """Return whether all last rows have been measured."""
         return all(
             sensor.row + 1 == len(sensor.rows) and sensor.due > (self._played_s or 0.0) + sensor.times[-1]
             for sensor in self._sensors
         )
 
     def _wait(self, watched: list[Any]) -> str | None:
-        """Sleeps until something is due or comes; a line of standard input, or "" at its end."""
+        """Wait until something is due or arrives; return a line of standard input, "" at its end, or None."""
         dues = [sensor.due for sensor in self._sensors] + [queue[0][0] for queue in self._queues if queue]
         ptys = {line.master: i for i, line in enumerate(self._lines) if isinstance(line, Pty)}
         timeout = max(0.0, min(dues) - time.monotonic())
@@ -419,17 +417,17 @@ class Player:
             self._queue(sensor, sensor.index if len(self._lines) > 1 else 0, sensor.due)
 
     def _answer(self, line: int) -> None:
-        asked = self._asked[line] + self._lines[line].receive()
+        received = self._received[line] + self._lines[line].receive()
         for request, sensor in self._requests.items():
-            if request in asked:
-                asked = asked.replace(request, b"")
+            if request in received:
+                received = received.replace(request, b"")
                 if sensor.wire is not None:
                     bits = 10 * (len(request) + len(sensor.wire))
                     self._queue(sensor, line, time.monotonic() + bits / ANSWER_BITS_S)
-        self._asked[line] = asked[-64:]
+        self._received[line] = received[-64:]
 
     def _queue(self, sensor: Sensor, line: int, due: float) -> None:
-        """Hands a packet to its line, unless something goes wrong."""
+        """Queue a packet for its line, subject to the faults."""
         faults, wire = self._faults, sensor.wire
         played = -1.0 if self._played_s is None else due - self._played_s
         killed = any(i == sensor.index and begin <= played < end for i, begin, end in faults.kill)
@@ -440,7 +438,7 @@ class Player:
             wire[self._rng.randrange(len(wire))] ^= 1 << self._rng.randrange(8)
         queue = self._queues[line]
         release = due + self._rng.random() * faults.jitter_ms * 1e-3
-        # A line keeps its order.
+        # Packets on a line stay in order.
         queue.append((max(release, queue[-1][0]) if queue else release, wire))
 
     def _release(self) -> None:
@@ -454,36 +452,38 @@ class Player:
 
 
 def parse_kill(ctx: click.Context, param: click.Parameter, values: Sequence[str]) -> tuple[Any, ...]:
-    """Sensor number, begin and end of each --kill."""
+    """Return sensor number, begin and end of each --kill."""
     result = []
     for value in values:
         match = re.fullmatch(r"(\w+)@(\d+(?:\.\d+)?)\.\.(\d+(?:\.\d+)?)?", value)
         if match is None or match[1] not in PLACEMENTS:
-            raise click.BadParameter(f"{value!r} is not SENSOR@T..T with a sensor of {', '.join(PLACEMENTS)}")
+            raise click.BadParameter(
+                f"{value!r} is not SENSOR@T..T, where SENSOR is one of {', '.join(PLACEMENTS)}"
+            )
         result.append((PLACEMENTS.index(match[1]), float(match[2]), float(match[3] or "inf")))
     return tuple(result)
 
 
-def simulate(recording: Recording, spoken: Format, bus: str | None, stand: bool, faults: Faults) -> None:
-    """Opens the lines and plays the recording on them."""
+def simulate(recording: Recording, wire_format: Format, bus: str | None, stand: bool, faults: Faults) -> None:
+    """Open the lines and play the recording on them."""
     start_s = min(float(data.time_s[0]) for data in recording.sensors.values())
-    ids = [0] * len(PLACEMENTS) if spoken.single_device else list(spoken.ids)
+    ids = [0] * len(PLACEMENTS) if wire_format.single_device else list(wire_format.ids)
     if faults.duplicate_id:
         ids[1] = ids[0]
-    encoders = [spoken.encoder() for _ in range(len(PLACEMENTS) if spoken.single_device else 1)]
+    encoders = [wire_format.encoder() for _ in range(len(PLACEMENTS) if wire_format.single_device else 1)]
     sensors = []
     for index, data in enumerate(recording.sensors.values()):
         sensor = Sensor(index, data, start_s, encoders[index % len(encoders)])
-        sensor.prepare(spoken, ids[index])
+        sensor.prepare(wire_format, ids[index])
         sensors.append(sensor)
-    lines = open_lines(spoken, bus)
+    lines = open_lines(wire_format, bus)
     name = ",".join(line.name for line in lines)
-    if spoken.transport == "bytes":
+    if wire_format.transport == "bytes":
         print("port", name, flush=True)
     else:
         print("can", name if bus else f"slcan:{name}", flush=True)
     try:
-        Player(sensors, lines, spoken, faults).play(stand)
+        Player(sensors, lines, wire_format, faults).play(stand)
     finally:
         for line in lines:
             line.close()
@@ -491,7 +491,7 @@ def simulate(recording: Recording, spoken: Format, bus: str | None, stand: bool,
 
 @click.command(help=__doc__)
 @click.argument("recording", type=click.Path(path_type=Path))
-@click.option("--stand", is_flag=True, help="Repeat the first sample until a line comes on standard input.")
+@click.option("--stand", is_flag=True, help="Repeat the first sample until a line arrives on standard input.")
 @click.option("--protocol", type=click.Choice(list(PROTOCOLS)), default="native", show_default=True)
 @click.option(
     "--can", "bus", metavar="INTERFACE:CHANNEL", help="Send CAN frames here  [default: slcan on a pty]"
@@ -501,38 +501,44 @@ def simulate(recording: Recording, spoken: Format, bus: str | None, stand: bool,
     "--corrupt", type=click.FloatRange(0, 1), default=0.0, help="Share of packets with a wrong bit."
 )
 @click.option(
-    "--jitter", type=click.FloatRange(0), default=0.0, metavar="MS", help="Packets are up to this late."
+    "--jitter",
+    type=click.FloatRange(0),
+    default=0.0,
+    metavar="MS",
+    help="Delay packets at random by up to this time.",
 )
 @click.option(
-    "--drift", type=float, default=0.0, metavar="PPM", help="Clocks of the six go wrong by -PPM to PPM."
+    "--drift", type=float, default=0.0, metavar="PPM", help="Let the six clocks drift by -PPM to PPM."
 )
 @click.option(
     "--kill",
     multiple=True,
     callback=parse_kill,
     metavar="SENSOR@T..T",
-    help="Silent from .. to, s since started.",
+    help="Silence a sensor between two times, seconds since `started`.",
 )
-@click.option("--exercises", is_flag=True, help="Before a clip, those of calibrate --heading-reset motion.")
+@click.option(
+    "--exercises", is_flag=True, help="Precede a clip by the exercises of calibrate --heading-reset motion."
+)
 @click.option(
     "--mounting",
     type=int,
     metavar="SEED",
-    help="Sensors of a clip sit at random angles.",
+    help="Mount the sensors of a clip at random angles.",
 )
 @click.option(
     "--raw",
     type=click.Choice(["6", "9"]),
-    help="No orientations: rates and forces of a BMI270 with its noise and bias; 9 is with a magnetometer.",
+    help="No orientations, only rates and forces of a BMI270 with noise and bias; 9 adds a magnetometer.",
 )
-@click.option("--seed", type=int, default=0, help="Of those errors.")
+@click.option("--seed", type=int, default=0, help="Seed of the errors of --raw.")
 @click.option(
     "--write",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Write an .npz and send nothing.",
+    help="Write an .npz file and send nothing.",
 )
-@click.option("--duplicate-id", is_flag=True, help="The second sensor has the id of the first.")
+@click.option("--duplicate-id", is_flag=True, help="Give the second sensor the id of the first.")
 def main(
     recording: Path,
     stand: bool,
@@ -550,22 +556,22 @@ def main(
     write: Path | None,
     duplicate_id: bool,
 ) -> None:
-    """The command line."""
-    spoken = PROTOCOLS[protocol]
-    if bus is not None and spoken.transport != "can":
-        raise click.UsageError(f"{protocol} does not go over CAN")
-    if corrupt and spoken.transport == "can":
-        raise click.UsageError("a CAN controller passes no wrong bits on; use --loss")
-    if duplicate_id and spoken.single_device:
-        raise click.UsageError(f"{protocol} has one sensor on a line, whatever its id")
-    # A shell starts what runs in the background deaf to Ctrl-C.
+    """Run the command line."""
+    wire_format = PROTOCOLS[protocol]
+    if bus is not None and wire_format.transport != "can":
+        raise click.UsageError(f"{protocol} is not a CAN protocol")
+    if corrupt and wire_format.transport == "can":
+        raise click.UsageError("CAN controllers drop frames with wrong bits; use --loss")
+    if duplicate_id and wire_format.single_device:
+        raise click.UsageError(f"{protocol} has one sensor per line, so ids cannot clash")
+    # Shells start background programs with SIGINT ignored.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         played = read_input(recording, Rig(exercises, mounting, None if raw is None else int(raw), seed))
         if write is not None:
             write_npz(write, played)
             return
-        simulate(played, spoken, bus, stand, Faults(loss, corrupt, jitter, drift, kill, duplicate_id))
+        simulate(played, wire_format, bus, stand, Faults(loss, corrupt, jitter, drift, kill, duplicate_id))
     except EdgeposeError as error:
         raise click.ClickException(str(error)) from error
     except KeyboardInterrupt:

@@ -1,1 +1,1 @@
-"""Where edgepose models come from: motion capture, synthesis, training, export."""
+"""The making of edgepose models: motion capture, synthesis, training, evaluation, export."""

@@ -45,7 +45,7 @@ def test_a_magnetometer_measures_the_field():
 
 
 def test_what_has_no_rates_is_refused():
-    with pytest.raises(ValueError, match="no rates and forces"):
+    with pytest.raises(ValueError, match="rates and forces, which are missing"):
         raw(REST._replace(gyr=None), BMI270, 0, magnetometer=False)
 
 

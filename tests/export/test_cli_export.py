@@ -109,7 +109,7 @@ def test_figures_of_another_model_stand_beside(made, tmp_path):
         assert 0 < other["sip_error_deg"][0] < own["sip_error_deg"][0]
     assert "| `rnn`, online, step by step |" in (tmp_path / "tiny.md").read_text()
     refused = CliRunner().invoke(cli, [str(a) for a in to])
-    assert (refused.exit_code, "--beside is for --measure" in refused.output) == (2, True)
+    assert (refused.exit_code, "--beside needs --measure" in refused.output) == (2, True)
 
 
 def test_metadata(made):
@@ -155,7 +155,7 @@ def test_card(made):
     for text in (
         "# tiny",
         "bidirectional LSTM",
-        "5 future frames have come (83 ms)",
+        "5 future frames have arrived (83 ms)",
         "8 units",
         "at 60 Hz",
         ", ".join(PLACEMENTS),
@@ -217,9 +217,9 @@ def test_training_goes_on_and_fine_tunes(made, tmp_path):
     folder, _, train = made
     run = tmp_path / "run"
     shutil.copytree(folder / "run", run)
-    assert "go on with --resume" in fails(*train, "--out", run)
+    assert "continue that run with --resume" in fails(*train, "--out", run)
     said = edgepose(*train, "--out", run, "--resume", "--steps", 9).output
-    assert "going on at step 6" in said
+    assert "continuing at step 6" in said
     assert read_checkpoint(run / "checkpoint.pt")["step"] == 9
     tuned = tmp_path / "tuned"
     edgepose(*train, "--out", tuned, "--init", folder / "run" / "best.pt")
@@ -254,7 +254,7 @@ def test_unidirectional(made, tmp_path):
     assert (about["kind"], about["past"], about["future"], about["measures"]) == ("rnn", 0, 0, {})
     card = path.with_suffix(".md").read_text(encoding="utf-8")
     assert "unidirectional" in card
-    assert "never seen" not in card
+    assert "held-out motion" not in card
     said = edgepose("evaluate", "--model", path, "--trust", "--data", data, "--part", "cmu-02").stdout
     assert "online, step by step" in said
     wrong = CliRunner().invoke(
@@ -300,7 +300,7 @@ def test_synthesize_faults(tmp_path):
     shutil.copy(WALK, folder / "good.bvh")
     (folder / "bad.bvh").write_text("HIERARCHY\n")
     result = CliRunner().invoke(cli, ["synthesize", str(folder), "--out", str(tmp_path / "out")])
-    assert "left out:" in result.output
+    assert "skipped:" in result.output
     assert "bad.bvh" in result.output
     assert "1 of 2 files could not be converted" in str(result.exception)
     assert (tmp_path / "out" / "good.npz").exists()
@@ -325,7 +325,7 @@ def test_mean_weights_of_checkpoints(made, tmp_path):
     about = archive.read_info(tmp_path / "mean.pt").metadata
     assert (about["training"]["checkpoints"], about["training"]["steps"]) == (2, 3)
     card = (tmp_path / "mean.md").read_text(encoding="utf-8")
-    assert "3 steps in the last of 2 trainings, the mean of whose weights this is." in card
+    assert "3 steps in the last of 2 training runs, whose weights are averaged." in card
     assert "checkpoint.pt OTHERS --out" in card
     states = [read_checkpoint(path) for path in (tuned, first)]
     weights = mean_of({"tuned": states[0], "first": states[1]})["averaged"]
@@ -341,7 +341,7 @@ def test_mean_weights_of_checkpoints(made, tmp_path):
     (tmp_path / "wide.toml").write_text(CONFIG.replace("hidden = 8", "hidden = 9"))
     edgepose(*train, "--config", tmp_path / "wide.toml", "--out", tmp_path / "other", "--steps", 1)
     refused = fails("export", first, tmp_path / "other" / "checkpoint.pt", "--out", tmp_path / "x.pt")
-    assert "other/checkpoint.pt: did not begin from" in refused
+    assert "other/checkpoint.pt: cannot be averaged with" in refused
     twice = CliRunner().invoke(cli, ["export", str(first), str(first), "--out", str(tmp_path / "x.pt")])
     assert (twice.exit_code, "named twice" in twice.output) == (2, True)
 
@@ -351,7 +351,9 @@ def test_rounded_weights(made, tmp_path):
     edgepose("export", folder / "run" / "best.pt", "--out", tmp_path / "short.pt", "--rounded")
     info = archive.read_info(tmp_path / "short.pt")
     assert info.metadata["rounded"]
-    assert "weights, rounded by about a hundredth." in (card := (tmp_path / "short.md").read_text("utf-8"))
+    assert "weights, rounded to about one part in a hundred." in (
+        card := (tmp_path / "short.md").read_text("utf-8")
+    )
     assert "--out short.pt --rounded --measure" in card
     weights = [
         weight
@@ -362,7 +364,7 @@ def test_rounded_weights(made, tmp_path):
     assert all(torch.equal(weight.half().float(), weight) for weight in weights)
     twice = ["export", "x.pt", "--out", "y.pt", "--rounded", "--precision", "int8"]
     refused = CliRunner().invoke(cli, twice)
-    assert (refused.exit_code, "not for --precision int8" in refused.output) == (2, True)
+    assert (refused.exit_code, "does not apply to --precision int8" in refused.output) == (2, True)
 
 
 def test_means_keep_licences_and_refuse_strangers(made):
@@ -376,7 +378,7 @@ def test_means_keep_licences_and_refuse_strangers(made):
     stranger = new_network(config_from(json.loads(first["config"])).network).state_dict()
     odd = first["statistics"] | {"input_std": first["statistics"]["input_std"] + 1.0}
     for change in ({"averaged": stranger}, {"statistics": odd}):
-        with pytest.raises(EdgeposeError, match="b: did not begin from a"):
+        with pytest.raises(EdgeposeError, match="b: cannot be averaged with a"):
             mean_of({"a": first, "b": first | change})
 
 
@@ -388,7 +390,7 @@ def test_errors_are_one_line(made, tmp_path):
         [sys.executable, "-m", "edgepose", *arguments], capture_output=True, text=True, check=False
     )
     assert done.returncode == 1
-    assert done.stderr == f"edgepose: {tmp_path / 'bad.toml'}: steps is 'many'; it takes a whole number\n"
+    assert done.stderr == f"edgepose: {tmp_path / 'bad.toml'}: steps is 'many'; it must be a whole number\n"
     assert not (tmp_path / "run").exists()
 
 
@@ -469,7 +471,7 @@ def test_fine_tuning_goes_on_too(made, tmp_path):
     tuned = tmp_path / "tuned"
     edgepose(*train, "--out", tuned, "--init", folder / "run" / "best.pt", "--steps", 3)
     said = edgepose(*train, "--out", tuned, "--resume").output
-    assert "going on at step 3" in said
+    assert "continuing at step 3" in said
     state = read_checkpoint(tuned / "checkpoint.pt")
     assert state["step"] == 6
     assert ", then " in state["data"]["summary"]

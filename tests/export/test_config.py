@@ -59,7 +59,7 @@ def test_config_that_differs_from_another(tmp_path):
     config = read_config(tmp_path / "other.toml")
     assert (config.steps, config.seed, config.network) == (9, 3, NetworkShape("rnn", 16))
     (tmp_path / "other.toml").write_text("base = 3\n")
-    with pytest.raises(EdgeposeError, match=r"other\.toml: base is 3; it takes the name of a config"):
+    with pytest.raises(EdgeposeError, match=r"other\.toml: base is 3; it must be the name of a config"):
         read_config(tmp_path / "other.toml")
     (tmp_path / "other.toml").write_text("base = 'nosuch'\n")
     with pytest.raises(EdgeposeError, match=r"nosuch\.toml: No such file"):
@@ -72,32 +72,32 @@ def test_config_that_differs_from_another(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("steps = 'many'", "steps is 'many'; it takes a whole number"),
-        ("steps = 1.5", "steps is 1.5; it takes a whole number"),
-        ("steps = true", "steps is True; it takes a whole number"),
-        ("steps = 0", "steps is 0; it takes 1 to"),
-        ("joined = 1", "joined is 1; it takes true or false"),
-        ("learning_rate = -1", "learning_rate is -1; it takes"),
-        ("learning_rate = nan", "learning_rate is nan; it takes"),
-        ("input_dropout = 1.0", "input_dropout is 1.0; it takes 0 to 0.99"),
-        ("schedule = 'linear'", "schedule is 'linear'; it takes 'exponential' or 'cosine'"),
-        ("schedule = []", "schedule is []; it takes a text"),
+        ("steps = 'many'", "steps is 'many'; it must be a whole number"),
+        ("steps = 1.5", "steps is 1.5; it must be a whole number"),
+        ("steps = true", "steps is True; it must be a whole number"),
+        ("steps = 0", "steps is 0; it must be from 1 to"),
+        ("joined = 1", "joined is 1; it must be true or false"),
+        ("learning_rate = -1", "learning_rate is -1; it must be"),
+        ("learning_rate = nan", "learning_rate is nan; it must be"),
+        ("input_dropout = 1.0", "input_dropout is 1.0; it must be from 0 to 0.99"),
+        ("schedule = 'linear'", "schedule is 'linear'; it must be 'exponential' or 'cosine'"),
+        ("schedule = []", "schedule is []; it must be a string"),
         ("speed = 1", "unknown field 'speed'"),
-        ('streamed = 5\n[network]\nkind = "rnn"', "can be trained as streamed"),
-        ("window = 5\nstreamed = 5", "streamed is 5; it takes fewer frames"),
-        ("network = 3", r"network is 3; it takes a table [network]"),
-        ("[network]\nkind = 'gru'", "kind is 'gru'; it takes 'birnn' or 'rnn'"),
-        ("[network]\nhidden = 0", "hidden is 0; it takes 1 to"),
+        ('streamed = 5\n[network]\nkind = "rnn"', 'streamed needs kind = "birnn"'),
+        ("window = 5\nstreamed = 5", "streamed is 5; it must be less than window"),
+        ("network = 3", r"network is 3; it must be a table [network]"),
+        ("[network]\nkind = 'gru'", "kind is 'gru'; it must be 'birnn' or 'rnn'"),
+        ("[network]\nhidden = 0", "hidden is 0; it must be from 1 to"),
         ("[network]\nlayers = 3", r"unknown field 'layers' in [network]"),
-        ("[network]\nsmoothing = 1.0", "smoothing is 1.0; it takes 0 to 0.99"),
-        ("[network]\nkind = 'wavenet'\nsmoothing = 0.5", "smoothing is for kind"),
+        ("[network]\nsmoothing = 1.0", "smoothing is 1.0; it must be from 0 to 0.99"),
+        ("[network]\nkind = 'wavenet'\nsmoothing = 0.5", "smoothing needs kind"),
         ("[network]\nsmoothing = 0.5", 'smoothing needs targets = "global-6d"'),
         ("[network]\nmeasured = 'passed'", 'measured = "passed" needs targets = "global-6d"'),
-        ("[network]\nacceleration = false", "cannot give them back: acceleration_loss = false"),
-        ("[network]\nnormalisation = 'none'", "normalisation is 'none'; it takes 'root' or"),
-        ("[augmentation]\nmirror = 2", "mirror is 2; it takes 0 to 1"),
-        ("[augmentation]\nsilent = 1.5", "silent is 1.5; it takes 0 to 1"),
-        ("[augmentation]\nheading_deg = inf", "heading_deg is inf; it takes"),
+        ("[network]\nacceleration = false", "cannot reconstruct them: set acceleration_loss = false"),
+        ("[network]\nnormalisation = 'none'", "normalisation is 'none'; it must be 'root' or"),
+        ("[augmentation]\nmirror = 2", "mirror is 2; it must be from 0 to 1"),
+        ("[augmentation]\nsilent = 1.5", "silent is 1.5; it must be from 0 to 1"),
+        ("[augmentation]\nheading_deg = inf", "heading_deg is inf; it must be"),
         ("[augmentation\n", "line 1"),
     ],
 )

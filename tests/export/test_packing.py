@@ -14,7 +14,7 @@ from edgepose_export.mocap import read_motion, resample
 from edgepose_export.synthesis.virtual_imus import recording_arrays, virtual_imus
 from edgepose_export.training.dataset import read_take, tape
 from edgepose_export.training.memory_map import FRAME, packed_tape
-from edgepose_export.training.trainer import windows
+from edgepose_export.training.windows import windows
 
 DATA = Path(__file__).parents[1] / "data" / "mocap"
 

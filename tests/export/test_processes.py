@@ -59,7 +59,7 @@ def compare(processes):
         torch.testing.assert_close(gradient, p.grad, rtol=1e-4, atol=1e-6)
     total = processes.total(torch.tensor([processes.rank + 1.0, 0.5]))
     assert total.tolist() == [3.0, 1.0], total
-    assert processes.everywhere(f"process {processes.rank}") == ["process 0", "process 1"]
+    assert processes.gathered(f"process {processes.rank}") == ["process 0", "process 1"]
     (Path(sys.argv[1]) / f"done-{processes.rank}").write_text("yes")
 
 with joined() as processes:
@@ -159,7 +159,7 @@ def test_resumed_run_of_two_processes_is_the_uninterrupted_one(run, tmp_path):
     assert done.returncode == 0, done.stderr
     done = together("-m", "edgepose", *words(folder), "--out", half, "--resume")
     assert done.returncode == 0, done.stderr
-    assert "going on at step 2" in done.stderr
+    assert "continuing at step 2" in done.stderr
     whole, resumed = (read_checkpoint(path / "checkpoint.pt") for path in (folder / "run", half))
     for key in ("network", "averaged"):
         for name, weights in whole[key].items():
@@ -181,5 +181,5 @@ def test_another_number_of_processes_goes_on_too(run, tmp_path):
 def test_sequences_must_be_shared_equally(run):
     takes = tape([read_take(run[0] / "recordings" / "01_01.npz")])
     config = TrainConfig(sequences=4, window=20)
-    with pytest.raises(EdgeposeError, match="4 sequences a step cannot be shared by 3 processes equally"):
+    with pytest.raises(EdgeposeError, match="sequences is 4; 3 processes cannot share it equally"):
         Trainer(config, takes, takes, {}, Processes(0, 3))

@@ -202,7 +202,7 @@ def test_broken_sensors(totalcapture):
     broken(text.replace("Pelvis", "Tail", 1), "frame 1 has no Pelvis")
     broken("\n".join([*rows[:2], "Head\tnan 0 0 0 0 0 0", *rows[3:]]), "line 3: expected a unit quaternion")
     path.write_text(text)
-    with pytest.raises(EdgeposeError, match=r"no s1_acting1\.pkl"):
+    with pytest.raises(EdgeposeError, match=r"needs the true poses: s1_acting1\.pkl"):
         read_totalcapture(path, folder, {})
     calibration = folder / "imu" / "s1" / "s1_acting1_calib_imu_ref.txt"
     calibration.write_text("6\nHead 0 0 0 1\n")
@@ -311,7 +311,7 @@ def test_limbs_point_as_vicons_do_whatever_its_t_pose(tmp_path, true_bones):
 def test_vicon_of_another_take(totalcapture, true_bones):
     folder, path = totalcapture
     turned = write_vicon(folder / "S1" / "acting1", rot.rotation_about_axis("y", 1.0) @ true_bones)
-    with pytest.raises(EdgeposeError, match="its bones are 57 degrees from what the sensors say"):
+    with pytest.raises(EdgeposeError, match="its bones are 57 degrees off the sensors"):
         read_totalcapture(path, folder, {"s1_acting1": turned})
 
 
@@ -325,14 +325,14 @@ def other_order(text):
 @pytest.mark.parametrize(
     ("kind", "change", "message"),
     [
-        ("ori", lambda t: "", r"ori\.txt, line 1: the names of joints lack Head, Hips, Left"),
-        ("ori", lambda t: t.replace("Spine2", "Tail"), r"ori\.txt, line 1: the names of joints lack Spine2$"),
-        ("pos", lambda t: t.replace("LeftHand", "Paw"), r"pos\.txt, line 1: the names of joints lack LeftH"),
+        ("ori", lambda t: "", r"ori\.txt, line 1: joint names are missing: Head, Hips, Left"),
+        ("ori", lambda t: t.replace("Spine2", "Tail"), r"ori\.txt, line 1: joint names are missing: Spine2$"),
+        ("pos", lambda t: t.replace("LeftHand", "Paw"), r"pos\.txt, line 1: joint names are missing: LeftH"),
         ("ori", lambda t: t.replace("Spine\t", "Hips\t", 1), r"line 1: a joint is named twice"),
         ("ori", lambda t: t.splitlines()[0], r"ori\.txt: has no frame"),
-        ("ori", lambda t: t.rstrip().rpartition("\t")[0], r"line 13: 21 joints were expected, 20 found"),
+        ("ori", lambda t: t.rstrip().rpartition("\t")[0], r"line 13: expected 21 joints, found 20"),
         ("ori", lambda t: t.rstrip().rpartition(" ")[0], r"line 13: 4 numbers were expected, 3 found"),
-        ("pos", lambda t: t.replace("\n", "\n\n", 1), r"pos\.txt, line 2: 21 joints were expected, 1 found"),
+        ("pos", lambda t: t.replace("\n", "\n\n", 1), r"pos\.txt, line 2: expected 21 joints, found 1"),
         ("pos", lambda t: t.replace("0.000000000", "nan", 1), r"pos\.txt, line 2: a number is not finite"),
         (
             "pos",
@@ -349,7 +349,7 @@ def other_order(text):
         (
             "pos",
             lambda t: t.rstrip().rpartition("\n")[0],
-            r"has 12 frames, gt_skel_gbl_pos\.txt beside it 11",
+            r"has 12 frames, but gt_skel_gbl_pos\.txt beside it has 11",
         ),
         (
             "pos",
@@ -380,5 +380,5 @@ def test_vicon_without_its_places(tmp_path, true_bones):
 def test_sensors_without_any_truth(totalcapture):
     folder, _ = totalcapture
     (folder / "s1_acting1.pkl").unlink()
-    with pytest.raises(EdgeposeError, match=r"no s1_acting1\.pkl .* and no s1/acting1/gt_skel_gbl_ori\.txt"):
+    with pytest.raises(EdgeposeError, match=r"needs .*s1_acting1\.pkl.* or s1/acting1/gt_skel_gbl_ori\.txt"):
         list(read_published(folder))

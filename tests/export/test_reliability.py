@@ -41,7 +41,7 @@ def test_wrong_deviations_are_found_wrong():
     assert len(said.splitlines()) == rel.BINS + 2
     assert "60.8 % expected" in said
     assert "scale 3.0" in said
-    assert "40000 errors" in said
+    assert "40000 joint errors" in said
 
 
 def test_scales_mend_each_joint():

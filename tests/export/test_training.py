@@ -23,6 +23,7 @@ from edgepose_export.training import trainer as training
 from edgepose_export.training.config import TrainConfig, config_from
 from edgepose_export.training.dataset import read_take, tape, training_paths
 from edgepose_export.training.trainer import Trainer, read_checkpoint, save_checkpoint
+from edgepose_export.training.windows import sample_windows, window_starts, windows
 
 DATA = Path(__file__).parents[1] / "data" / "mocap"
 SMALL = TrainConfig(
@@ -165,7 +166,7 @@ def test_accelerations_are_reconstructed_too(takes):
         nothing = torch.zeros(*x.shape[:-1], 60 + 15)
         return nothing, nothing + 1
 
-    batch = training.windows(one.train_tape, torch.tensor([0]), 20)
+    batch = windows(one.train_tape, torch.tensor([0]), 20)
     s = one.statistics
     targets = (training.pose_targets(batch[2], SMALL.network) - s.target_mean) / s.target_std
     inputs = network_input(*batch[:2])[..., -15:]
@@ -181,20 +182,20 @@ def test_windows_stay_inside_takes(takes):
     together = tape(takes)
     ends = together.starts.tolist()
     for joined in (False, True):
-        others, cmu = training.window_starts(together, 20, joined)
+        others, cmu = window_starts(together, 20, joined)
         assert set(cmu.tolist()) <= set(range(ends[0], ends[1]))  # 01_01 comes first
         for start in torch.cat([others, cmu]).tolist():
             inside = any(a <= start and start + 20 <= b for a, b in pairwise(ends))
             assert inside or (joined and start + 20 <= ends[-1])
-    one = sum(len(x) for x in training.window_starts(together, 20, False))
+    one = sum(len(x) for x in window_starts(together, 20, False))
     assert one == sum(len(take.pose) - 19 for take in takes)
-    assert sum(len(x) for x in training.window_starts(together, 20, True)) == ends[-1] - 19
+    assert sum(len(x) for x in window_starts(together, 20, True)) == ends[-1] - 19
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5])
 def test_share_of_cmu(takes, share):
-    starts = training.window_starts(tape(takes), 20, False)
-    drawn = training.sample_windows(starts, 40, share, torch.Generator().manual_seed(0))
+    starts = window_starts(tape(takes), 20, False)
+    drawn = sample_windows(starts, 40, share, torch.Generator().manual_seed(0))
     assert len(drawn) == 40
     assert sum(int(s) in starts[1].tolist() for s in drawn) == 40 * share
 
@@ -220,8 +221,10 @@ def test_windows_with_made_sitting_keep_their_pelvis(takes, monkeypatch, joined)
     config = replace(SMALL, sequences=64, seated_share=0.5, free_share=0.0, joined=joined, augmentation=how)
     one = Trainer(config, tape(made), tape(takes), ABOUT)
     first, length = len(made[0].pose), len(made[1].pose)
-    sitting = [start for start in range(len(one.sits)) if first - config.window < start < first + length]
-    assert one.sits.nonzero().flatten().tolist() == sitting
+    sitting = [
+        start for start in range(len(one.has_sitting)) if first - config.window < start < first + length
+    ]
+    assert one.has_sitting.nonzero().flatten().tolist() == sitting
     batches = []
 
     def recorded(batch, how, generator):
@@ -245,7 +248,7 @@ def test_windows_in_other_postures(takes):
     length, starts = one.config.window, torch.cat(one.starts).sort().values
     assert starts[0] == 0
     assert starts.max() == one.train_tape.starts[-1] - length
-    plain = training.windows(one.train_tape, starts, length)
+    plain = windows(one.train_tape, starts, length)
     orientation, acceleration, relative = one._windows(starts)
     assert torch.equal(orientation[:, :, ROOT], plain[0][:, :, ROOT])
     bones = orientation[:, :, ROOT:] @ relative[:, :, list(BONES[:ROOT])]
@@ -519,7 +522,7 @@ def test_loss_without_accelerations_is_the_poses_alone(takes):
         nothing = torch.zeros(*x.shape[:-1], outputs + 15)
         return nothing, nothing + 1
 
-    batch = training.windows(both.train_tape, torch.tensor([0]), 20)
+    batch = windows(both.train_tape, torch.tensor([0]), 20)
     s = both.statistics
     targets = (training.pose_targets(batch[2], SMALL.network) - s.target_mean) / s.target_std
     torch.testing.assert_close(alone._loss(zero, batch, 0.0), 0.5 * targets.square().mean())
@@ -534,7 +537,7 @@ def test_loss_is_of_what_the_low_pass_gives(takes):
         nothing = torch.zeros(*x.shape[:-1], shape.pose_outputs + 15)
         return nothing, nothing + 1
 
-    batch = training.windows(one.train_tape, torch.tensor([0]), 20)
+    batch = windows(one.train_tape, torch.tensor([0]), 20)
     s = one.statistics
     steady = s.target_mean.expand(1, 20, -1)  # to the root, so it moves as the root does
     smooth = smoothed(steady, batch[0][:, :, ROOT], 0.5)

@@ -45,7 +45,7 @@ def test_a_row_says_what_wearers_cost(rows):
     )
     assert 0.0 < network_us < all_us
     assert 0.0 < p50_ms <= p99_ms
-    assert most == [f"rnn: most that hold {2 if row[-1] == 'yes' else 0}"]
+    assert most == [f"rnn: holds for up to {2 if row[-1] == 'yes' else 0} wearers"]
 
 
 def test_the_curve_is_drawn(rows):

@@ -79,7 +79,7 @@ def follow(recording: Path, protocol: str, out: Path) -> tuple[float, float, Pat
                 heard.recv(65536)
                 process.stdin.write("go\n")
                 process.stdin.flush()
-                begin, end = (float(demo.said(process, word)) for word in ("started", "ended"))
+                begin, end = (float(demo.read_reply(process, word)) for word in ("started", "ended"))
                 while json.loads(heard.recv(65536))["time_s"] < end:
                     pass
             finally:

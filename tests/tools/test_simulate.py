@@ -187,9 +187,9 @@ def one_instant(sensors):
         (
             drop_orientation,
             ["--protocol", "hipnuc"],
-            "head: hipnuc cannot hold its samples: quaternion, acceleration and angular rate are required",
+            "head: hipnuc cannot represent its samples: quaternion, acceleration and angular rate are required",
         ),
-        (one_instant, [], "left_forearm: it needs two instants or more"),
+        (one_instant, [], "left_forearm: needs at least two samples"),
     ],
 )
 def test_a_recording_that_cannot_be_played(recording, tmp_path, change, words, says):
@@ -375,13 +375,13 @@ def test_broken_and_late_packets_and_two_sensors_with_one_id(recording):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["--can", "slcan:x"], "native does not go over CAN"),
+        (["--can", "slcan:x"], "native is not a CAN protocol"),
         (["--protocol", "native-can", "--corrupt", "0.1"], "use --loss"),
-        (["--protocol", "xsens", "--duplicate-id"], "one sensor on a line"),
+        (["--protocol", "xsens", "--duplicate-id"], "one sensor per line"),
         (["--kill", "nose@1..2"], "'nose@1..2' is not SENSOR@T..T"),
         (["--kill", "head"], "'head' is not SENSOR@T..T"),
-        (["--protocol", "native-can", "--can", "slcan:/nowhere"], "slcan:/nowhere: cannot open it"),
-        (["--protocol", "native-can", "--can", "nonsense:x"], "nonsense:x: cannot open it"),
+        (["--protocol", "native-can", "--can", "slcan:/nowhere"], "slcan:/nowhere: cannot be opened"),
+        (["--protocol", "native-can", "--can", "nonsense:x"], "nonsense:x: cannot be opened"),
     ],
 )
 def test_flags_that_mean_nothing(recording, words, says):

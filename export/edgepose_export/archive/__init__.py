@@ -1,1 +1,1 @@
-"""Trained networks as archives, and their cards."""
+"""TorchScript archives of trained networks, and model cards."""

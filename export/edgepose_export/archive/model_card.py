@@ -1,4 +1,4 @@
-"""The page beside each archive: what it is, from which data, how good, how to make it again."""
+"""Model cards: pages beside archives with network, training data, licences, accuracy and commands."""
 
 from __future__ import annotations
 
@@ -7,38 +7,41 @@ from typing import Any
 from edgepose_export.evaluation.uncertainty import EXPECTED
 
 _KINDS = {
-    "birnn": "bidirectional LSTM; the pose of a frame is known once its {future} future frames have come "
+    "birnn": "bidirectional LSTM; the pose of a frame is known once its {future} future frames have arrived "
     "({latency:.0f} ms)",
     "rnn": "unidirectional LSTM; the pose of a frame is known at once",
     "feed-forward": "five dense layers over {past} past and {future} future frames; the pose of a frame is "
-    "known once these have come ({latency:.0f} ms)",
+    "known once these have arrived ({latency:.0f} ms)",
     "wavenet": "dilated convolutions over {past} past frames; the pose of a frame is known at once",
 }
 
 _INPUTS = {
-    "root": "as seen from the pelvis",
-    "tilt": "as seen from the pelvis, with the pelvis' own tilt and acceleration",
-    "heading": "without the pelvis' heading",
-    "sequence": "as seen from the pelvis in the first frame",
+    "root": "in the pelvis frame",
+    "tilt": "in the pelvis frame, with the tilt and acceleration of the pelvis itself",
+    "heading": "without the heading of the pelvis",
+    "sequence": "in the pelvis frame of the first frame",
 }
 
 
 def card(metadata: dict[str, Any]) -> str:
-    """Markdown of an archive's card, made from its metadata alone."""
+    """Return an archive's card as Markdown, made from its metadata alone."""
+    lines = [f"# {metadata['name']}", "", *_summary(metadata), ""]
+    if metadata["measures"]:
+        lines += _accuracy(metadata)
+    return "\n".join([*lines, *_reproduction(metadata), ""])
+
+
+def _summary(metadata: dict[str, Any]) -> list[str]:
+    """Return the list at the top: network, input, targets, training data, licences, version."""
     kind = _KINDS[metadata["kind"]].format(
         past=metadata["past"],
         future=metadata["future"],
         latency=1e3 * metadata["future"] / metadata["rate_hz"],
     )
     training = metadata["training"]
-    several = training.get("checkpoints", 1) > 1
-    mixed = "Bandai-Namco" in training["summary"]
-    bandai = ", and both Bandai-Namco Research motion datasets" if mixed else ""
-    lines = [
-        f"# {metadata['name']}",
-        "",
+    return [
         f"- Network: {kind}; {_size(metadata)}, {metadata['parameters'] / 1e6:.2f} million weights"
-        f"{', rounded by about a hundredth' if metadata.get('rounded') else ''}.",
+        f"{', rounded to about one part in a hundred' if metadata.get('rounded') else ''}.",
         f"- Input: calibrated orientations{' and accelerations' if metadata['acceleration'] else ''} of "
         f"{', '.join(metadata['placements'])} at {metadata['rate_hz']:g} Hz, "
         f"{_INPUTS[metadata['normalisation']]}.",
@@ -46,50 +49,59 @@ def card(metadata: dict[str, Any]) -> str:
         f"{_smoothing(metadata)}.",
         f"- Trained on: {training['summary']}; {training['takes']} takes, {training['hours']:.2f} h, "
         f"{training['steps']} steps{_mean(training)}.",
-        "- Licences of that motion:",
+        "- Licences of the motion data:",
         *(f"  - {text}" for text in training["licenses"]),
-        "- Weights: for non-commercial use wherever a licence above says NC; edgepose's own code is MIT.",
+        "- Weights: for non-commercial use wherever a licence above says NC. The code of edgepose is MIT.",
         f"- Exported by edgepose {metadata['edgepose']}, revision {metadata['revision'] or 'unknown'}.",
+    ]
+
+
+def _accuracy(metadata: dict[str, Any]) -> list[str]:
+    """Return the section with the measures on held-out takes."""
+    lines = [
+        "## Accuracy on held-out motion",
+        "",
+        "Mean ± standard deviation over all frames, with synthetic sensors on held-out takes. Position "
+        "errors are on the default body.",
         "",
     ]
-    if metadata["measures"]:
-        lines += [
-            "## On motion it has never seen",
-            "",
-            "Mean ± deviation over all frames; synthetic sensors on held-out takes, run through this "
-            "archive. Position errors are on the default body.",
-            "",
-        ]
     for part, rows in metadata["measures"].items():
         lines += [f"### {part}", "", *_table(rows), ""]
-    if metadata["measures"]:
-        lines += _deviations(metadata["deviations"])
-        lines += _precisions(metadata["precisions"])
-        lines += [
-            "The parts: `cmu-walk-run` is CMU subjects 07, 08, 09; `cmu-02` is CMU subject 02 (bends, "
-            "punches, sword, washing); `bandai-styles` is Bandai-Namco's styles exhausted and tired. None of "
-            "these takes or styles is in the training set.",
-            "",
-        ]
-    lines += [
-        "## Make it again",
+    return [
+        *lines,
+        *_deviations(metadata["deviations"]),
+        *_precisions(metadata["precisions"]),
+        "The parts: `cmu-walk-run` is CMU subjects 07, 08 and 09; `cmu-02` is CMU subject 02 (bending, "
+        "punching, sword play, washing); `bandai-styles` is Bandai-Namco's styles exhausted and tired. None "
+        "of these takes or styles is in the training set.",
+        "",
+    ]
+
+
+def _reproduction(metadata: dict[str, Any]) -> list[str]:
+    """Return the section with the commands that make the archive."""
+    name = metadata["name"]
+    several = metadata["training"].get("checkpoints", 1) > 1
+    with_bandai = "Bandai-Namco" in metadata["training"]["summary"]
+    bandai = ", and both Bandai-Namco Research motion datasets" if with_bandai else ""
+    return [
+        "## Reproduce",
         "",
         "```",
         "edgepose synthesize MOCAP --out recordings --jobs 2",
-        f"edgepose synthesize MOCAP/{'*_normal_*' if mixed else '*'}.bvh --hold 3 --out recordings/standing",
+        f"edgepose synthesize MOCAP/{'*_normal_*' if with_bandai else '*'}.bvh --hold 3 "
+        "--out recordings/standing",
         *(["edgepose synthesize SOME --seated 1 --out recordings/seated"] if _seated(metadata) else []),
-        f"edgepose train --config {metadata['name']} --data recordings --out runs/{metadata['name']}",
-        f"edgepose export runs/{metadata['name']}/checkpoint.pt {'OTHERS ' * several}--out "
-        f"{metadata['name']}.pt{' --rounded' * metadata.get('rounded', False)} --measure recordings",
+        f"edgepose train --config {name} --data recordings --out runs/{name}",
+        f"edgepose export runs/{name}/checkpoint.pt {'OTHERS ' * several}--out "
+        f"{name}.pt{' --rounded' * metadata.get('rounded', False)} --measure recordings",
         "```",
         "",
-        "MOCAP is a folder with the motion named above. For the shipped models: the BVH files of CMU "
-        f"subjects 01, 02, 03, 05 - 09 and some further takes (cgspeed's conversion){bandai}. The whole "
+        "MOCAP is a folder with the motion data named above. The shipped models use the BVH files of CMU "
+        f"subjects 01, 02, 03, 05 - 09 and a few more takes (cgspeed's conversion){bandai}. The whole "
         "config is in the archive's metadata."
         + (" OTHERS are earlier checkpoints, see docs/research/training-history.md." * several),
-        "",
     ]
-    return "\n".join(lines)
 
 
 _COLUMNS = {
@@ -114,35 +126,36 @@ def _smoothing(metadata: dict[str, Any]) -> str:
     if not metadata["smoothing"]:
         return ""
     return (
-        f"; a low-pass of two poles at {metadata['smoothing']:g} behind the network, over rotations as seen "
-        "from a level pelvis"
+        f"; the network's rotations, in a level pelvis frame, pass a two-pole low-pass filter with poles at "
+        f"{metadata['smoothing']:g}"
     )
 
 
 def _mean(training: dict[str, Any]) -> str:
     count = training.get("checkpoints", 1)
-    return f" in the last of {count} trainings, the mean of whose weights this is" if count > 1 else ""
+    return f" in the last of {count} training runs, whose weights are averaged" if count > 1 else ""
 
 
 def _seated(metadata: dict[str, Any]) -> bool:
-    """Whether the network was trained on made sitting."""
+    """Return whether the network was trained on synthetic sitting."""
     return metadata["training"]["config"].get("seated_share", 0.0) > 0.0
 
 
 def _size(metadata: dict[str, Any]) -> str:
     if metadata["kind"] in ("birnn", "rnn"):
-        return f"{metadata['hidden']} units a direction, two layers"
+        return f"two layers with {metadata['hidden']} units per direction"
     return f"{metadata['hidden']} units in the widest layer"
 
 
 def _deviations(parts: dict[str, dict[str, Any]]) -> list[str]:
-    """How often errors are within the predicted standard deviations, once these are fitted."""
+    """Return the table of how often errors lie within the fitted standard deviations."""
     lines = [
         "### Predicted standard deviations",
         "",
-        "Fitted to the errors on validation takes, a factor a joint. The joints' errors within one and two "
-        f"deviations (expected {100 * EXPECTED[0]:.0f} and {100 * EXPECTED[1]:.0f} %), and the factor that "
-        "would make the deviations right on the part:",
+        "Scaled by one factor per joint, fitted to the errors on the validation takes. The table shows the "
+        "shares of joint errors within one and two standard deviations (expected: "
+        f"{100 * EXPECTED[0]:.0f} and {100 * EXPECTED[1]:.0f} %), and the factor that would still be needed "
+        "to make the standard deviations right.",
         "",
         "| part | within one, % | within two, % | factor | errors |",
         "|---|---|---|---|---|",
@@ -154,11 +167,11 @@ def _deviations(parts: dict[str, dict[str, Any]]) -> list[str]:
 
 
 def _precisions(parts: dict[str, dict[str, Any]]) -> list[str]:
-    """What `run --precision` does to the poses."""
+    """Return the table of the effect of `run --precision` on the poses."""
     lines = [
         "### Precision of the weights",
         "",
-        "As `run` streams: the error against the truth, and how far the poses are from those in f32.",
+        "Streamed as by `edgepose run`: errors against the true poses, and distances to the poses in f32.",
         "",
         "| part | precision | SIP error, deg | hips and shoulders from f32, deg | 10 joints from f32, deg |",
         "|---|---|---|---|---|",

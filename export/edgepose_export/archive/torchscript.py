@@ -1,4 +1,4 @@
-"""Trained weights to a TorchScript archive that runs without edgepose (C++ with libtorch included)."""
+"""Export of trained weights as TorchScript archives, which run without edgepose, even in C++."""
 
 from __future__ import annotations
 
@@ -32,12 +32,13 @@ KINDS: dict[str, type[Network]] = {
     "feed-forward": FeedForward,
     "wavenet": WaveNet,
 }
-"""What trains a network of each kind."""
+"""The module that is trained for each kind of network."""
 
 
 class Statistics(NamedTuple):
-    """Means and standard deviations over the training set: of the inputs, the last 15 being accelerations
-    where the network has them, and of the pose targets.
+    """Means and standard deviations of the inputs and of the pose targets over the training set.
+
+    The last 15 inputs are accelerations, if the network has them.
     """
 
     input_mean: Tensor
@@ -47,17 +48,17 @@ class Statistics(NamedTuple):
 
 
 def new_network(shape: NetworkShape) -> Network:
-    """A network of a shape with random weights."""
+    """Return a network with the given shape and random weights."""
     return KINDS[shape.kind](shape)
 
 
 def build(network: Network, statistics: Statistics, std_scale: Tensor | None = None) -> nn.Module:
-    """The archive's module, in Python.
+    """Return the archive's module, not yet scripted.
 
     Args:
-        network: a trained one.
-        statistics: of what it was trained on.
-        std_scale: (24,) factors of the joints' standard deviations, see `reliability`; ones when None.
+        network: the trained network.
+        statistics: statistics of its training set.
+        std_scale: (24,) factors of the joints' standard deviations, see `uncertainty.scales`; all 1 if None.
     """
     shape = network.shape
     decoder = PoseDecoder(shape, statistics.target_mean, statistics.target_std, std_scale)
@@ -73,12 +74,12 @@ def build(network: Network, statistics: Statistics, std_scale: Tensor | None = N
 def script(
     network: Network, statistics: Statistics, std_scale: Tensor | None = None
 ) -> torch.jit.ScriptModule:
-    """The archive's module, scripted; arguments as in `build`.
+    """Return the archive's scripted module; the arguments are those of `build`.
 
-    It is not frozen: a frozen module could not pack its weights, and gains two percent.
+    It is not frozen: a frozen module could not pack its weights, and would only be two percent faster.
     """
     with warnings.catch_warnings():
-        # TorchScript is deprecated in favour of torch.export; on purpose, see docs/reference/models.md.
+        # TorchScript is deprecated in favour of torch.export; docs/reference/models.md says why it is used.
         warnings.filterwarnings("ignore", message="`torch.jit", category=DeprecationWarning)
         return torch.jit.script(build(network, statistics, std_scale))
 
@@ -86,16 +87,16 @@ def script(
 def save(
     module: torch.jit.ScriptModule, path: Path, metadata: dict[str, object], overwrite: bool = True
 ) -> None:
-    """Writes an archive with its metadata as a JSON extra file.
+    """Write an archive, with its metadata as an extra file in JSON.
 
     Raises:
-        EdgeposeError: it cannot be written.
+        EdgeposeError: the file cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory() as folder, warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="`torch.jit", category=DeprecationWarning)
-            named = Path(folder) / path.name  # the name goes into the file
+            named = Path(folder) / path.name  # torch stores this name in the file
             torch.jit.save(module, str(named), _extra_files={METADATA_FILE: json.dumps(metadata, indent=2)})
             content = named.read_bytes()
     except (OSError, RuntimeError) as error:
@@ -105,7 +106,7 @@ def save(
 
 
 def revision() -> str | None:
-    """The commit of the source tree that this code runs from; None when it was installed as a package."""
+    """Return the commit of the source tree that this code runs from; None for an installed package."""
     root = Path(__file__).parents[3]
     if not (root / ".git").exists():
         return None
@@ -121,14 +122,14 @@ def revision() -> str | None:
 def describe(
     name: str, network: Network, checkpoint: dict[str, Any], past: int, future: int
 ) -> dict[str, Any]:
-    """Metadata of an archive, without measures.
+    """Return an archive's metadata, without measures.
 
     Args:
-        name: of the model.
-        network: whose weights the archive holds.
-        checkpoint: the training run's state.
-        past: default frames before the present one in a window, of a bidirectional network.
-        future: default frames after it.
+        name: name of the model.
+        network: the network in the archive.
+        checkpoint: the state of its training run.
+        past: default number of past frames in a window; used for bidirectional networks only.
+        future: default number of future frames, likewise.
     """
     shape = network.shape
     if not isinstance(network, PoseNetwork):

@@ -1,1 +1,1 @@
-"""Commands that make models; found by the entry-point group `edgepose.commands`."""
+"""Commands that make models, registered in the entry-point group `edgepose.commands`."""

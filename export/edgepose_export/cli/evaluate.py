@@ -1,4 +1,4 @@
-"""`edgepose evaluate`: measures of models on takes with known poses."""
+"""`edgepose evaluate`: accuracy of models on takes with known poses."""
 
 from __future__ import annotations
 
@@ -42,37 +42,39 @@ class _Model(NamedTuple):
     multiple=True,
     default=["birnn"],
     show_default=True,
-    help="Shipped model or an archive's path; may be repeated.",
+    help="Name of a shipped model or path of an archive; may be repeated.",
 )
 @click.option(
-    "--trust", is_flag=True, help="Load --model although its sum is not known: you vouch for the code in it."
+    "--trust",
+    is_flag=True,
+    help="Load --model although its checksum is unknown: you vouch for the code in it.",
 )
 @click.option(
     "--data",
     required=True,
     type=click.Path(path_type=Path, exists=True, file_okay=False),
-    help="Folder that `edgepose synthesize` wrote, or with --part published one of DIP-IMU or TotalCapture.",
+    help="Folder written by `edgepose synthesize`, or of DIP-IMU or TotalCapture with --part published.",
 )
 @click.option(
     "--part",
     "parts",
     multiple=True,
     type=click.Choice(["cmu-walk-run", "cmu-02", "bandai-styles", "validation", "all", "published"]),
-    help="Part of the split, all takes below --data, or the files of DIP-IMU or TotalCapture there as their "
-    "makers publish them; may be repeated  [default: the three held-out parts]",
+    help="Part of the split; all: every take below --data; published: files of DIP-IMU or TotalCapture as "
+    "downloaded; may be repeated  [default: the three held-out parts]",
 )
 @click.option(
     "--online",
     "modes",
     multiple=True,
     type=MODES,
-    help="How a model runs: as `run` runs it, or over whole takes; may be repeated  "
+    help="How a model runs: window or stream as in `run`, offline over whole takes; may be repeated  "
     "[default: all that apply]",
 )
 @click.option("--past", type=click.IntRange(0, 600), help="Past frames of a window  [default: the model's]")
 @click.option("--future", type=click.IntRange(0, 120), help="Future frames  [default: the model's]")
 @click.option(
-    "--baselines", is_flag=True, help="Add trivial baselines, learnt from the training takes below --data."
+    "--baselines", is_flag=True, help="Add trivial baselines, trained on the training takes below --data."
 )
 @click.option(
     "--table",
@@ -84,20 +86,21 @@ class _Model(NamedTuple):
 @click.option(
     "--heat-map",
     type=PICTURE,
-    help="Draw the error against past and future frames (the paper's figure 6) of the one bidirectional "
-    "model, instead of tables.",
+    help="Draw the error of one bidirectional model against past and future frames (the paper's figure 6), "
+    "instead of tables.",
 )
 @click.option(
     "--every",
     type=click.IntRange(1),
+    metavar="N",
     default=1,
     show_default=True,
-    help="Frames from one that the heat map measures to the next; all of them take long.",
+    help="Measure every Nth frame for the heat map; measuring all of them takes long.",
 )
 @click.option(
     "--reliability",
     type=PICTURE,
-    help="Draw actual errors against predicted standard deviations, and print them.",
+    help="Draw and print actual errors against predicted standard deviations.",
 )
 @overwrite_option
 def evaluate(
@@ -116,7 +119,7 @@ def evaluate(
     reliability: Path | None,
     overwrite: bool,
 ) -> None:
-    """Measure models against true poses. Every frame counts, those at the start and end of a take too.
+    """Measure models against true poses. All frames count, including the first and last ones of a take.
 
     \b
     Examples:
@@ -128,13 +131,11 @@ def evaluate(
       edgepose evaluate --data recordings/ --part cmu-walk-run --heat-map window.png --every 10
     """
     if table and (modes or past is not None or future is not None):
-        raise click.UsageError("--table says how models run: leave --online, --past and --future out")
+        raise click.UsageError("--table decides how models run: omit --online, --past and --future")
     if heat_map and (table or histogram or baselines):
-        raise click.UsageError(
-            "--heat-map stands in the place of tables: leave --table, --histogram, --baselines"
-        )
+        raise click.UsageError("--heat-map replaces the tables: omit --table, --histogram and --baselines")
     if heat_map and len(names) > 1:
-        raise click.UsageError("--heat-map is of one model")
+        raise click.UsageError("--heat-map takes one --model")
     from edgepose.analysis.figures import check_picture
     from edgepose_export.training.splits import HELD_OUT
 
@@ -142,7 +143,7 @@ def evaluate(
         if picture:
             check_picture(picture, "drawing", overwrite)
     models = [_model(name, trust, modes, past, future, table) for name in names]
-    if len({model.name for model in models}) < len(models):  # files of one name in several folders
+    if len({model.name for model in models}) < len(models):  # files with the same name in several folders
         models = [model._replace(name=name) for model, name in zip(models, names, strict=True)]
     chosen = parts or HELD_OUT
     if heat_map:
@@ -167,19 +168,19 @@ def _model(
     if about["kind"] != "birnn":
         if future or past or set(modes) - {"stream", "offline"}:
             raise click.UsageError(
-                f"{name} {NO_WINDOW[about['kind']]}: it has no window; use --online stream"
+                f"{name} {NO_WINDOW[about['kind']]} and has no window; use --online stream"
             )
     else:
         about["past"] = about["past"] if past is None else past
         about["future"] = about["future"] if future is None else future
     if table:
-        ways = TABLES[table].modes(about)
+        chosen = TABLES[table].modes(about)
     else:
-        ways = [mode for mode in modes_of(about) if not modes or mode.name in modes]
-    return _Model(path.stem, about, module, ways)
+        chosen = [mode for mode in modes_of(about) if not modes or mode.name in modes]
+    return _Model(path.stem, about, module, chosen)
 
 
-def _named(models: list[_Model], model: _Model, mode: Mode) -> str:
+def _row_name(models: list[_Model], model: _Model, mode: Mode) -> str:
     return f"{model.name}, {mode}" if len(models) > 1 else str(mode)
 
 
@@ -201,12 +202,12 @@ def _tables(
 
     methods: dict[str, evaluation.Method] = {}
     for model in models:
-        ways = evaluation.archive_methods(model.module, model.modes)
-        named = zip(model.modes, ways.values(), strict=True)
-        methods |= {_named(models, model, mode): method for mode, method in named}
+        runs = evaluation.archive_methods(model.module, model.modes).values()
+        for mode, run in zip(model.modes, runs, strict=True):
+            methods[_row_name(models, model, mode)] = run
     if baselines:
-        learnt = learn(evaluation.takes_of(data, "train", labelled("learning baselines")))
-        methods |= evaluation.baseline_methods(learnt)
+        trained = learn(evaluation.takes_of(data, "train", labelled("training baselines")))
+        methods |= evaluation.baseline_methods(trained)
     columns: dict[str, Columns] = evaluation.columns_of_parts(methods, data, parts, labelled("measuring"))
     tables = {part: evaluation.summarise(rows) for part, rows in columns.items()}
     if table:
@@ -227,7 +228,7 @@ def _heat_map(
 ) -> None:
     if model.metadata["kind"] != "birnn":
         raise click.UsageError(
-            f"{model.name} {NO_WINDOW[model.metadata['kind']]}: it has no window to draw a heat map of"
+            f"{model.name} {NO_WINDOW[model.metadata['kind']]}; a heat map needs a bidirectional model"
         )
     from edgepose_export.cli.progress import labelled
     from edgepose_export.evaluation import plots
@@ -238,7 +239,7 @@ def _heat_map(
         takes = takes_of(data, part, labelled(f"measuring {part}"))
         means, frames = window_errors(model.module, takes, HEAT_MAP_FRAMES, HEAT_MAP_FRAMES, every)
         maps[part] = means
-        show(f"\n{part}: SIP error, deg, {frames} frames; rows future, columns past frames")
+        show(f"\n{part}: SIP error, deg, {frames} frames; rows: future frames, columns: past frames")
         for future, row in zip(HEAT_MAP_FRAMES[::-1], means[::-1], strict=True):
             show(f"{future:>6}  " + "  ".join(f"{mean:6.2f}" for mean in row))
         show("        " + "  ".join(f"{past:>6}" for past in HEAT_MAP_FRAMES))
@@ -258,7 +259,7 @@ def _reliability(
     for part in parts:
         for model in models:
             for mode in model.modes:
-                name = _named(models, model, mode)
+                name = _row_name(models, model, mode)
                 takes = takes_of(data, part, labelled("measuring deviations"))
                 pair = rel.errors_and_deviations(model.module, model.metadata, takes, mode)
                 result = results.setdefault(part, {})[name] = rel.reliability(*pair)

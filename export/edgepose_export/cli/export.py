@@ -1,4 +1,4 @@
-"""`edgepose export`: a checkpoint to a TorchScript archive."""
+"""`edgepose export`: TorchScript archives of trained networks."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
@@ -22,11 +22,21 @@ if TYPE_CHECKING:
     import torch
     from numpy.typing import NDArray
 
+    from edgepose_export.archive.torchscript import Network, Statistics
+
     Archive = tuple[torch.jit.ScriptModule, dict[str, Any]]
     """A loaded archive and its metadata."""
 
 
-@click.command(short_help="Make an archive of a trained network.")
+class _Trained(NamedTuple):
+    """A trained network, the statistics of its training set, and the metadata of its archive so far."""
+
+    network: Network
+    statistics: Statistics
+    metadata: dict[str, Any]
+
+
+@click.command(short_help="Export a trained network as an archive.")
 @click.argument(
     "checkpoints", metavar="CHECKPOINT...", nargs=-1, required=True, type=click.Path(path_type=Path)
 )
@@ -34,7 +44,7 @@ if TYPE_CHECKING:
     "--out",
     required=True,
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Archive to write, a .pt file; its card goes beside it as .md.",
+    help="Archive to write, a .pt file; its model card is written beside it as .md.",
 )
 @click.option(
     "--past",
@@ -55,25 +65,25 @@ if TYPE_CHECKING:
     type=click.Choice(PRECISIONS),
     default="f32",
     show_default=True,
-    help="How the archive's weights are kept. An archive in f32 runs anywhere and in any precision (`run "
-    "--precision`); one in int8 is a quarter of the size; one in fp16 is not smaller.",
+    help="Precision of the stored weights. An f32 archive runs on any machine and in any precision (`run "
+    "--precision`); an int8 archive is a quarter of the size; an fp16 archive is not smaller.",
 )
 @click.option(
     "--rounded",
     is_flag=True,
-    help="Round weights by about a hundredth: fp16 then holds the recurrent layers exactly, and the archive "
-    "compresses to two fifths, in a wheel for example.",
+    help="Round weights to about one part in a hundred: fp16 then represents the recurrent layers exactly, "
+    "and the archive compresses to two fifths of its size, in a wheel for example.",
 )
 @click.option(
     "--measure",
     "data",
     type=click.Path(path_type=Path, exists=True, file_okay=False),
-    help="Folder that `edgepose synthesize` wrote: fit the standard deviations to the errors on its "
-    "validation takes, measure the archive on its held-out takes and put the figures into the card.",
+    help="Folder written by `edgepose synthesize`: fit the standard deviations to the errors on its "
+    "validation takes, measure the archive on its held-out takes and add the results to the card.",
 )
 @click.option(
     "--beside",
-    help="Shipped or trusted model whose figures stand beside in the card, with --measure.",
+    help="With --measure: shipped or trusted model to measure for comparison in the card.",
 )
 @overwrite_option
 def export(
@@ -87,11 +97,10 @@ def export(
     beside: str | None,
     overwrite: bool,
 ) -> None:
-    """Turn a checkpoint of `edgepose train` into a TorchScript archive for `edgepose run --model FILE
-    --trust`.
+    """Turn a checkpoint of `edgepose train` into an archive for `edgepose run --model FILE --trust`.
 
-    Of several checkpoints that were trained on from each other (`train --init`), the archive gets the mean
-    weights, which often do better on motion they have not seen than any of them; all else is the first's.
+    Several checkpoints, each trained further from another one (`train --init`), are averaged: mean weights
+    often do better on unseen motion than any of them. Everything else is taken from the first checkpoint.
 
     \b
     Examples:
@@ -99,42 +108,69 @@ def export(
       edgepose export runs/tuned/checkpoint.pt runs/birnn/checkpoint.pt --out my-birnn.pt
     """
     if out.suffix != ".pt":
-        raise click.UsageError("--out is the name of a .pt file")
+        raise click.UsageError("--out must name a .pt file")
     if beside and not data:
-        raise click.UsageError("--beside is for --measure")
+        raise click.UsageError("--beside needs --measure")
     if rounded and precision == "int8":
-        raise click.UsageError("--rounded is not for --precision int8, which rounds in its own way")
+        raise click.UsageError("--rounded does not apply to --precision int8, which rounds by itself")
     if len({path.resolve() for path in checkpoints}) < len(checkpoints):
-        raise click.UsageError("one checkpoint is named twice")
-    beside_it = out.with_suffix(".md")
-    if out.parent.is_dir():  # made with what it is for otherwise
+        raise click.UsageError("a checkpoint is named twice")
+    card_path = out.with_suffix(".md")
+    if out.parent.is_dir():  # otherwise the folder is made when the archive is saved
         check_output(out, "the archive", (".pt",), overwrite)
-        check_output(beside_it, "the card", (".md",), overwrite)
-    import torch
+        check_output(card_path, "the card", (".md",), overwrite)
 
-    from edgepose.inference.archive import find_archive, load, read_info
-    from edgepose.inference.quantisation import pack_weights
     from edgepose_export.archive import torchscript as archive
     from edgepose_export.archive.model_card import card
+
+    others = _load_other(beside) if beside else {}
+    trained = _read(checkpoints, out.stem, past, future, rounded)
+    trained.metadata["precision"] = precision
+    module = _measured_module(trained, data, others, out.name)
+    archive.save(module, out, trained.metadata, overwrite)
+    write_whole(card_path, card(trained.metadata), "the card", overwrite=overwrite)
+    say(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB) and {card_path}")
+
+
+def _load_other(name: str) -> dict[str, Archive]:
+    """Load the model to compare with; return it by its name as it stands in the card."""
+    from edgepose.inference.archive import find_archive, load, read_info
+
+    info = read_info(find_archive(name))
+    return {f"`{name}`": (load(info), info.metadata)}
+
+
+def _read(checkpoints: tuple[Path, ...], name: str, past: int, future: int, rounded: bool) -> _Trained:
+    """Read the checkpoints, average them if there are several, and describe the result."""
+    from edgepose_export.archive import torchscript as archive
     from edgepose_export.evaluation.quantisation import round_weights
-    from edgepose_export.training import trainer as training
+    from edgepose_export.training.checkpoints import mean_of, read_checkpoint
     from edgepose_export.training.config import config_from
 
-    others = {}
-    if beside:
-        info = read_info(find_archive(beside))
-        others = {f"`{beside}`": (load(info), info.metadata)}
-    state = training.mean_of({str(path): training.read_checkpoint(path) for path in checkpoints})
-    config = config_from(json.loads(state["config"]))
-    network = archive.new_network(config.network)
+    state = mean_of({str(path): read_checkpoint(path) for path in checkpoints})
+    network = archive.new_network(config_from(json.loads(state["config"])).network)
     network.load_state_dict(state["averaged"])
     if rounded:
         round_weights(network)
-    statistics = archive.Statistics(**state["statistics"])
-    metadata = archive.describe(out.stem, network, state, past, future)
-    metadata["precision"] = precision
+    metadata = archive.describe(name, network, state, past, future)
     metadata["rounded"] = rounded
     metadata["training"]["checkpoints"] = len(checkpoints)
+    return _Trained(network, archive.Statistics(**state["statistics"]), metadata)
+
+
+def _measured_module(
+    trained: _Trained, data: Path | None, others: Mapping[str, Archive], file_name: str
+) -> torch.jit.ScriptModule:
+    """Return the archive's module.
+
+    With a folder of takes, fit the standard deviations and add the measures to the metadata.
+    """
+    import torch
+
+    from edgepose.inference.quantisation import pack_weights
+    from edgepose_export.archive import torchscript as archive
+
+    network, statistics, metadata = trained
     scale = None
     if data:
         fitted = _std_scale(archive.script(network, statistics), metadata, data)
@@ -145,22 +181,20 @@ def export(
         return archive.script(network, statistics, scale)
 
     module = script()
-    pack_weights(module, precision)
+    pack_weights(module, metadata["precision"])
     if data:
         with TemporaryDirectory() as folder:
-            measured = Path(folder) / out.name
-            archive.save(module, measured, metadata)
-            metadata |= _measures(measured, data, others)
+            path = Path(folder) / file_name
+            archive.save(module, path, metadata)
+            metadata |= _measures(path, data, others)
         metadata["precisions"] = _precisions(script, metadata, data)
-    archive.save(module, out, metadata, overwrite)
-    write_whole(beside_it, card(metadata), "the card", overwrite=overwrite)
-    say(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB) and {beside_it}")
+    return module
 
 
 def _precisions(
     script: Callable[[], torch.jit.ScriptModule], metadata: dict[str, Any], data: Path
 ) -> dict[str, Any]:
-    """What each precision does to the poses on the held-out takes."""
+    """Return the effect of each precision on the poses of the held-out takes."""
     from edgepose_export.cli.progress import labelled
     from edgepose_export.evaluation.evaluate import modes_of
     from edgepose_export.evaluation.quantisation import compare
@@ -171,7 +205,7 @@ def _precisions(
 
 
 def _std_scale(module: torch.jit.ScriptModule, metadata: dict[str, Any], data: Path) -> NDArray[np.float64]:
-    """Factors (24,) of the joints' standard deviations, from the validation takes."""
+    """Fit factors (24,) of the joints' standard deviations to the validation takes."""
     import numpy as np
 
     from edgepose_export.cli.progress import labelled
@@ -187,7 +221,10 @@ def _std_scale(module: torch.jit.ScriptModule, metadata: dict[str, Any], data: P
 
 
 def _measures(path: Path, data: Path, others: Mapping[str, Archive]) -> dict[str, Any]:
-    """Measures and reliability of the archive as a run loads it, with one thread, and measures of others."""
+    """Return measures and reliability of the archive, and measures of the baselines and of other models.
+
+    The archive is loaded as `edgepose run` loads it, with one thread.
+    """
     from edgepose.inference.archive import load, read_info
     from edgepose_export.cli.progress import labelled
     from edgepose_export.evaluation import evaluate as evaluation
@@ -197,8 +234,8 @@ def _measures(path: Path, data: Path, others: Mapping[str, Archive]) -> dict[str
 
     info = read_info(path)
     module, modes = load(info, trust=True), evaluation.modes_of(info.metadata)
-    learnt = learn(evaluation.takes_of(data, "train", labelled("learning baselines")))
-    methods = evaluation.archive_methods(module, modes) | evaluation.baseline_methods(learnt)
+    trained = learn(evaluation.takes_of(data, "train", labelled("training baselines")))
+    methods = evaluation.archive_methods(module, modes) | evaluation.baseline_methods(trained)
     for name, (other, about) in others.items():
         streamed = [mode for mode in evaluation.modes_of(about) if mode.name == "stream"]
         for row, method in evaluation.archive_methods(other, streamed).items():

@@ -1,4 +1,4 @@
-"""`edgepose learn-prior`: what poses people take, from motion capture, for `edgepose solve`."""
+"""`edgepose learn-prior`: a pose prior from motion capture, for `edgepose solve`."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from edgepose.errors import EdgeposeError
 from edgepose.utils.output_targets import check_output
 
 RATE = 6.0
-"""Poses a second that are taken; neighbours say the same."""
+"""Poses per second that are used; neighbouring frames are nearly alike."""
 
 
-@click.command(short_help="Learn from motion capture what poses people take.")
+@click.command(short_help="Learn a pose prior from motion capture.")
 @click.argument("inputs", nargs=-1, required=True, type=click.Path(path_type=Path, exists=True))
 @click.option(
     "--out",
@@ -26,14 +26,14 @@ RATE = 6.0
 @click.option(
     "--about",
     default="",
-    help="What the data are and their licence, kept in the file.  [default: what the files say]",
+    help="Source and licence of the data, stored in the file  [default: taken from the files]",
 )
 @overwrite_option
 def learn_prior(inputs: tuple[Path, ...], out: Path, about: str, overwrite: bool) -> None:
-    """Learn mean, covariance and limits of poses from motion capture (.bvh, .amc, AMASS .npz; folders are
-    searched), for `edgepose solve`.
+    """Learn a pose prior for `edgepose solve` from motion capture (.bvh, .amc, AMASS .npz, or folders).
 
-    Takes that the split of this project holds out stay out, by their names.
+    The prior holds mean, covariance and limits of poses. Takes of the held-out parts, which are recognised by
+    their names, are left out.
 
     \b
     Example:
@@ -57,7 +57,7 @@ def learn_prior(inputs: tuple[Path, ...], out: Path, about: str, overwrite: bool
         try:
             takes = pieces(read_motion(path))
         except EdgeposeError as error:
-            say(f"left out: {error}")
+            say(f"skipped: {error}")
             continue
         for take in takes:
             rows = take.rotations[:: max(1, round(take.rate / RATE))]
@@ -66,4 +66,4 @@ def learn_prior(inputs: tuple[Path, ...], out: Path, about: str, overwrite: bool
     together = np.concatenate(poses).reshape(-1, 72)
     prior = learn(together, about or " and ".join(sorted(sources)))
     save_prior(out, prior, overwrite)
-    say(f"wrote {out}: {len(together)} poses of {len(files)} files; {prior.about}")
+    say(f"wrote {out}: {len(together)} poses from {len(files)} files; {prior.about}")

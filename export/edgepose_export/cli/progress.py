@@ -1,4 +1,4 @@
-"""Progress on a terminal as a bar, elsewhere as a plain line now and then."""
+"""Progress output: a bar on a terminal, otherwise an occasional line."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from edgepose.cli.terminal.messages import say
 T = TypeVar("T")
 
 PLAIN_EVERY_S = 10.0
+"""Least time between two lines, seconds."""
 
 
 def progress(items: Sequence[T], label: str) -> Iterator[T]:
-    """Yields the items and shows on stderr how many are done."""
+    """Yield the items and report on stderr how many are done."""
     if sys.stderr.isatty():
         with click.progressbar(items, label=label, show_pos=True, file=sys.stderr) as bar:
             yield from bar
@@ -31,7 +32,7 @@ def progress(items: Sequence[T], label: str) -> Iterator[T]:
 
 
 def labelled(label: str):  # type: ignore[no-untyped-def]
-    """`progress` with a label, as a function of the items."""
+    """Return `progress` with a fixed label."""
 
     def show(items: Iterable[T]) -> Iterator[T]:
         return progress(list(items), label)

@@ -1,4 +1,4 @@
-"""`edgepose synthesize`: virtual IMU recordings from motion capture."""
+"""`edgepose synthesize`: recordings of virtual IMUs from motion capture."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LICENSES = {
 
 
 class Job(NamedTuple):
-    """What to make of each motion file; fields are the command's flags."""
+    """Settings of a conversion: the command's flags, and the folder that paths are relative to."""
 
     out: Path
     root: Path
@@ -49,7 +49,7 @@ class Job(NamedTuple):
     help="Folder for the recordings (.npz).",
 )
 @click.option(
-    "--rate", type=click.FloatRange(1, 1000), default=60.0, show_default=True, help="Samples a second."
+    "--rate", type=click.FloatRange(1, 1000), default=60.0, show_default=True, help="Samples per second."
 )
 @click.option(
     "--height",
@@ -67,26 +67,26 @@ class Job(NamedTuple):
     type=click.FloatRange(0, 600),
     default=0.0,
     show_default=True,
-    help="Seconds of straight standing before the motion.",
+    help="Seconds of standing straight before the motion.",
 )
 @click.option(
     "--mounting",
     "mounting_seed",
     type=click.IntRange(0),
     metavar="SEED",
-    help="Strap the sensors on at random angles drawn with this seed  [default: along the bones]",
+    help="Strap the sensors on at random angles drawn with this seed  [default: aligned with the bones]",
 )
 @click.option(
     "--seated",
     "seated_seed",
     type=click.IntRange(0),
     metavar="SEED",
-    help="Keep only the upper bodies: play each to and fro while the wearer stands, sits, squats and rises "
-    "as drawn with this seed; half a minute a take",
+    help="Keep only the motion of the upper body, play it to and fro, and let the wearer sit down, squat and "
+    "rise at random, drawn with this seed; about half a minute per take.",
 )
 @overwrite_option
 @click.option(
-    "--jobs", type=click.IntRange(1), default=1, show_default=True, help="Files to work on at once."
+    "--jobs", type=click.IntRange(1), default=1, show_default=True, help="Files to process in parallel."
 )
 def synthesize(
     inputs: tuple[Path, ...],
@@ -102,8 +102,8 @@ def synthesize(
 ) -> None:
     """Make IMU recordings with true poses from motion capture (.bvh, .amc, AMASS .npz; folders are searched).
 
-    Training reads them with the default flags. A recording with --hold can be calibrated and run like a real
-    one.
+    Recordings made with the default flags are for training. One made with --hold can be calibrated and run
+    like a real one.
 
     \b
     Examples:
@@ -116,42 +116,48 @@ def synthesize(
     from edgepose_export.cli.progress import progress
 
     if body_path and height:
-        raise click.UsageError("--body has a height of its own: leave --height out")
+        raise click.UsageError("--body sets the height: omit --height")
     body = read_smpl(body_path) if body_path else default_body(height or 1.75)
     files = [(root, path) for root in inputs for path in motion_files(root)]
     if not files:
         raise EdgeposeError(f"no motion files ({', '.join(KINDS)}) in {', '.join(map(str, inputs))}")
-    how = (rate, body, hold, mounting_seed, seated_seed, overwrite)
-    tasks = [(path, Job(out, root if root.is_dir() else root.parent, *how)) for root, path in files]
+    flags = (rate, body, hold, mounting_seed, seated_seed, overwrite)
+    tasks = [(path, Job(out, root if root.is_dir() else root.parent, *flags)) for root, path in files]
     _check_targets(tasks, overwrite)
     failed = []
     with ExitStack() as stack:
         if jobs == 1:
             results = [partial(convert, *task) for task in tasks]
         else:
-            # Not forked: a copy of a process with threads may hang.
+            # Spawned, because a forked copy of a process with threads may hang.
             pool = stack.enter_context(ProcessPoolExecutor(jobs, mp_context=get_context("spawn")))
             results = [pool.submit(convert, *task).result for task in tasks]
         for result, (_, path) in progress(list(zip(results, files, strict=True)), "synthesizing"):
             problem = result()
             if problem:
                 failed.append(path)
-                say(f"left out: {problem}")
+                say(f"skipped: {problem}")
     say(f"{len(files) - len(failed)} of {len(files)} recordings written to {out}")
     if failed:
         raise EdgeposeError(
-            f"{len(failed)} of {len(files)} files could not be converted; they are named above"
+            f"{len(failed)} of {len(files)} files could not be converted; see the messages above"
         )
 
 
 def _check_targets(tasks: list[tuple[Path, Job]], overwrite: bool) -> None:
-    """Raises EdgeposeError if two files would become one recording, such as a take's .amc and .bvh, or if a
-    recording is there already and not to be overwritten."""
+    """Check that no recording would overwrite another file.
+
+    Raises:
+        EdgeposeError: two files would become one recording, such as a take's .amc and .bvh; or a recording
+            exists and may not be overwritten.
+    """
     seen: dict[Path, Path] = {}
     for path, job in tasks:
         target = job.out / path.relative_to(job.root).with_suffix(".npz")
         if target in seen:
-            raise EdgeposeError(f"{seen[target]} and {path} would both become {target}; give one of them")
+            raise EdgeposeError(
+                f"{seen[target]} and {path} would both become {target}; give only one of them"
+            )
         if target.resolve() == path.resolve():
             raise EdgeposeError(f"{path} would be overwritten by its recording; give another --out")
         seen[target] = path
@@ -161,7 +167,7 @@ def _check_targets(tasks: list[tuple[Path, Job]], overwrite: bool) -> None:
 
 
 def _target(path: Path, job: Job, part: str) -> Path:
-    """The recording of a motion file, or of a part of it."""
+    """Return the path of the recording made of a motion file, or of a part of it."""
     from edgepose_export.training.dataset import SEATED
 
     kind = "" if job.seated_seed is None else SEATED
@@ -169,14 +175,14 @@ def _target(path: Path, job: Job, part: str) -> Path:
 
 
 def motion_files(root: Path) -> list[Path]:
-    """The motion files below a folder, or the file itself."""
+    """Return the motion files below a folder, or the file itself."""
     if root.is_file():
         return [root]
     return sorted(path for path in root.rglob("*") if path.suffix.lower() in KINDS)
 
 
 def convert(path: Path, job: Job) -> str | None:
-    """Converts one file, in parts where its source jumps; what was wrong with it, or None."""
+    """Convert one file, cut into parts where the source jumps; return what was wrong with it, or None."""
     import numpy as np
 
     from edgepose_export.mocap import pieces, read_motion, resample
@@ -192,11 +198,11 @@ def convert(path: Path, job: Job) -> str | None:
         mounting = None if job.mounting_seed is None else random_mounting(job.mounting_seed)
         takes = pieces(read_motion(path))
         if not takes:
-            return f"{path}: shorter than a second between jumps"
+            return f"{path}: no part between two jumps is as long as a second"
         for i, take in enumerate(takes):
             motion = resample(take, job.rate)
             if job.seated_seed is not None:
-                # Each take has its own draw, whatever others are made with it.
+                # Seeded by name, so that a take does not depend on the others in the call.
                 rng = np.random.default_rng([job.seated_seed, i, *path.stem.encode()])
                 motion = seated(motion, job.body, rng)
             if job.hold_s:

@@ -1,4 +1,4 @@
-"""`edgepose train`: trains or fine-tunes a network."""
+"""`edgepose train`: training and fine-tuning of a network."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ def _config_path(name: str) -> Path:
     "--config",
     required=True,
     metavar="NAME|FILE",
-    help="Shipped config, e.g. birnn, rnn, dip-birnn (docs/research/training.md lists all), or a TOML file.",
+    help="Shipped config, such as birnn or dip-rnn (docs/research/training.md lists all), or a TOML file.",
 )
 @click.option(
     "--data",
     required=True,
     type=click.Path(path_type=Path, exists=True, file_okay=False),
-    help="Folder that `edgepose synthesize` wrote.",
+    help="Folder written by `edgepose synthesize`.",
 )
 @click.option(
     "--out",
@@ -39,7 +39,7 @@ def _config_path(name: str) -> Path:
     type=click.Path(path_type=Path, file_okay=False),
     help="Folder for checkpoints and the log.",
 )
-@click.option("--resume", is_flag=True, help="Go on from the checkpoint in --out.")
+@click.option("--resume", is_flag=True, help="Continue from the checkpoint in --out.")
 @click.option(
     "--init", type=click.Path(path_type=Path), help="Start from this checkpoint's weights (fine-tuning)."
 )
@@ -47,15 +47,15 @@ def _config_path(name: str) -> Path:
 @click.option(
     "--cache",
     type=click.Path(path_type=Path, file_okay=False),
-    help="Folder for the takes packed into files, 1152 bytes a frame, which are mapped instead of read: for "
-    "more motion than memory  [default: everything in memory]",
+    help="Folder for packed takes, 1152 bytes per frame, which are memory-mapped instead of read: for more "
+    "motion than fits into memory  [default: everything in memory]",
 )
 @click.option(
     "--threads",
     type=click.IntRange(1),
     default=2,
     show_default=True,
-    help="Processor threads of each process.",
+    help="CPU threads of each process.",
 )
 def train(
     config: str,
@@ -67,9 +67,9 @@ def train(
     cache: Path | None,
     threads: int,
 ) -> None:
-    """Train a network on synthetic recordings. Ctrl-C loses at most the steps since the last checkpoint.
+    """Train a network on synthetic recordings. Ctrl-C loses only the steps since the last checkpoint.
 
-    Several processes, each with its share of the takes, train together when torchrun starts them.
+    Several processes started by torchrun train together, each with its share of the takes.
 
     \b
     Examples:
@@ -79,9 +79,7 @@ def train(
       torchrun --nproc-per-node 4 -m edgepose train --config birnn --data recordings/ --out runs/birnn
     """
     if resume and init:
-        raise click.UsageError(
-            "--resume goes on with a run, --init begins one from other weights: give one of them"
-        )
+        raise click.UsageError("--resume continues a run, --init starts a new one: give only one of them")
     from dataclasses import replace
 
     import torch
@@ -96,7 +94,7 @@ def train(
     checkpoint = out / training.CHECKPOINT
     if not resume and checkpoint.exists():
         raise EdgeposeError(
-            f"{checkpoint}: there is a run already; go on with --resume or choose another --out"
+            f"{checkpoint}: already exists; continue that run with --resume or choose another --out"
         )
     torch.set_num_threads(threads)
     with joined() as processes:
@@ -115,19 +113,19 @@ def _train(  # type: ignore[no-untyped-def]
     ]
     about = training.describe_tape(parts[0], processes)
     trainer = training.Trainer(settings, *parts, about, processes)
-    tell = say if processes.rank == 0 else lambda text: None
-    tell(f"training on {about['takes']} takes, {about['hours']:.2f} h: {about['summary']}")
+    report = say if processes.rank == 0 else lambda text: None
+    report(f"training on {about['takes']} takes, {about['hours']:.2f} h: {about['summary']}")
     out.mkdir(parents=True, exist_ok=True)
     if resume:
         trainer.load(training.read_checkpoint(out / training.CHECKPOINT))
-        tell(f"going on at step {trainer.step}")
+        report(f"continuing at step {trainer.step}")
     if init:
         trainer.start_from(training.read_checkpoint(init))
-    _fit(trainer, out, tell)
+    _fit(trainer, out, report)
 
 
 def _tape(paths: list[Path], processes, cache: Path | None):  # type: ignore[no-untyped-def]
-    """A process's takes, in memory or packed into a folder of the process's own."""
+    """Return the takes of this process, in memory or packed into a folder of its own."""
     from edgepose_export.cli.progress import labelled
     from edgepose_export.training.dataset import read_take, tape
     from edgepose_export.training.memory_map import packed_tape
@@ -139,18 +137,18 @@ def _tape(paths: list[Path], processes, cache: Path | None):  # type: ignore[no-
     return packed_tape(paths, cache / f"{processes.rank + 1}-of-{processes.size}", show)
 
 
-def _fit(trainer, out: Path, tell: Callable[[str], None]) -> None:  # type: ignore[no-untyped-def]
+def _fit(trainer, out: Path, report: Callable[[str], None]) -> None:  # type: ignore[no-untyped-def]
     from edgepose_export.training.trainer import fit
 
     config = trainer.config
     started, first = time.monotonic(), trainer.step
 
-    def line(step: int, loss: float, validation: float) -> None:
-        spent = time.monotonic() - started
-        speed = (step - first) * config.sequences * config.window / spent
-        left = (config.steps - step) * spent / (step - first) / 60
+    def report_validation(step: int, loss: float, validation: float) -> None:
+        elapsed = time.monotonic() - started
+        speed = (step - first) * config.sequences * config.window / elapsed
+        left = (config.steps - step) * elapsed / (step - first) / 60
         clear_bar()
-        tell(
+        report(
             f"step {step} of {config.steps}: loss {loss:.4f}, "
             f"validation {validation:.4f}, {speed / 1e3:.1f} k frames/s, {left:.0f} min left"
         )
@@ -158,4 +156,4 @@ def _fit(trainer, out: Path, tell: Callable[[str], None]) -> None:  # type: igno
     hidden = trainer.processes.rank > 0 or not sys.stderr.isatty()
     with click.progressbar(length=config.steps, label="training", file=sys.stderr, hidden=hidden) as bar:
         bar.update(first)
-        fit(trainer, out, lambda step, loss: bar.update(1), line)
+        fit(trainer, out, lambda step, loss: bar.update(1), report_validation)

@@ -1,7 +1,7 @@
-"""Readers for real recordings with true poses, as their makers publish them.
+"""Readers for published recordings of real sensors with true poses.
 
-Nobody may pass these data on: a user gets them from their makers and has a licence. What a reader needs to
-know of a layout comes from its makers and users; the readers' tests make small files of the same layout.
+The licences forbid redistribution, so users download these datasets themselves. The layouts are known from
+the publications and from code that uses them; the readers' tests make small files of the same layout.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ __all__ = ["read_dip", "read_published", "read_totalcapture", "read_vicon"]
 
 
 def read_published(folder: Path) -> Iterator[Take]:
-    """All takes below a folder: DIP's .pkl files, or, where there are any, TotalCapture's .sensors files.
+    """Yield all takes below a folder, from TotalCapture's .sensors files or else from DIP's .pkl files.
 
-    The true pose of TotalCapture's .sensors is DIP's .pkl of the same name, wherever below the folder, or
-    where there is none Vicon's `gt_skel_gbl_ori.txt` in a folder of the take's name.
+    The true poses of a .sensors file are in DIP's .pkl of the same name, anywhere below the folder, or else
+    in Vicon's `gt_skel_gbl_ori.txt` in a folder with the take's name.
 
     Raises:
-        EdgeposeError: there is none, or one of them is broken.
+        EdgeposeError: the folder has no such file, or one of them is broken.
     """
     pickles = sorted(folder.rglob("*.pkl"))
-    # A take may lie there twice, with and without the magnetometers; the orientations are the same.
+    # A take may be there twice, with and without magnetometers; its orientations are the same in both.
     sensors = {take_name(path): path for path in sorted(folder.rglob("*.sensors"))}
     if sensors:
         truth = {take_name(path): path for path in sorted(folder.rglob(ORIENTATIONS))}

@@ -1,4 +1,4 @@
-"""DIP's pickles as takes; their layout is that of `edgepose.formats.recordings.dip_imu`."""
+"""Reader for takes in DIP's pickles; see `edgepose.formats.recordings.dip_imu` for their layout."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ LICENSE = "DIP-IMU (dip.is.tue.mpg.de), for non-commercial scientific research"
 
 
 def read_dip(path: Path) -> Take:
-    """A take of DIP-IMU, or of TotalCapture as DIP's authors publish it; 60 frames a second.
+    """Read a take of DIP-IMU, or of TotalCapture as DIP's authors publish it, at 60 frames per second.
 
-    Frames in which a sensor is missing have its values of the nearest frame.
+    A sensor that is missing in a frame gets its values of the nearest frame.
 
     Raises:
-        EdgeposeError: not such a file.
+        EdgeposeError: the file is not of this kind.
     """
     take = dip_imu.read_dip(path)
     return Take(

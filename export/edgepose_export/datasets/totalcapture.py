@@ -1,8 +1,9 @@
 """Reader for TotalCapture's own files (cvssp.org/data/totalcapture): Xsens sensors and their calibration.
 
-What the sensors say is read by `totalcapture`. `sN_NAME_calib_imu_ref.txt` and `_bone.txt`: the
-number of sensors, then name and quaternion x y z w of inertial to global frame, and of sensor to bone; both
-are those of `vicon`. True poses are DIP's SMPL poses, which end with the sensors, or else TotalCapture's own.
+`edgepose.formats.recordings.totalcapture` reads the sensors' readings. The calibration is in
+`sN_NAME_calib_imu_ref.txt` (inertial to global frame) and `sN_NAME_calib_imu_bone.txt` (sensor to bone): the
+number of sensors, then for each its name and a quaternion x y z w. Global frame and bones are those of
+`vicon`. True poses are DIP's SMPL poses, whose last frame is that of the sensors, or else TotalCapture's own.
 """
 
 from __future__ import annotations
@@ -28,19 +29,21 @@ Array = NDArray[np.float64]
 
 LICENSE = "TotalCapture (cvssp.org/data/totalcapture), for non-commercial research"
 
-_APART = 30.0  # degrees; sensors and Vicon of one take are 2 to 8 apart in the median, a user of both found
+_MAX_DISTANCE_DEG = (
+    30.0  # between sensors and Vicon of one take; medians of 2 to 8 are reported for real ones
+)
 
 
 def read_totalcapture(path: Path, folder: Path, truth: Mapping[str, Path]) -> Take:
-    """One take of Xsens sensors, 60 frames a second.
+    """Read a take of Xsens sensors, at 60 frames per second.
 
     Args:
-        path: `NAME_Xsens_AuxFields.sensors` in a folder of its subject, `s1` to `s5`.
-        folder: below which the calibrations lie.
+        path: `NAME_Xsens_AuxFields.sensors` in the folder of its subject, `s1` to `s5`.
+        folder: folder that is searched for the calibration files.
         truth: DIP's pickles or TotalCapture's `gt_skel_gbl_ori.txt`, by `take_name`.
 
     Raises:
-        EdgeposeError: a file is missing or broken; says which and where.
+        EdgeposeError: a file is missing or broken; names the file and the line.
     """
     name = take_name(path)
     readings = read_sensors(path)
@@ -51,8 +54,8 @@ def read_totalcapture(path: Path, folder: Path, truth: Mapping[str, Path]) -> Ta
     bones = _calibration(folder, f"{name}_calib_imu_bone.txt")
     if name not in truth:
         raise EdgeposeError(
-            f"{path}: no {name}.pkl with the true poses, which DIP's authors publish, and no "
-            f"{name.replace('_', '/')}/gt_skel_gbl_ori.txt of TotalCapture's own"
+            f"{path}: needs the true poses: {name}.pkl from DIP's authors, or "
+            f"{name.replace('_', '/')}/gt_skel_gbl_ori.txt of TotalCapture"
         )
     to_body = BODY_FROM_GLOBAL @ refs
     r_tb = to_body @ orientation @ rot.transpose(bones) @ THEIR_BONE_FROM_OURS
@@ -68,9 +71,9 @@ def read_totalcapture(path: Path, folder: Path, truth: Mapping[str, Path]) -> Ta
 
 
 def take_name(path: Path) -> str:
-    """Subject and action, such as `s1_acting1`, of a file of sensors or of Vicon's.
+    """Return subject and action, such as `s1_acting1`, of a sensor file or of a Vicon file.
 
-    They are called `s1/acting1_Xsens_AuxFields.sensors` or `s1_acting1_Xsens.sensors`, and
+    Sensor files are called `s1/acting1_Xsens_AuxFields.sensors` or `s1_acting1_Xsens.sensors`, Vicon files
     `S1/acting1/gt_skel_gbl_ori.txt`.
     """
     stem = path.stem if path.suffix == ".sensors" else path.parent.name
@@ -82,7 +85,7 @@ def take_name(path: Path) -> str:
 
 
 def _true_pose(path: Path, r_tb: Array) -> tuple[Array, slice]:
-    """Local rotations (T, 24, 3, 3) of DIP's or of Vicon's file, and the frames of both that are the same."""
+    """Return local rotations (T, 24, 3, 3) from either file, and the frames shared with the sensors."""
     if path.suffix == ".pkl":
         pose = read_true_pose(path)
         return pose, slice(-min(len(pose), len(r_tb)), None)
@@ -91,24 +94,25 @@ def _true_pose(path: Path, r_tb: Array) -> tuple[Array, slice]:
 
 
 def _shared_frames(path: Path, r_tb: Array, true: Array) -> slice:
-    """The first or the last frames of two (T, 6, 3, 3) of one take, if one has more.
+    """Return the frames that two recordings (T, 6, 3, 3) of a take share: the first or the last ones.
 
-    Some users of the data leave out what is more at the end, others at the start; the orientations decide.
+    Users of the data disagree on whether the longer one is cut at its start or its end, so the orientations
+    decide.
     """
     frames = min(len(r_tb), len(true))
     choices = (slice(-frames, None), slice(frames))
-    apart = [np.median(rot.geodesic_angle(r_tb[part], true[part]), axis=0).mean() for part in choices]
-    best = int(np.argmin(apart))
-    if apart[best] > np.radians(_APART):
+    distances = [np.median(rot.geodesic_angle(r_tb[part], true[part]), axis=0).mean() for part in choices]
+    best = int(np.argmin(distances))
+    if distances[best] > np.radians(_MAX_DISTANCE_DEG):
         raise EdgeposeError(
-            f"{path}: its bones are {np.degrees(apart[best]):.0f} degrees from what the sensors say; "
-            f"it belongs to another take, or is not laid out as TotalCapture's"
+            f"{path}: its bones are {np.degrees(distances[best]):.0f} degrees off the sensors; "
+            f"it belongs to another take, or its layout is not TotalCapture's"
         )
     return choices[best]
 
 
 def _calibration(folder: Path, name: str) -> Array:
-    """Rotations (6, 3, 3) in a calibration file anywhere below a folder."""
+    """Read rotations (6, 3, 3) from a calibration file, anywhere below a folder."""
     path = next(iter(sorted(p for p in folder.rglob("*.txt") if p.name.lower() == name)), None)
     if path is None:
         raise EdgeposeError(f"{folder}: no {name}, the calibration of these sensors")

@@ -1,1 +1,1 @@
-"""How good models are."""
+"""Accuracy of models: baselines, measures, tables, plots."""

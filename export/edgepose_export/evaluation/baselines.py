@@ -1,4 +1,4 @@
-"""Trivial answers that a network must beat: they stand beside every result."""
+"""Trivial baselines that a network must beat, shown with every result."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ Array = NDArray[np.float64]
 NEIGHBOURS = 8
 
 MOST_FRAMES = 50_000
-"""Training frames that the nearest neighbours are looked for in, spread evenly: 55 MB."""
+"""Training frames, evenly spaced, among which nearest neighbours are searched: 55 MB."""
 
 _BETWEEN = {
-    # unobserved joint: (nearest sensors' bones along the body, share of the way from the first to the second)
+    # joint without a sensor: (the two nearest bones with one, share of the way from the first to the second)
     1: (0, 4, 1 / 2), 2: (0, 5, 1 / 2),
     3: (0, 15, 1 / 5), 6: (0, 15, 2 / 5), 9: (0, 15, 3 / 5), 12: (0, 15, 4 / 5),
     13: (0, 15, 3 / 5), 14: (0, 15, 3 / 5),
     16: (9, 18, 1 / 2), 17: (9, 19, 1 / 2),
 }  # fmt: skip
-"""Thighs halfway between pelvis and shank, trunk and neck in equal steps from pelvis to head, collars with
-the chest, upper arms halfway between chest and forearm."""
+"""Thighs are halfway between pelvis and shank, trunk and neck in equal steps from pelvis to head, collars
+like the chest, upper arms halfway between chest and forearm."""
 
 
 def _measured(take: Take) -> Array:
-    """Global rotations (T, 24, 3, 3) in T with the measured bones in place, the rest undefined."""
+    """Return global rotations (T, 24, 3, 3) in T: those of the measured bones; the others are NaN."""
     poses = np.full((len(take.orientation), 24, 3, 3), np.nan)
     poses[:, list(BONES)] = take.orientation
     return poses
 
 
 def _local(poses: Array) -> Array:
-    """Local rotations of global ones; feet, toes, wrists and hands first take their parents' rotation."""
+    """Convert global rotations to local ones, with feet, toes, wrists and hands at rest."""
     for joint, parent in enumerate(PARENTS):
         if JOINTS[joint].endswith(("ankle", "foot", "wrist", "hand")):
             poses[:, joint] = poses[:, parent]
@@ -50,11 +50,11 @@ def _local(poses: Array) -> Array:
 
 
 def interpolated(take: Take, offsets: Array | None = None) -> Array:
-    """Local poses (T, 24, 3, 3): measured bones, the others interpolated from the nearest sensors.
+    """Return local poses (T, 24, 3, 3): measured bones, and the others interpolated from the nearest sensors.
 
     Args:
-        take: whose sensors are used.
-        offsets: (24, 3, 3) turned in behind each interpolated rotation, see `Baselines.offsets`.
+        take: the take whose sensors are used.
+        offsets: (24, 3, 3) right factors for the interpolated rotations, see `Baselines.offsets`.
     """
     poses = _measured(take)
     for joint, (first, second, share) in sorted(_BETWEEN.items(), key=lambda item: item[0]):
@@ -66,13 +66,13 @@ def interpolated(take: Take, offsets: Array | None = None) -> Array:
 
 
 class Baselines(NamedTuple):
-    """What the baselines know of the training takes.
+    """The training data of the baselines.
 
     Attributes:
         mean_pose: (24, 3, 3) mean local rotations.
-        offsets: (24, 3, 3) mean rotation from each interpolated joint's guess to its truth, in its frame.
+        offsets: (24, 3, 3) mean rotation from each interpolated joint to the true one, in its own frame.
         inputs: (N, 60) float32 network inputs of single frames, at most `MOST_FRAMES`.
-        poses: (N, 24, 3, 3) float32 their local rotations.
+        poses: (N, 24, 3, 3) float32 local rotations of these frames.
     """
 
     mean_pose: Array
@@ -82,7 +82,7 @@ class Baselines(NamedTuple):
 
 
 def learn(takes: Iterable[Take], every: int = 10) -> Baselines:
-    """Means over every tenth frame of the training takes, and single frames; one take in memory at a time."""
+    """Compute means over every tenth frame of the training takes and keep single frames, a take at a time."""
     sums, count = np.zeros((2, 24, 3, 3)), 0
     kept: list[tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]] = []
     seen, stride = 0, 1
@@ -112,15 +112,15 @@ def _globals(local: Array) -> Array:
     return forward_kinematics(local, np.zeros((24, 3)))[0]
 
 
-def _still(pose: Array, take: Take) -> Array:
-    """One local pose (24, 3, 3) for every frame of a take, turned as the pelvis sensor is."""
+def _constant(pose: Array, take: Take) -> Array:
+    """Return one local pose (24, 3, 3) for every frame of a take, oriented as the pelvis sensor is."""
     poses = np.tile(pose, (len(take.orientation), 1, 1, 1))
     poses[:, 0] = take.orientation[:, ROOT]
     return poses
 
 
 def with_measured_bones(take: Take, pose: Array) -> Array:
-    """Local poses (T, 24, 3, 3): measured bones, all other joints as in a local pose (24, 3, 3)."""
+    """Return local poses (T, 24, 3, 3): measured bones, all other joints as in a local pose (24, 3, 3)."""
     poses = _measured(take)
     for joint, parent in enumerate(PARENTS):
         if joint not in BONES:
@@ -128,29 +128,29 @@ def with_measured_bones(take: Take, pose: Array) -> Array:
     return local_from_global(poses)
 
 
-def nearest(take: Take, learnt: Baselines) -> Array:
-    """Local poses (T, 24, 3, 3): the mean of the training frames whose inputs are nearest, frame by frame."""
-    scale = learnt.inputs.std(0).clip(1e-3)
-    known = torch.from_numpy(learnt.inputs / scale)
+def nearest(take: Take, trained: Baselines) -> Array:
+    """Return local poses (T, 24, 3, 3): means of the training frames with the nearest inputs."""
+    scale = trained.inputs.std(0).clip(1e-3)
+    known = torch.from_numpy(trained.inputs / scale)
     rows = []
     for part in torch.from_numpy(_inputs(take) / scale).split(256):
         distances = torch.cdist(part, known)
         rows.append(distances.topk(min(NEIGHBOURS, len(known)), largest=False).indices)
-    poses = rot.nearest_rotation(learnt.poses[torch.cat(rows).numpy()].astype(float).mean(1))
+    poses = rot.nearest_rotation(trained.poses[torch.cat(rows).numpy()].astype(float).mean(1))
     poses[:, 0] = take.orientation[:, ROOT]
     return poses
 
 
 METHODS: dict[str, Callable[[Take, Baselines], Array]] = {
-    "mean pose": lambda take, learnt: _still(learnt.mean_pose, take),
-    "frozen calibration pose": lambda take, _: _still(local_from_global(straight_pose()), take),
-    "measured bones, others' mean local pose": lambda take, learnt: with_measured_bones(
-        take, learnt.mean_pose
+    "mean pose": lambda take, trained: _constant(trained.mean_pose, take),
+    "frozen calibration pose": lambda take, _: _constant(local_from_global(straight_pose()), take),
+    "measured bones, others' mean local pose": lambda take, trained: with_measured_bones(
+        take, trained.mean_pose
     ),
     "measured bones, others interpolated": lambda take, _: interpolated(take),
-    "measured bones, others interpolated + mean offsets": lambda take, learnt: interpolated(
-        take, learnt.offsets
+    "measured bones, others interpolated + mean offsets": lambda take, trained: interpolated(
+        take, trained.offsets
     ),
     f"{NEIGHBOURS} nearest neighbours of the frame": nearest,
 }
-"""Local poses (T, 24, 3, 3) of each baseline, by its name; all of them know the root's orientation."""
+"""Functions that return local poses (T, 24, 3, 3), by the baseline's name; all use the root's orientation."""

@@ -1,4 +1,4 @@
-"""Measures of an exported archive on takes with known poses, run the way `edgepose run` runs it."""
+"""Accuracy of an archive on takes with known poses, run the way `edgepose run` runs it."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ Array = NDArray[np.float64]
 Tensors = tuple[torch.Tensor, torch.Tensor]
 
 BATCH = 512
-"""Windows run at once."""
+"""Windows that run together."""
 
 GROUP = 64
-"""Takes run at once, and in memory."""
+"""Takes that run together and are in memory at the same time."""
 
 Progress = Callable[[list[Path]], Iterable[Path]]
 
 
 class Mode(NamedTuple):
-    """How an archive is run: "offline" (the whole take), "window" or "stream"; past and future frames."""
+    """A way to run an archive: "offline" (whole takes), "window" or "stream"; past and future frames."""
 
     name: str
     past: int = 0
     future: int = 0
 
     def __str__(self) -> str:
-        """For a person."""
+        """Return the name shown in tables."""
         if self.name == "offline":
             return "offline, whole take"
         if self.name == "window":
@@ -46,7 +46,7 @@ class Mode(NamedTuple):
 
 
 def modes_of(metadata: dict[str, Any]) -> list[Mode]:
-    """The ways in which an archive is worth measuring."""
+    """Return the modes in which an archive is measured."""
     past, future = metadata["past"], metadata["future"]
     if metadata["kind"] != "birnn":
         return [Mode("stream", 0, future), Mode("offline")]
@@ -57,12 +57,12 @@ def modes_of(metadata: dict[str, Any]) -> list[Mode]:
 
 
 def run_archive(module: torch.jit.ScriptModule, takes: list[Take], mode: Mode) -> list[Array]:
-    """Local poses (T, 24, 3, 3) of each take; every frame gets one, as in a run."""
+    """Return local poses (T, 24, 3, 3) for each take, one for every frame, as in a run."""
     return [poses for poses, _ in run_with_std(module, takes, mode)]
 
 
 def run_with_std(module: torch.jit.ScriptModule, takes: list[Take], mode: Mode) -> list[tuple[Array, Array]]:
-    """Local poses (T, 24, 3, 3) of each take and their standard deviations (T, 24), rad."""
+    """Return local poses (T, 24, 3, 3) and their standard deviations (T, 24), rad, for each take."""
     with torch.inference_mode():
         if mode.name == "stream":
             results = _stream(module, takes, mode.future)
@@ -87,7 +87,7 @@ def _offline(
 
 
 def _stream(module: torch.jit.ScriptModule, takes: list[Take], future: int) -> list[Tensors]:
-    """Frame by frame, all takes side by side as if each were a wearer, the longest first."""
+    """Run frame by frame, with all takes side by side as if each were a wearer, the longest first."""
     order = sorted(range(len(takes)), key=lambda i: -len(takes[i].pose))
     lengths = [len(takes[i].pose) for i in order]
     outputs: list[list[Tensors]] = [[] for _ in order]
@@ -113,17 +113,17 @@ def _stream(module: torch.jit.ScriptModule, takes: list[Take], future: int) -> l
 
 
 def _wearers(state: list[torch.Tensor], rows: slice) -> list[torch.Tensor]:
-    """The state of some wearers; the tensor without wearers, whose length is `future`, is common to all."""
+    """Return the state of some wearers; the tensor whose length is `future` is shared by all of them."""
     return [s if s.dim() == 1 else s[rows] for s in state]
 
 
 def run_windows(
     module: torch.jit.ScriptModule, take: Take, frames: NDArray[np.intp], past: int, future: int
 ) -> Tensors:
-    """Poses (N, 24, 3, 3) and deviations (N, 24) of some frames (N,), each from its own window.
+    """Return poses (N, 24, 3, 3) and deviations (N, 24) of some frames (N,), each from its own window.
 
-    Windows of full length run many at once. Those that the take's ends cut run alone, and those that are cut
-    at both ends are the whole take, which runs once.
+    Windows of full length run in batches. Windows cut by one end of the take run alone. Windows cut by both
+    ends are the whole take, which runs once.
     """
     orientation, acceleration = _sensors(take)
     total, length = len(orientation), past + 1 + future
@@ -149,17 +149,17 @@ def run_windows(
 # --- measures -----------------------------------------------------------------------------------------------
 
 Table = dict[str, dict[str, Metric]]
-"""Row name to measures."""
+"""Measures by row name."""
 
 Columns = dict[str, dict[str, Array]]
-"""Row name to measures frame by frame."""
+"""Measures of each frame by row name."""
 
 Method = Callable[[list[Take]], list[Array]]
-"""Poses (T, 24, 3, 3) of some takes."""
+"""A function that returns poses (T, 24, 3, 3) for each of some takes."""
 
 
 def collect(takes: Iterable[Take], methods: Mapping[str, Method]) -> Columns:
-    """Measures of several methods for every frame of some takes, on the default body."""
+    """Measure several methods on every frame of some takes, on the default body."""
     offsets = default_body().offsets
     values: dict[str, dict[str, list[Array]]] = {}
     for group in groups(takes):
@@ -171,39 +171,39 @@ def collect(takes: Iterable[Take], methods: Mapping[str, Method]) -> Columns:
 
 
 def groups(takes: Iterable[Take]) -> Iterator[list[Take]]:
-    """Lists of takes to run at once, at most `GROUP` each."""
+    """Yield lists of takes to run together, at most `GROUP` each."""
     iterator = iter(takes)
     while group := list(islice(iterator, GROUP)):
         yield group
 
 
 def summarise(columns: Columns) -> Table:
-    """Means, deviations and numbers of frames."""
+    """Return means, standard deviations and numbers of frames."""
     return {name: {key: measure(v) for key, v in rows.items()} for name, rows in columns.items()}
 
 
 def archive_methods(module: torch.jit.ScriptModule, modes: list[Mode]) -> dict[str, Method]:
-    """An archive's ways of running as methods for `collect`."""
+    """Return an archive's modes as methods for `collect`."""
     return {str(mode): lambda takes, mode=mode: run_archive(module, takes, mode) for mode in modes}
 
 
-def baseline_methods(learnt: baselines.Baselines) -> dict[str, Method]:
-    """The trivial baselines as methods for `collect`."""
+def baseline_methods(trained: baselines.Baselines) -> dict[str, Method]:
+    """Return the trivial baselines as methods for `collect`."""
     return {
-        name: lambda takes, method=method: [method(take, learnt) for take in takes]
+        name: lambda takes, method=method: [method(take, trained) for take in takes]
         for name, method in baselines.METHODS.items()
     }
 
 
 def takes_of(data: Path, part: str, progress: Progress = iter) -> Iterator[Take]:
-    """Takes of a part of the split, of the part "all", or of "published" recordings, read one by one."""
+    """Read takes one by one: those of a part of the split, of "all" parts, or "published" recordings."""
     if part == "published":
-        return map(_as_a_run_measures, read_published(data))
+        return map(_with_mean_acceleration, read_published(data))
     return (read_take(path) for path in progress(take_paths(data, part)))
 
 
-def _as_a_run_measures(take: Take) -> Take:
-    """The take with a frame's acceleration as the mean since the frame before, see `FrameSynchronizer`."""
+def _with_mean_acceleration(take: Take) -> Take:
+    """Return the take with accelerations averaged since the previous frame, as `FrameSynchronizer` does."""
     acceleration = take.acceleration.copy()
     acceleration[1:] = 0.5 * (take.acceleration[1:] + take.acceleration[:-1])
     return take._replace(acceleration=acceleration)
@@ -212,24 +212,24 @@ def _as_a_run_measures(take: Take) -> Take:
 def columns_of_parts(
     methods: Mapping[str, Method], data: Path, parts: Iterable[str], progress: Progress = iter
 ) -> dict[str, Columns]:
-    """`collect` for each of some parts of the takes below a folder."""
+    """Return the results of `collect` for each of some parts of the takes below a folder."""
     return {part: collect(takes_of(data, part, progress), methods) for part in parts}
 
 
 def window_errors(
     module: torch.jit.ScriptModule, takes: Iterable[Take], past: list[int], future: list[int], every: int = 1
 ) -> tuple[Array, int]:
-    """Mean SIP error for each length of a bidirectional network's window (DIP figure 6).
+    """Return the mean SIP error for each window length of a bidirectional network (DIP figure 6).
 
     Args:
         module: the archive.
-        takes: to run over.
+        takes: takes to measure.
         past: numbers of past frames.
         future: numbers of future frames.
-        every: frames from one that is measured to the next.
+        every: measure each `every`-th frame.
 
     Returns:
-        (len(future), len(past)) degrees, and how many frames were measured.
+        (len(future), len(past)) degrees, and the number of measured frames.
     """
     totals, count = np.zeros((len(future), len(past))), 0
     for take in takes:

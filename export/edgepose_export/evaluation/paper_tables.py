@@ -1,4 +1,4 @@
-"""Tables in the form of DIP's tables 2 to 5, so that figures stand beside the paper's."""
+"""Tables in the form of DIP's tables 2 to 5, for comparison with the paper."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def _online(metadata: Mapping[str, Any]) -> list[Mode]:
 
 
 def _windows(metadata: Mapping[str, Any]) -> list[Mode]:
-    """Both windows of table 3; a network that has no windows runs as it does."""
+    """Return both windows of table 3; a network without windows is streamed."""
     if metadata["kind"] != "birnn":
         return _online(metadata)
     return [Mode("window", 20, 5), Mode("window", 50, 5)]
@@ -27,8 +27,8 @@ class PaperTable(NamedTuple):
     """One of the paper's tables.
 
     Attributes:
-        modes: how an archive with some metadata is run for it.
-        positions: whether positional errors stand in it too.
+        modes: function that returns the modes to run, from an archive's metadata.
+        positions: whether the table has positional errors, too.
     """
 
     modes: Callable[[Mapping[str, Any]], list[Mode]]
@@ -47,7 +47,7 @@ TABLES = {
 
 
 def format_paper_table(tables: Mapping[str, Table], positions: bool) -> str:
-    """Rows of methods, for each part of the split side by side the paper's columns.
+    """Format a table with a row per method and, side by side, the paper's columns for each part of the split.
 
     The joint angle error is that of the paper's own evaluation, over hips and shoulders: `sip_error_deg`.
     """
@@ -69,7 +69,7 @@ def format_paper_table(tables: Mapping[str, Table], positions: bool) -> str:
         for name in names
     ]
     widths = [max(map(len, column)) for column in zip(*head[1:], *rows, strict=True)]
-    # A part's name may run over the columns that are empty beside it.
+    # A part's name may run into the empty columns to its right.
     lines = ["".join(cell.ljust(width + 2) for cell, width in zip(head[0], widths, strict=True))]
     for name, *cells in [head[1], *rows]:
         padded = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))

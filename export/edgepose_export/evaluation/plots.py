@@ -1,4 +1,4 @@
-"""Pictures of evaluations, DIP's figures 5 and 6 among them; needs matplotlib."""
+"""Plots of evaluations, including DIP's figures 5 and 6; they need matplotlib."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ Array = NDArray[np.float64]
 
 PANEL_IN, DPI = 4.5, 150
 MOST_DEG = 60
-"""Errors beyond are counted in the last bin of a histogram."""
+"""Larger errors are counted in the last bin of a histogram."""
 
 
 def histogram(path: Path, parts: Mapping[str, Mapping[str, Array]], overwrite: bool = True) -> None:
-    """Distribution of errors, as DIP's figure 5.
+    """Draw the distribution of errors, as DIP's figure 5.
 
     Args:
         path: picture to write.
-        parts: for each part of the split each method's errors (N,), deg.
-        overwrite: whether it may take the place of a file.
+        parts: errors (N,), deg, by part of the split and by method.
+        overwrite: whether an existing file may be replaced.
     """
     figure, axes = _panels(list(parts))
     edges = np.arange(MOST_DEG + 1)
@@ -39,7 +39,7 @@ def histogram(path: Path, parts: Mapping[str, Mapping[str, Array]], overwrite: b
         for name, errors in methods.items():
             share = 100.0 * np.histogram(errors.clip(0, MOST_DEG), edges)[0] / len(errors)
             ax.stairs(share, edges, label=name)
-        label = f"SIP error, deg (the last degree: all beyond {MOST_DEG - 1})"
+        label = f"SIP error, deg (last bin: all above {MOST_DEG - 1})"
         ax.set(xlabel=label, ylabel="frames, %", xlim=(0, MOST_DEG), ylim=(0, None))
     _legend(figure, axes)
     _save(figure, path, overwrite)
@@ -48,14 +48,14 @@ def histogram(path: Path, parts: Mapping[str, Mapping[str, Array]], overwrite: b
 def heat_map(
     path: Path, parts: Mapping[str, Array], past: list[int], future: list[int], overwrite: bool = True
 ) -> None:
-    """Mean errors against past and future frames, as DIP's figure 6.
+    """Draw mean errors against past and future frames, as DIP's figure 6.
 
     Args:
         path: picture to write.
-        parts: for each part of the split mean errors (len(future), len(past)), deg.
-        past: numbers of past frames, rising.
-        future: numbers of future frames, rising.
-        overwrite: whether it may take the place of a file.
+        parts: mean errors (len(future), len(past)), deg, by part of the split.
+        past: numbers of past frames, in ascending order.
+        future: numbers of future frames, in ascending order.
+        overwrite: whether an existing file may be replaced.
     """
     figure, axes = _panels(list(parts))
     for ax, means in zip(axes, parts.values(), strict=True):
@@ -74,7 +74,7 @@ def heat_map(
 def reliability_plot(
     path: Path, parts: Mapping[str, Mapping[str, Reliability]], overwrite: bool = True
 ) -> None:
-    """Actual against predicted errors in quantiles of the predicted ones, for each part and method."""
+    """Draw actual against predicted errors in quantiles of the predicted ones, for each part and method."""
     figure, axes = _panels(list(parts))
     for ax, methods in zip(axes, parts.values(), strict=True):
         most = 0.0
@@ -88,7 +88,7 @@ def reliability_plot(
 
 
 def _panels(titles: list[str]) -> tuple[Figure, list[Any]]:
-    """A figure with a panel for each title, side by side."""
+    """Return a figure with one panel per title, side by side."""
     require_matplotlib("drawing")
     from matplotlib.figure import Figure
 
@@ -100,7 +100,7 @@ def _panels(titles: list[str]) -> tuple[Figure, list[Any]]:
 
 
 def _legend(figure: Figure, axes: list[Any]) -> None:
-    """One legend for all panels, below them."""
+    """Add one legend for all panels, below them."""
     handles, labels = axes[0].get_legend_handles_labels()
     columns = 2 if len(axes) > 1 else 1
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize="small")

@@ -1,4 +1,4 @@
-"""Rounded weights, and what packing an archive's weights does to its poses."""
+"""Rounding of weights, and the effect of packed weights on an archive's poses."""
 
 from __future__ import annotations
 
@@ -24,18 +24,17 @@ from edgepose_export.evaluation.evaluate import (
 from edgepose_export.training.dataset import Take
 
 STEPS = 32
-"""Steps in a typical weight once weights are rounded."""
+"""Size of a typical rounded weight, in rounding steps."""
 
 KEYS = ("sip_error_deg", "joint_angle_error_10_deg")
 
 
 @torch.no_grad()
 def round_weights(network: nn.Module) -> None:
-    """Makes a network's weights whole multiples of powers of two, one for each parameter, near 1 / STEPS of
-    its root mean square.
+    """Round each parameter to multiples of a power of two near 1 / STEPS of its root mean square.
 
-    They move by about a hundredth of their size. fp16 holds such numbers exactly (below 2048 steps), and an
-    archive of them compresses to two fifths of what it would.
+    Weights change by about a hundredth of their size. fp16 represents such numbers exactly (below 2048
+    steps), and their archive compresses to two fifths of the size it has otherwise.
     """
     for weight in network.parameters():
         typical = weight.square().mean().sqrt()
@@ -51,25 +50,25 @@ def compare(
     mode: Mode,
     progress: Progress = iter,
 ) -> dict[str, dict[str, dict[str, Any]]]:
-    """Errors of each precision over the takes of some parts, and how far its poses are from those in f32.
+    """Measure each precision on the takes of some parts: its errors, and its distance to the poses in f32.
 
     Args:
-        new_module: gives the archive anew, its weights not packed.
+        new_module: returns a fresh copy of the archive with unpacked weights.
         data: folder of takes.
-        parts: of the split.
-        mode: how the archive runs.
+        parts: parts of the split.
+        mode: mode in which the archive runs.
         progress: wraps the list of takes.
 
     Returns:
-        For each part and precision that this machine has: "errors" against the truth and "away" from the f32
-        poses, each [mean, deviation, frames] for each of `KEYS`, degrees.
+        By part and precision that this machine supports: "errors" against the true poses, and "away", the
+        distance to the f32 poses; each holds [mean, deviation, frames] for each of `KEYS`, degrees.
     """
     modules = {"f32": new_module()}
     for precision in PRECISIONS[1:]:
         module = new_module()
         try:
             pack_weights(module, precision)
-        except EdgeposeError:  # not on this machine, or not for this kind of network
+        except EdgeposeError:  # not supported on this machine or for this kind of network
             continue
         modules[precision] = module
     return {part: _part(modules, takes_of(data, part, progress), mode) for part in parts}
@@ -85,7 +84,7 @@ def _part(
         for take, pose in zip(group, run_archive(modules["f32"], group, mode), strict=True)
     ]
     methods = {
-        # Inputs rounded to int8 share a scale with all that is computed at once; a run has one wearer.
+        # int8 activations share one scale per batch, so batching would change results; a run has one wearer.
         name: lambda group, module=module, size=1 if name == "int8" else GROUP: [
             poses
             for i in range(0, len(group), size)

@@ -1,8 +1,7 @@
-"""Whether a network errs as much as it says: predicted standard deviations against actual errors.
+"""Reliability of a network's predicted standard deviations, compared with its actual errors.
 
-A joint's standard deviation is the root mean square size of the small turn, in three directions alike,
-between predicted and true rotation. Which rotation that is depends on the network's targets: the joint's
-local one, or the one seen from the root.
+A joint's standard deviation is the root mean square angle between its predicted and its true rotation, with
+isotropic errors. The rotation is local or relative to the root, depending on the network's targets.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ Array = NDArray[np.float64]
 BINS = 10
 
 EXPECTED = (0.608, 0.993)
-"""Share of turns within one and two standard deviations if their three components are normally distributed
+"""Shares of errors within one and two standard deviations if their three components are normally distributed
 (chi-squared with three degrees of freedom at 3 and 12).
 """
 
@@ -34,9 +33,9 @@ class Reliability(NamedTuple):
 
     Attributes:
         predicted_deg: (BINS,) root mean square of the predicted deviations in each of their quantiles.
-        actual_deg: (BINS,) root mean square errors there.
+        actual_deg: (BINS,) root mean square of the errors in the same quantiles.
         within: shares of the errors within one and two deviations.
-        scale: factor of all deviations that would make them right on average.
+        scale: common factor that would make the deviations right on average.
         values: number of errors, frames times joints.
     """
 
@@ -50,36 +49,36 @@ class Reliability(NamedTuple):
 def errors_and_deviations(
     module: torch.jit.ScriptModule, metadata: Mapping[str, Any], takes: Iterable[Take], mode: Mode
 ) -> tuple[Array, Array]:
-    """Errors and predicted deviations (N, joints), rad, of an archive's joints in all frames of takes."""
+    """Return errors and predicted deviations (N, joints), rad, of an archive's joints in all frames."""
     joints = [JOINTS.index(name) for name in metadata["joints"]]
     errors, deviations = [], []
     for group in groups(takes):
         for take, (poses, std) in zip(group, run_with_std(module, group, mode), strict=True):
             pair = [poses, take.pose.astype(float)]
             if metadata["targets"] != "local-matrix":
-                pair = [_seen_from_root(local) for local in pair]
+                pair = [_relative_to_root(local) for local in pair]
             errors.append(geodesic_angle(pair[0][:, joints], pair[1][:, joints]))
             deviations.append(std[:, joints])
     return np.concatenate(errors), np.concatenate(deviations)
 
 
-def _seen_from_root(local: Array) -> Array:
+def _relative_to_root(local: Array) -> Array:
     local = local.copy()
     local[:, 0] = np.eye(3)
     return forward_kinematics(local, np.zeros((24, 3)))[0]
 
 
 def scales(errors: Array, deviations: Array) -> Array:
-    """Factors (joints,) that make deviations (N, joints) as large as the errors in the mean square, by joint.
+    """Return factors (joints,) that give deviations (N, joints) the same mean square as the errors, by joint.
 
-    The most likely factors, of the mean square of each error over its deviation, would follow the few frames
-    in which a network is surest and wrong; on other takes they were twice too large.
+    Maximum-likelihood factors, from the mean square of error over deviation, are dominated by the few frames
+    in which a network is confident and wrong; on other takes they were too large by a factor of two.
     """
     return _rms(errors) / _rms(deviations)
 
 
 def reliability(errors: Array, deviations: Array) -> Reliability:
-    """Sums up errors and deviations of any shape alike, rad."""
+    """Compare errors with deviations, two arrays of the same shape, rad."""
     errors, deviations = errors.ravel(), deviations.ravel()
     bins = np.array_split(np.argsort(deviations, kind="stable"), BINS)
     ratio = errors / deviations
@@ -93,7 +92,7 @@ def reliability(errors: Array, deviations: Array) -> Reliability:
 
 
 def describe(result: Reliability) -> str:
-    """Lines for a person."""
+    """Format a result as lines of text."""
     rows = zip(result.predicted_deg, result.actual_deg, strict=True)
     one, two = (
         f"{100 * share:.1f} % ({100 * expected:.1f} % expected)"
@@ -104,7 +103,7 @@ def describe(result: Reliability) -> str:
             "predicted, deg  actual RMS error, deg",
             *(f"{predicted:14.2f}  {actual:21.2f}" for predicted, actual in rows),
             f"within one standard deviation {one}, within two {two}; scale {result.scale:.2f}; "
-            f"{result.values} errors of joints",
+            f"{result.values} joint errors",
         ]
     )
 

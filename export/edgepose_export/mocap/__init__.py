@@ -1,4 +1,4 @@
-"""Motion capture: readers for BVH, ASF/AMC and AMASS files, and the transfer of all to the 24 SMPL joints."""
+"""Motion capture: readers for BVH, ASF/AMC and AMASS files, and retargeting to the 24 SMPL joints."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ __all__ = ["Motion", "pieces", "read_motion", "resample"]
 
 
 def read_motion(path: str | Path) -> Motion:
-    """The motion in a file, transferred to SMPL.
+    """Read the motion in a file, retargeted to SMPL.
 
-    .npz is AMASS, .amc is CMU (its .asf beside it), .bvh is CMU in cgspeed's conversion or Bandai-Namco.
+    .npz is AMASS, .amc is CMU (with its .asf beside it), .bvh is CMU in cgspeed's conversion or Bandai-Namco.
 
     Raises:
-        EdgeposeError: another kind of file, a skeleton that is not known, or a broken file.
+        EdgeposeError: the file is of another kind, has an unknown skeleton, or is broken.
     """
     path = Path(path)
     kind = path.suffix.lower()
@@ -36,8 +36,8 @@ def read_motion(path: str | Path) -> Motion:
         if has_names(CMU_BVH, recording):
             return from_cmu_bvh(recording, path)
         if has_names(BANDAI, recording):
-            # The two datasets share one skeleton and differ in the collars' zero; the name tells which.
+            # Both datasets share one skeleton; the zero of the collars differs, which only the name reveals.
             return from_bandai(recording, path, collars_back=not path.name.startswith("dataset-1_"))
     else:
         raise EdgeposeError(f"{path}: motion is read from .npz, .amc and .bvh files")
-    raise EdgeposeError(f"{path}: the skeleton is not known; CMU's and Bandai-Namco's are")
+    raise EdgeposeError(f"{path}: unknown skeleton; only those of CMU and Bandai-Namco are supported")

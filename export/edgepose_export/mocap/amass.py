@@ -1,4 +1,4 @@
-"""Reader for AMASS files: SMPL, SMPL-H or SMPL-X poses in npz, in a world with Z up."""
+"""Reader for AMASS files: SMPL, SMPL-H or SMPL-X poses in .npz files, in a world with Z up."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from .motion import Motion
 Array = NDArray[np.float64]
 
 BODY_JOINTS = 22
-"""Joints that SMPL, SMPL-H and SMPL-X share; 22 and 23 are SMPL's hands, fingers or face in the others."""
+"""Joints that SMPL, SMPL-H and SMPL-X share; 22 and 23 are hands in SMPL, fingers or face in the others."""
 
 
 def read_amass(path: str | Path) -> Motion:
-    """The motion in an AMASS file.
+    """Read the motion in an AMASS file.
 
-    It holds `poses` (T, 72 or more), `trans` (T, 3), and `mocap_framerate` or `mocap_frame_rate`.
-    The translation is that of the file. The pelvis' place in the wearer's template, a constant offset of
-    about 0.2 m, is not added, because it needs the body model.
+    The file holds `poses` (T, 72 or more), `trans` (T, 3), and `mocap_framerate` or `mocap_frame_rate`.
+    The translation is that of the file. The position of the pelvis in the body's template, a constant offset
+    of about 0.2 m, is not added, because it needs the body model.
 
     Raises:
-        EdgeposeError: not such a file, or a number in it is not finite.
+        EdgeposeError: the file is of another kind, or holds a number that is not finite.
     """
     path = Path(path)
     fields = _load(path)
@@ -41,12 +41,12 @@ def read_amass(path: str | Path) -> Motion:
     rate = float(rate_field.reshape(()))
     poses, trans = fields["poses"], fields["trans"]
     if not 1e-2 < rate < 1e5:
-        raise EdgeposeError(f"{path}: a frame rate of {rate:g} Hz is not possible")
+        raise EdgeposeError(f"{path}: a frame rate of {rate:g} Hz is impossible")
     if poses.ndim != 2 or poses.shape[1] < 72 or poses.shape[1] % 3:
-        raise EdgeposeError(f"{path}: 'poses' must be (frames, 72 or more), it is {poses.shape}")
+        raise EdgeposeError(f"{path}: 'poses' must have the shape (frames, 72 or more), not {poses.shape}")
     if not len(poses) or trans.shape != (len(poses), 3):
         raise EdgeposeError(
-            f"{path}: 'trans' must be ({len(poses)}, 3) with at least one frame, it is {trans.shape}"
+            f"{path}: 'trans' must have the shape ({len(poses)}, 3) and a frame, not {trans.shape}"
         )
     for name, values in (("poses", poses), ("trans", trans)):
         bad = np.flatnonzero(~(np.abs(values) < LARGEST).all(axis=1))
@@ -64,7 +64,7 @@ def read_amass(path: str | Path) -> Motion:
 
 
 def _load(path: Path) -> dict[str, Array]:
-    """The fields of the file that matter, as numbers."""
+    """Return the fields of the file that are used, as numbers."""
     wanted = ("poses", "trans", "mocap_framerate", "mocap_frame_rate")
     try:
         with open_npz(path) as archive:

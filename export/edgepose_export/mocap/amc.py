@@ -16,14 +16,14 @@ from edgepose.rotations import euler_to_matrix, transpose
 Array = NDArray[np.float64]
 
 AMC_RATE = 120.0
-"""Frames per second of the CMU recordings; the format has no field for it."""
+"""Frames per second of CMU's recordings; the format has no field for the rate."""
 
 _INCH = 0.0254
 _FREEDOMS = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 
 class Skeleton(NamedTuple):
-    """An ASF skeleton in its zero pose; frames are parallel to the world's there."""
+    """An ASF skeleton in its zero pose, in which all frames are parallel to the world's."""
 
     names: tuple[str, ...]
     """The root, then the bones; each after its parent."""
@@ -31,9 +31,9 @@ class Skeleton(NamedTuple):
     offsets: Array
     """(J, 3) start of each bone minus start of its parent, metres; for the root its position."""
     axes: Array
-    """(J, 3, 3) frames in which the bones' angles are given."""
+    """(J, 3, 3) frames that the bones' angles refer to."""
     freedoms: tuple[tuple[str, ...], ...]
-    """Values that the motion gives for each bone, in order: rx, ry, rz, tx, ty, tz."""
+    """Values that the motion holds for each bone, in order: rx, ry, rz, tx, ty, tz."""
     metre: float
     """Metres in one unit of length of the file."""
     radian: float
@@ -46,11 +46,15 @@ class _Bone(NamedTuple):
     freedoms: tuple[str, ...]
 
 
+_Fields = dict[str, tuple[int, list[str]]]
+"""Line number and words by keyword."""
+
+
 def find_asf(path: str | Path) -> Path:
-    """The skeleton beside a motion file: 07_01.amc belongs to 07.asf, or to the only skeleton in its folder.
+    """Return the skeleton file of a motion file: 07.asf for 07_01.amc, or the only skeleton in its folder.
 
     Raises:
-        EdgeposeError: there is none, or it is not clear which.
+        EdgeposeError: there is none, or there are several and none has the right name.
     """
     path = Path(path)
     found = sorted(file for file in path.parent.glob("*") if file.suffix.lower() == ".asf")
@@ -62,23 +66,44 @@ def find_asf(path: str | Path) -> Path:
 
 
 def read_amc(path: str | Path, skeleton: str | Path | None = None, rate: float = AMC_RATE) -> JointTree:
-    """All frames of an AMC file, lengths in metres.
+    """Read all frames of an AMC file, with lengths in metres.
 
     Args:
         path: the motion.
         skeleton: its ASF file; None looks beside the motion, see `find_asf`.
-        rate: frames per second, which the file does not say.
+        rate: frames per second, which the file does not state.
 
     Raises:
-        EdgeposeError: a file cannot be read, breaks the format, is cut short, or holds a number that is not
-            finite.
+        EdgeposeError: a file cannot be read, is malformed or truncated, or holds a number that is not finite.
     """
     path = Path(path)
     body = read_asf(find_asf(path) if skeleton is None else skeleton)
-    joint_of = {name: joint for joint, name in enumerate(body.names)}
-    moving = {name for name, freedoms in zip(body.names, body.freedoms, strict=True) if freedoms}
+    radian, columns = _read_columns(path, body)
+    frames = len(next(iter(columns.values()), ()))
+    rotations = np.broadcast_to(np.eye(3), (frames, len(body.names), 3, 3)).copy()
+    positions = np.broadcast_to(body.offsets, (frames, len(body.names), 3)).copy()
+    for joint, (name, freedoms) in enumerate(zip(body.names, body.freedoms, strict=True)):
+        if not freedoms:
+            continue
+        table = np.array(columns[name])
+        angles = [i for i, freedom in enumerate(freedoms) if freedom[0] == "r"]
+        # The rotation listed first is applied first, so it is the last factor of the product.
+        order = "".join(freedoms[i][1] for i in reversed(angles))
+        rotation = euler_to_matrix(table[:, angles[::-1]] * radian, order) if angles else np.eye(3)
+        rotations[:, joint] = body.axes[joint] @ rotation @ transpose(body.axes[joint])
+        for i, freedom in enumerate(freedoms):
+            if freedom[0] == "t":
+                positions[:, joint, "xyz".index(freedom[1])] += table[:, i] * body.metre
+    return JointTree(body.names, body.parents, body.offsets, rotations, positions, rate)
+
+
+def _read_columns(path: Path, body: Skeleton) -> tuple[float, dict[str, list[list[float]]]]:
+    """Return the radians in one unit of angle, and for each moving bone its values frame by frame."""
+    counts = {
+        name: len(freedoms) for name, freedoms in zip(body.names, body.freedoms, strict=True) if freedoms
+    }
+    columns: dict[str, list[list[float]]] = {name: [] for name in counts}
     radian = body.radian
-    columns: dict[str, list[list[float]]] = {name: [] for name in moving}
     frames = last = 0
     missing: set[str] = set()
     for number, words in _lines(path):
@@ -90,122 +115,138 @@ def read_amc(path: str | Path, skeleton: str | Path | None = None, rate: float =
             if missing:
                 fail(path, number, f"frame {last} lacks {min(missing)}")
             if frames and int(key) != last + 1:  # excerpts do not start at 1
-                fail(path, number, f"frame {last + 1} was expected, this is {key}")
+                fail(path, number, f"expected frame {last + 1}, found {key}")
             last = int(key)
             frames += 1
-            missing = set(moving)
+            missing = set(counts)
         elif not frames:
-            fail(path, number, "a frame number was expected")
-        elif key not in moving:
-            fail(path, number, f"bone {key!r} has no freedom in the skeleton, or is not in it")
+            fail(path, number, "expected a frame number")
+        elif key not in counts:
+            fail(path, number, f"bone {key!r} is not in the skeleton, or has no degree of freedom there")
         elif key not in missing:
-            fail(path, number, f"bone {key!r} twice in a frame")
+            fail(path, number, f"bone {key!r} occurs twice in a frame")
         else:
             missing.remove(key)
-            columns[key].append(numbers(path, number, words[1:], len(body.freedoms[joint_of[key]])))
-    if missing or not frames:
-        raise EdgeposeError(
-            f"{path}: ends within frame {last} (cut short?)" if frames else f"{path}: no frames"
-        )
-
-    rotations = np.broadcast_to(np.eye(3), (frames, len(body.names), 3, 3)).copy()
-    positions = np.broadcast_to(body.offsets, (frames, len(body.names), 3)).copy()
-    for name in moving:
-        joint, freedoms = joint_of[name], body.freedoms[joint_of[name]]
-        table = np.array(columns[name])
-        turns = [i for i, freedom in enumerate(freedoms) if freedom[0] == "r"]
-        # The first listed angle turns first, so it stands last in the product.
-        order = "".join(freedoms[i][1] for i in reversed(turns))
-        turn = euler_to_matrix(table[:, turns[::-1]] * radian, order) if turns else np.eye(3)
-        rotations[:, joint] = body.axes[joint] @ turn @ transpose(body.axes[joint])
-        for i, freedom in enumerate(freedoms):
-            if freedom[0] == "t":
-                positions[:, joint, "xyz".index(freedom[1])] += table[:, i] * body.metre
-    return JointTree(body.names, body.parents, body.offsets, rotations, positions, rate)
+            columns[key].append(numbers(path, number, words[1:], counts[key]))
+    if not frames:
+        raise EdgeposeError(f"{path}: no frames")
+    if missing:
+        raise EdgeposeError(f"{path}: ends within frame {last} (cut short?)")
+    return radian, columns
 
 
 def read_asf(path: str | Path) -> Skeleton:
-    """The skeleton in an ASF file.
+    """Read the skeleton in an ASF file.
 
     Raises:
-        EdgeposeError: the file cannot be read, breaks the format, is cut short, or holds a number that is not
-            finite.
+        EdgeposeError: the file cannot be read, is malformed or truncated, or a number in it is not finite.
     """
-    path = Path(path)
-    metre, radian = _INCH, math.pi / 180
-    section = ""
-    root: dict[str, tuple[int, list[str]]] = {}
-    current: dict[str, tuple[int, list[str]]] | None = None
-    bones: dict[str, _Bone] = {}
-    parent_of: dict[str, str] = {}
-    closed = False
-    for number, words in _lines(path):
+    reader = _AsfReader(Path(path))
+    for number, words in _lines(reader.path):
+        reader.feed(number, words)
+    return reader.skeleton()
+
+
+class _AsfReader:
+    """Reader of an ASF file's lines, one section after the other."""
+
+    def __init__(self, path: Path) -> None:
+        """Start before the first section; `path` is for error messages."""
+        self.path = path
+        self._section = ""
+        self._metre, self._radian = _INCH, math.pi / 180
+        self._root: _Fields = {}
+        self._open_bone: _Fields | None = None
+        self._bones: dict[str, _Bone] = {}
+        self._parent_of: dict[str, str] = {}
+        self._hierarchy_closed = False
+
+    def feed(self, number: int, words: list[str]) -> None:
+        """Take the words of the next line."""
         key = words[0].lower()
         if key.startswith(":"):
-            section = key
-            closed = False
-        elif section == ":units" and key == "length":
-            scale = numbers(path, number, words[1:], 1)[0]
-            if scale <= 0:
-                fail(path, number, "the length unit must be positive")
-            metre = _INCH / scale  # lengths are inches times this number
-        elif section == ":units" and key == "angle":
-            radian = 1.0 if words[1:2] == ["rad"] else math.pi / 180
-        elif section == ":root":
-            root[key] = (number, words[1:])
-        elif section == ":bonedata":
-            if key == "begin":
-                current = {}
-            elif key == "end" and current is not None:
-                name, bone = _bone(path, number, current, metre, radian)
-                if name in bones or name == "root":
-                    fail(path, number, f"bone {name!r} is defined twice")
-                bones[name] = bone
-                current = None
-            elif current is None:
-                fail(path, number, "a bone must begin with 'begin'")
-            else:
-                current.setdefault(key, (number, words[1:]))
-        elif section == ":hierarchy":
+            self._section = key
+            self._hierarchy_closed = False
+        elif self._section == ":units":
+            self._read_unit(number, key, words[1:])
+        elif self._section == ":root":
+            self._root[key] = (number, words[1:])
+        elif self._section == ":bonedata":
+            self._read_bone(number, key, words[1:])
+        elif self._section == ":hierarchy":
             if key == "end":
-                closed = True
+                self._hierarchy_closed = True
             elif key != "begin":
-                for child in words[1:]:
-                    if child not in bones or child in parent_of:
-                        fail(path, number, f"bone {child!r} is not defined, or has two parents")
-                    if words[0] != "root" and words[0] not in parent_of:
-                        fail(path, number, f"bone {words[0]!r} has no parent before this line")
-                    parent_of[child] = words[0]
-    if not closed or section != ":hierarchy":
-        raise EdgeposeError(f"{path}: ends before its hierarchy is closed")
+                self._read_children(number, words[0], words[1:])
 
-    names = ("root", *parent_of)  # in order of the hierarchy: parents first
-    parents = (-1, *(names.index(parent) for parent in parent_of.values()))
-    number, order = root.get("order", (0, []))
-    freedoms = tuple(word.lower() for word in order)
-    if sorted(freedoms) != sorted(_FREEDOMS):
-        fail(path, number, "the root's order must name TX TY TZ RX RY RZ")
-    number, axis = root.get("axis", (0, ["XYZ"]))
-    at, angles = root.get("orientation", (0, ["0", "0", "0"]))
-    root_axis = _axis(path, number, [*angles, *axis], radian)
-    at, place = root.get("position", (0, ["0", "0", "0"]))
-    start = np.array(numbers(path, at, place, 3)) * metre
-    vectors = [np.zeros(3) if parent == "root" else bones[parent].vector for parent in parent_of.values()]
-    return Skeleton(
-        names,
-        parents,
-        np.array([start, *vectors]),
-        np.array([root_axis, *(bones[name].axis for name in parent_of)]),
-        (freedoms, *(bones[name].freedoms for name in parent_of)),
-        metre,
-        radian,
-    )
+    def _read_unit(self, number: int, key: str, words: list[str]) -> None:
+        if key == "length":
+            scale = numbers(self.path, number, words, 1)[0]
+            if scale <= 0:
+                fail(self.path, number, "the length unit must be positive")
+            self._metre = _INCH / scale  # lengths are inches times this number
+        elif key == "angle":
+            self._radian = 1.0 if words[:1] == ["rad"] else math.pi / 180
+
+    def _read_bone(self, number: int, key: str, words: list[str]) -> None:
+        if key == "begin":
+            self._open_bone = {}
+        elif self._open_bone is None:
+            fail(self.path, number, "a bone must begin with 'begin'")
+        elif key == "end":
+            name, bone = _bone(self.path, number, self._open_bone, self._metre, self._radian)
+            if name in self._bones or name == "root":
+                fail(self.path, number, f"bone {name!r} is defined twice")
+            self._bones[name] = bone
+            self._open_bone = None
+        else:
+            self._open_bone.setdefault(key, (number, words))
+
+    def _read_children(self, number: int, parent: str, children: list[str]) -> None:
+        for child in children:
+            if child not in self._bones or child in self._parent_of:
+                fail(self.path, number, f"bone {child!r} is not defined, or has two parents")
+            if parent != "root" and parent not in self._parent_of:
+                fail(self.path, number, f"bone {parent!r} has no parent before this line")
+            self._parent_of[child] = parent
+
+    def skeleton(self) -> Skeleton:
+        """Return the skeleton once all lines have been fed.
+
+        Raises:
+            EdgeposeError: the file ended too early, or its root is malformed.
+        """
+        if not self._hierarchy_closed or self._section != ":hierarchy":
+            raise EdgeposeError(f"{self.path}: ends before its hierarchy is closed")
+        names = ("root", *self._parent_of)  # in order of the hierarchy: parents first
+        parents = (-1, *(names.index(parent) for parent in self._parent_of.values()))
+        number, order = self._root.get("order", (0, []))
+        freedoms = tuple(word.lower() for word in order)
+        if sorted(freedoms) != sorted(_FREEDOMS):
+            fail(self.path, number, "the root's order must name TX TY TZ RX RY RZ")
+        number, axis = self._root.get("axis", (0, ["XYZ"]))
+        _, angles = self._root.get("orientation", (0, ["0", "0", "0"]))
+        root_axis = _axis(self.path, number, [*angles, *axis], self._radian)
+        number, position = self._root.get("position", (0, ["0", "0", "0"]))
+        start = np.array(numbers(self.path, number, position, 3)) * self._metre
+        bones = [self._bones[name] for name in self._parent_of]
+        vectors = [
+            np.zeros(3) if parent == "root" else self._bones[parent].vector
+            for parent in self._parent_of.values()
+        ]
+        return Skeleton(
+            names,
+            parents,
+            np.array([start, *vectors]),
+            np.array([root_axis, *(bone.axis for bone in bones)]),
+            (freedoms, *(bone.freedoms for bone in bones)),
+            self._metre,
+            self._radian,
+        )
 
 
-def _bone(
-    path: Path, number: int, fields: dict[str, tuple[int, list[str]]], metre: float, radian: float
-) -> tuple[str, _Bone]:
-    """Name and shape of a bone from the lines between its begin and its end."""
+def _bone(path: Path, number: int, fields: _Fields, metre: float, radian: float) -> tuple[str, _Bone]:
+    """Return name and shape of a bone from the lines between its begin and its end."""
     for key in ("name", "direction", "length", "axis"):
         if key not in fields or not fields[key][1]:
             fail(path, number, f"a bone without {key}")
@@ -215,21 +256,21 @@ def _bone(
     at, words = fields.get("dof", (number, []))
     freedoms = tuple(word.lower() for word in words)
     if any(word not in _FREEDOMS for word in freedoms) or len(set(freedoms)) != len(freedoms):
-        fail(path, at, f"dof of bone {name!r}: only rx, ry, rz, tx, ty, tz are known")
+        fail(path, at, f"dof of bone {name!r} may hold only rx, ry, rz, tx, ty, tz, each once")
     return name, _Bone(direction * length * metre, _axis(path, *fields["axis"], radian), freedoms)
 
 
 def _axis(path: Path, number: int, words: list[str], radian: float) -> Array:
-    """Rotation matrix of three angles and the order in which they turn, such as XYZ."""
+    """Return the rotation matrix of three angles that are applied in an order such as XYZ."""
     order = words[-1].lower()
     if sorted(order) != ["x", "y", "z"]:
-        fail(path, number, "three angles and their order, such as XYZ, were expected")
+        fail(path, number, "expected three angles and their order, such as XYZ")
     angles = np.array(numbers(path, number, words[:-1], 3)) * radian
     return euler_to_matrix(angles[::-1], order[::-1])
 
 
 def _lines(path: Path) -> list[tuple[int, list[str]]]:
-    """Line numbers, from 1, and words of the lines that hold something."""
+    """Return line number, from 1, and words of each line that is not empty."""
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except OSError as error:

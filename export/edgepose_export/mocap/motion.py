@@ -1,4 +1,4 @@
-"""A motion of the 24 SMPL joints, whatever it was read from."""
+"""Motions of the 24 SMPL joints, independent of the source: type, resampling, cutting at jumps."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ Array = NDArray[np.float64]
 
 
 class Motion(NamedTuple):
-    """Global rotations and the pelvis' path, in a world with the axes of the body frame T at heading zero."""
+    """Global rotations and pelvis positions, in a world with the axes of the body frame T at heading zero."""
 
     rotations: Array
-    """(T, 24, 3, 3) global bone rotations R_TB; all are the identity in SMPL's zero pose facing +Z."""
+    """(T, 24, 3, 3) global bone rotations R_TB; all are the identity in SMPL's zero pose, facing +Z."""
     translation: Array
     """(T, 3) pelvis position, metres, Y up."""
     rate: float
     """Frames per second."""
     source: str
-    """Where it comes from: "cmu", "bandai-namco" or "amass"."""
+    """Origin: "cmu", "bandai-namco" or "amass"."""
 
 
 def resample(motion: Motion, rate: float = 60.0) -> Motion:
-    """The same motion at another rate, from its first frame to the last that still lies inside it.
+    """Resample a motion, from its first frame to the last sample within it.
 
-    Rotations go through a cubic spline on quaternions of continuous sign. Slerp would be linear between
-    frames: its corners become spikes in the accelerations that are derived from the motion.
+    Rotations are interpolated by a cubic spline on quaternions of continuous sign. Slerp is linear between
+    frames, and its corners would become spikes in the accelerations derived from the motion.
     """
     frames = len(motion.rotations)
     if rate == motion.rate or frames < 2:
@@ -46,23 +46,23 @@ def resample(motion: Motion, rate: float = 60.0) -> Motion:
 
 
 FASTEST_TURN = 60.0
-"""rad/s; kicks and punches stay below 45. What is above are faults of the source, mostly half turns."""
+"""rad/s; kicks and punches stay below 45. Faster ones are faults of the source, mostly by 180 deg."""
 FASTEST_PELVIS = 10.0
 """m/s."""
-_FEET = (7, 8, 10, 11)  # their angles are noisy, and nothing is learned from them
+_FEET = (7, 8, 10, 11)  # their angles are noisy, and no sensor or target depends on them
 
 
 def pieces(motion: Motion, shortest: float = 1.0) -> list[Motion]:
-    """The motion cut where the source jumps, without cut pieces that are shorter than `shortest` seconds.
+    """Cut a motion where the source jumps, and drop cut pieces shorter than `shortest` seconds.
 
-    To be used before `resample`, whose spline would ring at a jump. A jump turns a bone other than the feet,
-    or moves the pelvis, faster than a body can. In some CMU takes of dance a thigh is turned by half a turn
-    for a few frames; such pieces are short and go.
+    At a jump a bone other than the feet rotates, or the pelvis moves, faster than a body can. In some CMU
+    takes of dance a thigh is rotated by 180 deg for a few frames; such pieces are short and are dropped. Call
+    this before `resample`, whose spline would ring at a jump.
     """
-    turns = geodesic_angle(motion.rotations[1:], motion.rotations[:-1]) * motion.rate
-    turns[:, _FEET] = 0.0
+    rates = geodesic_angle(motion.rotations[1:], motion.rotations[:-1]) * motion.rate
+    rates[:, _FEET] = 0.0
     speed = np.linalg.norm(np.diff(motion.translation, axis=0), axis=1) * motion.rate
-    cuts = 1 + np.flatnonzero((turns > FASTEST_TURN).any(axis=1) | (speed > FASTEST_PELVIS))
+    cuts = 1 + np.flatnonzero((rates > FASTEST_TURN).any(axis=1) | (speed > FASTEST_PELVIS))
     if not len(cuts):
         return [motion]
     ends = [0, *cuts.tolist(), len(motion.rotations)]

@@ -1,14 +1,14 @@
-"""From the skeletons of the motion-capture sources to the 24 SMPL joints.
+"""Retargeting from the skeletons of the motion-capture sources to the 24 SMPL joints.
 
-A bone's rotation is taken against the source's T-pose, and its limb direction is kept exactly:
+A bone's rotation is taken relative to the source's T-pose, and its limb direction is kept exactly:
 
     G_smpl = G_src inv(G0) minrot(SMPL rest direction -> source T-pose direction)
 
 `G_src` is the source bone's global rotation, `G0` the same in the source's T-pose. In the T-pose the SMPL
-bone is then turned from its rest direction to the source's (arms of the CMU T-pose hang by 8 deg), and in
-every pose both point the same way. Bones that are no limbs (trunk, neck, head, collars, feet) have the
-identity in the source's T-pose: a wearer's trunk is calibrated to the identity when standing straight,
-whatever the slope of the line between two vertebrae.
+bone thus points in the source's direction instead of its rest direction (the arms of CMU's T-pose hang by
+8 deg), and both point the same way in every pose. All other bones (trunk, neck, head, collars, feet) are the
+identity in the source's T-pose, because a wearer's trunk is calibrated to the identity when they stand
+straight, whatever the slope of the line between two vertebrae.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from .motion import Motion
 Array = NDArray[np.float64]
 
 LIMBS = {1: "-y", 2: "-y", 4: "-y", 5: "-y", 16: "+x", 17: "-x", 18: "+x", 19: "-x"}
-"""Direction in which each limb bone of SMPL's zero pose points; the template's slight tilts are left out."""
+"""Direction of each limb bone in SMPL's zero pose, without the slight tilts of the template."""
 
 _DIRECTIONS = {"+x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0), "-y": (0.0, -1.0, 0.0)}
 _FOREARM_OF = {20: 18, 21: 19, 22: 18, 23: 19}  # wrists and hands stay at rest against the forearms
@@ -44,19 +44,19 @@ BANDAI_METRES = 0.01
 
 
 class Names(NamedTuple):
-    """Names of a source's joints by the part that they play."""
+    """Names of a source's joints by their role."""
 
     joints: tuple[str, ...]
-    """(24) the joint whose rotation each SMPL joint takes."""
+    """(24) the source joint that gives each SMPL joint its rotation."""
     bones: dict[int, tuple[str, str]]
-    """Limb (key of `LIMBS`) -> joints at its two ends."""
+    """Source joints at both ends of each limb (key of `LIMBS`)."""
 
 
 def _names(trunk: str, left: str, right: str) -> Names:
-    """Names from the trunk (pelvis, three spines, neck, head) and each side.
+    """Build `Names` from the trunk (pelvis, three spines, neck, head) and both sides.
 
-    A side lists thigh, shank, foot, toes, collar, upper arm, the joint that turns with the forearm's far end,
-    forearm, hand.
+    A side lists thigh, shank, foot, toes, collar, upper arm, the joint that rotates with the forearm's far
+    end, forearm, hand.
     """
     pelvis, spine1, spine2, spine3, neck, head = trunk.split()
     sides = (left.split(), right.split())
@@ -64,9 +64,9 @@ def _names(trunk: str, left: str, right: str) -> Names:
     for joint, name in zip((0, 3, 6, 9, 12, 15), (pelvis, spine1, spine2, spine3, neck, head), strict=True):
         joints[joint] = name
     bones: dict[int, tuple[str, str]] = {}
-    for side, (thigh, shank, foot, toes, collar, arm, turning, forearm, hand) in enumerate(sides):
+    for side, (thigh, shank, foot, toes, collar, arm, twisting, forearm, hand) in enumerate(sides):
         for joint, name in zip(
-            (1, 4, 7, 10, 13, 16, 18), (thigh, shank, foot, toes, collar, arm, turning), strict=True
+            (1, 4, 7, 10, 13, 16, 18), (thigh, shank, foot, toes, collar, arm, twisting), strict=True
         ):
             joints[joint + side] = name
         bones |= {
@@ -80,8 +80,8 @@ def _names(trunk: str, left: str, right: str) -> Names:
     return Names(tuple(joints), bones)
 
 
-# CMU forearms do not turn about their axis: the next joint (wrist) does all of it and nothing else. A sensor
-# near the wrist feels it.
+# CMU's forearms do not rotate about their axis: the next joint (wrist) does, and does nothing else. A sensor
+# near the wrist measures that rotation.
 CMU_BVH = _names(
     "Hips LowerBack Spine Spine1 Neck Head",
     "LeftUpLeg LeftLeg LeftFoot LeftToeBase LeftShoulder LeftArm LeftHand LeftForeArm LeftHand",
@@ -98,7 +98,7 @@ BANDAI = _names(
     "UpperLeg_R LowerLeg_R Foot_R Toes_R Shoulder_R UpperArm_R LowerArm_R LowerArm_R Hand_R",
 )
 
-# Angles of the T-pose that the BVH conversion put into its frame 0, degrees; the AMC files have none.
+# Angles of the T-pose in frame 0 of the BVH conversion, degrees; the AMC files have no T-pose.
 _CMU_T_POSE = {
     "lfemur": ("z", -21.0),
     "rfemur": ("z", 21.0),
@@ -111,23 +111,22 @@ _CMU_T_POSE = {
 
 
 def from_cmu_bvh(recording: JointTree, path: object) -> Motion:
-    """Motion of a CMU file in cgspeed's conversion: frame 0 is the T-pose, the motion starts after it.
+    """Retarget a CMU file in cgspeed's conversion: frame 0 is the T-pose, the motion starts after it.
 
-    Two takes (07_12, 09_10) go on with frames that are zero throughout before the motion starts; they are
-    left out too.
+    In two takes (07_12, 09_10) frames that are all zero follow the T-pose; these are left out, too.
 
     Raises:
-        EdgeposeError: frame 0 is no T-pose, or there is no frame after it; `path` is named in the message.
+        EdgeposeError: frame 0 is no T-pose, or no frame follows it; the message names `path`.
     """
     filled = (recording.rotations != np.eye(3)).any(axis=(1, 2, 3)) | recording.positions[:, 0].any(axis=1)
     filled[0] = False
     if not filled.any():
-        raise EdgeposeError(f"{path}: holds only the T-pose of frame 0, no motion")
+        raise EdgeposeError(f"{path}: contains only the T-pose of frame 0, no motion")
     start = int(np.argmax(filled))
     rotations, positions = forward(recording)
     ends = _bone_directions(CMU_BVH, recording.names, positions[0])
     if not near_rest(ends):
-        raise EdgeposeError(f"{path}: frame 0 is not the T-pose that CMU files in BVH start with")
+        raise EdgeposeError(f"{path}: frame 0 is not the T-pose, with which CMU's BVH files start")
     picked = rotations[:, _indices(CMU_BVH, recording.names)]
     return Motion(
         to_smpl(picked[start:], picked[0], ends),
@@ -138,15 +137,15 @@ def from_cmu_bvh(recording: JointTree, path: object) -> Motion:
 
 
 def from_cmu_amc(recording: JointTree, path: object) -> Motion:
-    """Motion of a CMU file in ASF/AMC; it agrees with `from_cmu_bvh` of the same take.
+    """Retarget a CMU file in ASF/AMC; the result agrees with `from_cmu_bvh` of the same take.
 
     Raises:
-        EdgeposeError: the skeleton is not laid out like theirs; `path` is named in the message.
+        EdgeposeError: the skeleton is not like CMU's; the message names `path`.
     """
     local = np.broadcast_to(np.eye(3), (1, len(recording.names), 3, 3)).copy()
     for name, (axis, angle) in _CMU_T_POSE.items():
         if name not in recording.names:
-            raise EdgeposeError(f"{path}: its skeleton has no {name}, so it is not CMU's")
+            raise EdgeposeError(f"{path}: the skeleton has no {name}, so it is not one of CMU's")
         local[0, recording.names.index(name)] = rotation_about_axis(axis, np.radians(angle))
     pose = recording._replace(rotations=local, positions=recording.offsets[None])
     t_pose, t_positions = forward(pose)
@@ -154,40 +153,44 @@ def from_cmu_amc(recording: JointTree, path: object) -> Motion:
     rotations, positions = forward(recording)
     ends = _bone_directions(CMU_AMC, recording.names, t_positions[0])
     if not near_rest(ends):
-        raise EdgeposeError(f"{path}: the limbs of its skeleton do not lie as in CMU's skeletons")
+        raise EdgeposeError(f"{path}: the limbs of the skeleton do not lie as in CMU's skeletons")
     return Motion(
         to_smpl(rotations[:, indices], t_pose[0, indices], ends), positions[:, 0], recording.rate, "cmu"
     )
 
 
-# What a straight stand measures in Bandai-Namco's axes, degrees; means over the 284 takes of dataset 2 in
-# normal style that stand with hanging arms (4450 frames, standard deviation up to 2.3). A wearer's
-# calibration makes these zero, so they belong to G0.
+# Angles of people who stand straight, in Bandai-Namco's axes, degrees: means over the 284 takes of dataset 2
+# in normal style that contain standing with hanging arms (4450 frames, standard deviation up to 2.3). A
+# wearer's calibration makes these angles zero, so they belong to G0.
 _BANDAI_HEAD = 8.5  # pitch forward
 _BANDAI_NECK = 4.1
-_BANDAI_COLLAR = 17.5  # yaw back, against the chest; dataset 2 only, in dataset 1 collars lie straight
-_BANDAI_FOOT = 39.0  # pitch of the line from ankle to toe joint on a flat sole
+_BANDAI_COLLAR = (
+    17.5  # yaw backwards, relative to the chest; only in dataset 2, collars are straight in dataset 1
+)
+_BANDAI_FOOT = 39.0  # pitch of the line from ankle to toe joint when the sole is flat on the floor
 _BANDAI_TOES = 23.0
 
 
 def from_bandai(recording: JointTree, path: object, collars_back: bool = True) -> Motion:
-    """Motion of a Bandai-Namco file, whose zero pose is no T-pose: G0 comes from what its bone axes mean.
+    """Retarget a Bandai-Namco file.
+
+    Its zero pose is no T-pose, so G0 follows from the directions of its bone axes.
 
     Args:
-        recording: what the file holds.
+        recording: content of the file.
         path: the file, for error messages.
-        collars_back: collars point 17.5 deg backwards in a straight stand, as in dataset 2, not in dataset 1.
+        collars_back: collars point 17.5 deg backwards in straight standing (dataset 2; not so in dataset 1).
 
     Raises:
-        EdgeposeError: the skeleton is not laid out like theirs.
+        EdgeposeError: the skeleton is not like Bandai-Namco's.
     """
     rotations, positions = forward(recording)
     picked = rotations[:, _indices(BANDAI, recording.names)].copy()
     for elbow, hand in ((18, "Hand_L"), (19, "Hand_R")):
-        # Some takes turn the forearm in its own joint, some in the hand's. A sensor near the wrist feels
+        # Some takes rotate the forearm in its own joint, some in the hand's. A sensor near the wrist measures
         # both.
         quats = matrix_to_quat(recording.rotations[:, recording.names.index(hand)])
-        quats[:, 2:] = 0.0  # what is left turns about x, the forearm's axis
+        quats[:, 2:] = 0.0  # leaves the rotation about x, the forearm's axis
         quats /= np.maximum(np.linalg.norm(quats, axis=-1, keepdims=True), 1e-9)
         picked[:, elbow] @= quat_to_matrix(quats)
     t_pose = bandai_t_pose(_BANDAI_COLLAR if collars_back else 0.0)
@@ -195,16 +198,16 @@ def from_bandai(recording: JointTree, path: object, collars_back: bool = True) -
     for limb, (start, end) in BANDAI.bones.items():
         joint, child = recording.names.index(start), recording.names.index(end)
         if recording.parents[child] != joint:
-            raise EdgeposeError(f"{path}: {end} does not hang from {start}")
+            raise EdgeposeError(f"{path}: {end} is not a child of {start}")
         ends[limb] = t_pose[limb] @ _unit(recording.offsets[child])
     if not near_rest(ends):
-        raise EdgeposeError(f"{path}: the limbs of its skeleton do not lie as in Bandai-Namco's skeleton")
+        raise EdgeposeError(f"{path}: the limbs of the skeleton do not lie as in Bandai-Namco's skeleton")
     translation = positions[:, recording.names.index(BANDAI.joints[0])] * BANDAI_METRES
     return Motion(to_smpl(picked, t_pose, ends), translation, recording.rate, "bandai-namco")
 
 
 def bandai_t_pose(collar: float) -> Array:
-    """Rotations (24, 3, 3) of Bandai-Namco's bones in a straight T-pose; `collar` is a yaw in degrees."""
+    """Return rotations (24, 3, 3) of Bandai-Namco's bones in a straight T-pose; `collar`: yaw, degrees."""
     left, up, forward_ = np.eye(3)
     axes = {  # directions of a bone's x, y, z
         "pelvis": (up, -left, forward_),
@@ -238,15 +241,15 @@ def bandai_t_pose(collar: float) -> Array:
 
 
 def to_smpl(rotations: Array, t_pose: Array, ends: dict[int, Array]) -> Array:
-    """Global SMPL rotations of source ones.
+    """Convert global rotations of a source to global SMPL rotations.
 
     Args:
-        rotations: (T, 24, 3, 3) global rotation of the source joint that each SMPL joint takes.
+        rotations: (T, 24, 3, 3) global rotation of each SMPL joint's source joint.
         t_pose: (24, 3, 3) the same in the source's T-pose.
         ends: unit direction (3,) of each limb bone (`LIMBS`) in the source's T-pose.
 
     Returns:
-        (T, 24, 3, 3), where a limb's SMPL rest direction turned by its rotation is the source's direction.
+        (T, 24, 3, 3) rotations that take the SMPL rest direction of each limb to its direction in the source.
     """
     correction = transpose(t_pose)
     for limb, direction in LIMBS.items():
@@ -258,7 +261,7 @@ def to_smpl(rotations: Array, t_pose: Array, ends: dict[int, Array]) -> Array:
 
 
 def has_names(names: Names, recording: JointTree) -> bool:
-    """Whether a recording has the joints of a source."""
+    """Return whether a recording has the joints of a source."""
     return {*names.joints, *(end for bone in names.bones.values() for end in bone)} <= set(recording.names)
 
 
@@ -267,7 +270,7 @@ def _indices(names: Names, joints: tuple[str, ...]) -> list[int]:
 
 
 def _bone_directions(names: Names, joints: tuple[str, ...], positions: Array) -> dict[int, Array]:
-    """Unit direction of each limb bone for joint positions (J, 3)."""
+    """Return the unit direction of each limb bone for joint positions (J, 3)."""
     return {
         limb: _unit(positions[joints.index(end)] - positions[joints.index(start)])
         for limb, (start, end) in names.bones.items()
@@ -275,7 +278,7 @@ def _bone_directions(names: Names, joints: tuple[str, ...], positions: Array) ->
 
 
 def near_rest(ends: dict[int, Array]) -> bool:
-    """Whether limbs lie within 20 deg of the directions of SMPL's zero pose."""
+    """Return whether all limbs lie within 20 deg of their directions in SMPL's zero pose."""
     least = np.cos(np.radians(20.0))
     return all(ends[limb] @ _DIRECTIONS[direction] > least for limb, direction in LIMBS.items())
 

@@ -1,1 +1,1 @@
-"""The networks."""
+"""Neural networks, as they are trained and as they run in archives."""

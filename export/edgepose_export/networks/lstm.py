@@ -1,8 +1,8 @@
-"""The recurrent networks of DIP 3.4 as they run: from calibrated frames to poses, one frame at a time.
+"""The recurrent networks of DIP 3.4 as they run in archives: from calibrated frames to poses, frame by frame.
 
-The LSTM cells are written out, which is several times quicker for single frames than `torch.nn.LSTM`, and an
-archive carries everything between calibration and pose: root normalisation, statistics, network, projection
-to rotations. Statistics are folded into the weights next to them.
+The LSTM cells are written out, which for single frames is several times faster than `torch.nn.LSTM`. An
+archive contains everything between calibration and pose: root normalisation, statistics, network, projection
+to rotations. Statistics are folded into the adjacent weights.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from edgepose_export.networks.shape import SIGMA_FLOOR, PoseDecoder, PoseNetwork
 
 
 class LstmCell(nn.Module):
-    """One LSTM direction, written out: the products of inputs and of states apart.
+    """One LSTM direction, written out, with separate products of inputs and of states.
 
-    Over a sequence the products of all inputs are one; only those of the states have to wait for each other.
+    Over a sequence, the inputs of all frames share one product; only the products of states are sequential.
     """
 
     def __init__(self, lstm: nn.LSTM, suffix: str, parts: int = 1) -> None:
-        """Copies one direction's weights.
+        """Copy the weights of one direction.
 
         Args:
-            lstm: a layer.
-            suffix: torch's, "" forwards, "_reverse" backwards.
-            parts: in how many equal parts the input comes, each with a product of its own.
+            lstm: the layer.
+            suffix: torch's suffix of the direction: "" forwards, "_reverse" backwards.
+            parts: number of equal parts that the input comes in, each with a product of its own.
         """
         super().__init__()
         self.size = lstm.hidden_size
@@ -35,8 +35,8 @@ class LstmCell(nn.Module):
             getattr(lstm, f"{name}_l0{suffix}").detach()
             for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
         )
-        # Rows of the candidate, the third of four gates, are doubled: tanh(x) = 2 sigmoid(2 x) - 1, so one
-        # sigmoid serves all four.
+        # The rows of the candidate, the third of four gates, are doubled, so that one sigmoid serves all
+        # four: tanh(x) = 2 sigmoid(2 x) - 1.
         scale = torch.tensor([1.0, 1.0, 2.0, 1.0]).repeat_interleave(self.size)[:, None]
         bias = (bias_ih + bias_hh) * scale[:, 0]
         self.inputs = nn.ModuleList(
@@ -46,24 +46,25 @@ class LstmCell(nn.Module):
         self.state = PackedLinear(weight_hh * scale)
 
     def forward(self, product: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-        """New h and c (B, hidden) from the inputs' product (B, 4 hidden) and the old ones."""
+        """Return the new h and c (B, hidden) from the inputs' product (B, 4 hidden) and the old h and c."""
         return self.step(self.state.onto(h, product), c)
 
     def step(self, gates: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-        """New h and c from the sum of both products (B, 4 hidden)."""
+        """Return the new h and c from the sum of both products (B, 4 hidden)."""
         i, f, g, o = torch.sigmoid(gates).chunk(4, dim=1)
         c = torch.addcmul(f * c - i, i, g, value=2.0)
         return o * torch.tanh(c), c
 
     @torch.jit.export
     def run(self, products: Tensor, reverse: bool) -> Tensor:
-        """Outputs (B, T, hidden) over the inputs' products (B, T, 4 hidden) from a zero state, in order or
-        from last to first.
+        """Return outputs (B, T, hidden) for the inputs' products (B, T, 4 hidden), from a zero state.
+
+        With `reverse`, the frames are processed from last to first.
         """
         rows = products.unbind(1)
         if reverse:
             rows = rows[::-1]
-        # The first state is zero: a product less.
+        # The first state is zero, which saves a product.
         h, c = self.step(rows[0], products.new_zeros(products.shape[0], self.size))
         outputs = [h] + self.over(rows[1:], h, c)[0]
         if reverse:
@@ -72,17 +73,18 @@ class LstmCell(nn.Module):
 
     @torch.jit.export
     def carry(self, products: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Outputs (B, T, hidden) over the inputs' products (B, T, 4 hidden) from a state, and the last h and
-        c.
+        """Return outputs (B, T, hidden) for the inputs' products (B, T, 4 hidden), continuing from a state.
+
+        Also return the last h and c.
         """
-        if products.shape[1] == 1:  # live; lists would cost a tenth of the time of a small network
+        if products.shape[1] == 1:  # live streams; lists would cost a small network a tenth of its time
             h, c = self(products[:, 0], h, c)
             return h.unsqueeze(1), h, c
         outputs, h, c = self.over(products.unbind(1), h, c)
         return torch.stack(outputs, dim=1), h, c
 
     def over(self, rows: list[Tensor], h: Tensor, c: Tensor) -> tuple[list[Tensor], Tensor, Tensor]:
-        """Outputs after each of some products, and the last h and c."""
+        """Return the outputs after each of some products, and the last h and c."""
         outputs: list[Tensor] = []
         for row in rows:
             h, c = self(row, h, c)
@@ -98,12 +100,12 @@ class LstmCell(nn.Module):
 
 
 class NormalisationAndDecoding(nn.Module):
-    """What both archives share: the layers before and after the recurrent ones."""
+    """The layers before and after the recurrent ones, which both archives share."""
 
     def __init__(
         self, network: PoseNetwork, input_mean: Tensor, input_std: Tensor, decoder: PoseDecoder
     ) -> None:
-        """Takes the network's dense layers and the statistics of its inputs, 60 in the paper."""
+        """Copy the network's dense layers and fold in the statistics of its inputs (60 in the paper)."""
         super().__init__()
         shape = network.shape
         self.scheme, self.with_acceleration = shape.normalisation, shape.acceleration
@@ -112,7 +114,7 @@ class NormalisationAndDecoding(nn.Module):
         self.smoothing = shape.smoothing
         dense = network.dense.weight.detach() / input_std
         self.dense = PackedLinear(dense, network.dense.bias.detach() - dense @ input_mean)
-        # The acceleration part of the outputs serves training alone.
+        # The acceleration part of the outputs is needed in training only.
         size = shape.pose_outputs
         mean, deviation = network.mean, network.deviation
         weights = [mean.weight[:size] * decoder.target_std[:, None], deviation.weight[:size]]
@@ -120,21 +122,28 @@ class NormalisationAndDecoding(nn.Module):
         self.heads = PackedLinear(torch.cat(weights), torch.cat(biases))
 
     def forward(self, orientation: Tensor, acceleration: Tensor) -> Tensor:
-        """First hidden layer (..., hidden) of calibrated frames."""
+        """Return the first hidden layer (..., hidden) of calibrated frames."""
         x = network_inputs(orientation, acceleration, self.scheme, self.with_acceleration)
         return torch.relu(self.dense(x))
 
     @torch.jit.export
     def start(self, batch: int) -> Tensor:
-        """State of the low-pass before the first frame: its stages' last outputs, (B, 2, pose outputs)."""
+        """Return the initial state of the low-pass: the last outputs (B, 2, pose outputs) of its stages."""
         return torch.zeros(batch, 2, self.decoder.target_mean.shape[0])
 
     @torch.jit.export
     def pose(
         self, orientation: Tensor, hidden: Tensor, lowpass: Tensor, count: int
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Local rotations (B, count, 24, 3, 3) and deviations (B, count, 24) of the last of the frames (B, T,
-        6, 3, 3) whose recurrent outputs are (B, T, hidden); and the low-pass' new state.
+        """Return local rotations (B, count, 24, 3, 3) and deviations (B, count, 24) of the last frames.
+
+        Also return the new state of the low-pass.
+
+        Args:
+            orientation: (B, T, 6, 3, 3) frames.
+            hidden: (B, T, hidden) recurrent outputs of these frames.
+            lowpass: state of the low-pass.
+            count: number of frames to return.
         """
         pose, deviation = self.heads(hidden).chunk(2, dim=-1)
         if self.smoothing > 0.0:
@@ -145,11 +154,10 @@ class NormalisationAndDecoding(nn.Module):
         return rotations, self.decoder.deviations(deviation), lowpass
 
     def smoothed(self, pose: Tensor, root: Tensor, lowpass: Tensor) -> tuple[Tensor, Tensor]:
-        """Two-pole low-pass over the frames of (B, T, pose outputs) as seen from the root (B, T, 3, 3), made
-        level; and its new state.
+        """Apply the low-pass to frames (B, T, pose outputs) in the level frame of the root (B, T, 3, 3).
 
-        It begins at zero and is not corrected for it: the first outputs are too small, but rotations are
-        made from the numbers' directions alone.
+        Also return the new state. The state starts at zero without correction: the first outputs are too
+        small, but only their directions matter for rotations.
         """
         tilt = tilt_of(root)
         first, second = lowpass.unbind(1)
@@ -163,21 +171,21 @@ class NormalisationAndDecoding(nn.Module):
 
 
 class RnnArchive(nn.Module):
-    """Unidirectional network: one step a frame, no look-ahead. Methods and shapes as in `BirnnArchive`."""
+    """Unidirectional network: one step per frame, no look-ahead. Methods and shapes as in `BirnnArchive`."""
 
     def __init__(self, network: PoseNetwork, ends: NormalisationAndDecoding) -> None:
-        """Takes a trained network's weights."""
+        """Copy a trained network's weights."""
         super().__init__()
         self.ends = ends
         self.cell1 = LstmCell(network.lstm1, "")
         self.cell2 = LstmCell(network.lstm2, "")
 
     def forward(self, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
-        """Poses of a whole sequence."""
+        """Return the poses of a whole sequence."""
         return self.last(orientation, acceleration, orientation.shape[1])
 
     def last(self, orientation: Tensor, acceleration: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        """Poses of the last frames of a sequence."""
+        """Return the poses of the last `count` frames of a sequence."""
         x = self.cell1.run(self.cell1.inputs[0](self.ends(orientation, acceleration)), False)
         x = self.cell2.run(self.cell2.inputs[0](x), False)
         rotations, std, _ = self.ends.pose(orientation, x, self.ends.start(x.shape[0]), count)
@@ -185,19 +193,19 @@ class RnnArchive(nn.Module):
 
     @torch.jit.export
     def pack(self, precision: str) -> None:
-        """Chooses how the recurrent layers keep their weights, see `PackedLinear.pack`."""
+        """Choose the precision of the recurrent layers' weights, see `PackedLinear.pack`."""
         self.cell1.pack(precision)
         self.cell2.pack(precision)
 
     @torch.jit.export
     def window(self, orientation: Tensor, acceleration: Tensor, index: int) -> tuple[Tensor, Tensor]:
-        """Pose of frame `index` of a window; later frames are not used."""
+        """Return the pose of frame `index` of a window; later frames are not used."""
         rotations, std = self.last(orientation[:, : index + 1], acceleration[:, : index + 1], 1)
         return rotations[:, 0], std[:, 0]
 
     @torch.jit.export
     def start(self, batch: int, future: int) -> list[Tensor]:
-        """State before the first frame; `future` must be 0."""
+        """Return the state before the first frame; `future` must be 0."""
         if future != 0:
             raise ValueError("a unidirectional network has no future frames")
         zero = torch.zeros(batch, self.cell1.size)
@@ -207,14 +215,14 @@ class RnnArchive(nn.Module):
     def stream(
         self, orientation: Tensor, acceleration: Tensor, state: list[Tensor]
     ) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """One frame on."""
+        """Process one frame: return its pose, deviations and the new state."""
         return self.stream_many(orientation.unsqueeze(1), acceleration.unsqueeze(1), state)
 
     @torch.jit.export
     def stream_many(
         self, orientation: Tensor, acceleration: Tensor, state: list[Tensor]
     ) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Several frames on."""
+        """Process several frames (B, T, ...): return their poses, deviations and the new state."""
         x = self.ends(orientation, acceleration)
         x, h1, c1 = self.cell1.carry(self.cell1.inputs[0](x), state[0], state[1])
         x, h2, c2 = self.cell2.carry(self.cell2.inputs[0](x), state[2], state[3])
@@ -223,31 +231,32 @@ class RnnArchive(nn.Module):
 
     @torch.jit.export
     def drain(self, state: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Nothing is ever left."""
+        """Return no poses: no frame ever waits."""
         batch = state[0].shape[0]
         return torch.zeros(batch, 0, 24, 3, 3), torch.zeros(batch, 0, 24)
 
 
 class BirnnArchive(nn.Module):
-    """Bidirectional network: whole sequence, exact window, or stream with carried forward states.
+    """Bidirectional network: whole sequences, exact windows, or streams with carried forward states.
 
-    Everywhere `orientation` is (B, [T,] 6, 3, 3), calibrated bone orientations R_TB, and `acceleration`
-    (B, [T,] 6, 3), m/s^2 in T without gravity; B counts wearers. Poses are (B, [T,] 24, 3, 3) local rotations
+    In all methods `orientation` is (B, [T,] 6, 3, 3), calibrated bone orientations R_TB, and `acceleration`
+    (B, [T,] 6, 3), m/s^2 in T without gravity, for B wearers. Poses are (B, [T,] 24, 3, 3) local rotations
     with (B, [T,] 24) standard deviations in radians.
 
-    The second layer's input comes in two parts, what the first layer says forwards and backwards: in a stream
-    the first is known for good once its frame has come, the second changes with every new frame.
+    The input of the second layer has two parts, the first layer's forward and backward outputs. In a stream
+    the forward output of a frame is final once the frame has arrived; the backward output changes with every
+    new frame.
     """
 
     def __init__(self, network: PoseNetwork, ends: NormalisationAndDecoding) -> None:
-        """Takes a trained network's weights."""
+        """Copy a trained network's weights."""
         super().__init__()
         self.ends = ends
         self.forward1, self.backward1 = LstmCell(network.lstm1, ""), LstmCell(network.lstm1, "_reverse")
         self.forward2, self.backward2 = LstmCell(network.lstm2, "", 2), LstmCell(network.lstm2, "_reverse", 2)
 
     def layer1(self, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
-        """Outputs (B, T, hidden) of the first layer over a sequence, forwards and backwards."""
+        """Return the outputs (B, T, hidden) of the first layer over a sequence, forwards and backwards."""
         x = self.ends(orientation, acceleration)
         return (
             self.forward1.run(self.forward1.inputs[0](x), False),
@@ -255,15 +264,15 @@ class BirnnArchive(nn.Module):
         )
 
     def forward2_products(self, ahead: Tensor, back: Tensor) -> Tensor:
-        """What both parts of its input give for the second layer's forward direction."""
+        """Return the product of the second layer's whole input with its forward weights."""
         return self.forward2.inputs[0](ahead) + self.forward2.inputs[1](back)
 
     def backward2_products(self, ahead: Tensor, back: Tensor) -> Tensor:
-        """The same for the backward direction."""
+        """Return the product of the second layer's whole input with its backward weights."""
         return self.backward2.inputs[0](ahead) + self.backward2.inputs[1](back)
 
     def forward(self, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
-        """Poses of a whole sequence."""
+        """Return the poses of a whole sequence."""
         ahead, back = self.layer1(orientation, acceleration)
         frames = orientation.shape[1]
         hidden = self.layer2(ahead, back, 0, frames)
@@ -271,16 +280,14 @@ class BirnnArchive(nn.Module):
         return rotations, std
 
     def layer2(self, ahead: Tensor, back: Tensor, first: int, end: int) -> Tensor:
-        """Outputs (B, end - first, 2 hidden) of the second layer over a sequence, of the frames from `first`
-        to before `end`.
-        """
+        """Return outputs (B, end - first, 2 hidden) of the second layer for frames `first` to `end` - 1."""
         past = self.forward2.run(self.forward2_products(ahead[:, :end], back[:, :end]), False)
         later = self.backward2.run(self.backward2_products(ahead[:, first:], back[:, first:]), True)
         return torch.cat([past[:, first:], later[:, : end - first]], dim=-1)
 
     @torch.jit.export
     def pack(self, precision: str) -> None:
-        """Chooses how the recurrent layers keep their weights, see `PackedLinear.pack`."""
+        """Choose the precision of the recurrent layers' weights, see `PackedLinear.pack`."""
         self.forward1.pack(precision)
         self.backward1.pack(precision)
         self.forward2.pack(precision)
@@ -288,9 +295,9 @@ class BirnnArchive(nn.Module):
 
     @torch.jit.export
     def window(self, orientation: Tensor, acceleration: Tensor, index: int) -> tuple[Tensor, Tensor]:
-        """Pose of frame `index` of a window (DIP 3.4), the same as `forward` over the window gives there.
+        """Return the pose of frame `index` of a window (DIP 3.4), equal to that of `forward` over the window.
 
-        The second layer runs only over the frames that reach `index`: with smoothing, all of them do.
+        The second layer runs only over frames that influence frame `index`; with smoothing, all of them do.
         """
         ahead, back = self.layer1(orientation, acceleration)
         first = 0 if self.ends.smoothing > 0.0 else index
@@ -301,11 +308,11 @@ class BirnnArchive(nn.Module):
 
     @torch.jit.export
     def start(self, batch: int, future: int) -> list[Tensor]:
-        """State before the first frame of a stream in which each pose sees `future` later frames.
+        """Return the state before the first frame of a stream in which each pose uses `future` later frames.
 
-        The state is [h1, c1, h2, c2, then of the frames that wait for their future: products of layer 1
-        backwards, known products of layer 2 forwards, the same backwards, orientations; the low-pass' state;
-        last a tensor whose length is `future`].
+        The state is [h1, c1, h2, c2; for the frames that wait for their future: products of layer 1
+        backwards, known products of layer 2 forwards, the same backwards, orientations; the state of the
+        low-pass; a tensor whose length is `future`].
         """
         size = self.forward1.size
         zero, waiting = torch.zeros(batch, size), torch.zeros(batch, 0, 4 * size)
@@ -314,11 +321,11 @@ class BirnnArchive(nn.Module):
         return [zero, zero, zero, zero, waiting, waiting, waiting, orientations, lowpass, torch.zeros(future)]
 
     def oldest(self, state: list[Tensor], count: int, future: int) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Poses of the oldest waiting frames, each seen with `future` that wait behind it, and the state
-        without them.
+        """Return the poses of the `count` oldest waiting frames, and the state without these frames.
 
-        Forward states are carried; backward passes start anew for each frame at the last one that it sees
-        (latency-controlled bidirectional LSTM). Those of several frames run side by side.
+        Each pose uses `future` frames that wait behind its own. Forward states carry over; the backward pass
+        of each frame starts afresh at the last frame it uses (latency-controlled bidirectional LSTM). The
+        backward passes of several frames run side by side.
         """
         batch = state[0].shape[0]
         back = self.backward1.run(_fields(state[4], count, future), True)
@@ -334,9 +341,9 @@ class BirnnArchive(nn.Module):
     def stream(
         self, orientation: Tensor, acceleration: Tensor, state: list[Tensor]
     ) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """One frame on: the pose of the frame `future` frames ago, (B, 1, 24, 3, 3).
+        """Process one frame and return the pose (B, 1, 24, 3, 3) of the frame `future` frames ago.
 
-        Or none, (B, 0, 24, 3, 3), while too few frames have come.
+        The result is empty, (B, 0, 24, 3, 3), until enough frames have arrived.
         """
         return self.stream_many(orientation.unsqueeze(1), acceleration.unsqueeze(1), state)
 
@@ -344,7 +351,7 @@ class BirnnArchive(nn.Module):
     def stream_many(
         self, orientation: Tensor, acceleration: Tensor, state: list[Tensor]
     ) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Several frames (B, T, ...) on: all poses that are due, those `stream` gives one by one."""
+        """Process several frames (B, T, ...) and return all poses that `stream` would return one by one."""
         x = self.ends(orientation, acceleration)
         ahead, h1, c1 = self.forward1.carry(self.forward1.inputs[0](x), state[0], state[1])
         state = [
@@ -368,7 +375,7 @@ class BirnnArchive(nn.Module):
 
     @torch.jit.export
     def drain(self, state: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Poses of all frames that still wait when a stream ends, oldest first."""
+        """Return the poses of all frames that still wait when a stream ends, oldest first."""
         batch = state[0].shape[0]
         rotations: list[Tensor] = [torch.zeros(batch, 0, 24, 3, 3)]
         stds: list[Tensor] = [torch.zeros(batch, 0, 24)]
@@ -380,5 +387,5 @@ class BirnnArchive(nn.Module):
 
 
 def _fields(waiting: Tensor, count: int, future: int) -> Tensor:
-    """What each of the `count` oldest frames of (B, T, N) sees, (B * count, future + 1, N)."""
+    """Return the frames that each of the `count` oldest of (B, T, N) uses, (B * count, future + 1, N)."""
     return waiting.narrow(1, 0, count + future).unfold(1, future + 1, 1).transpose(2, 3).flatten(0, 1)

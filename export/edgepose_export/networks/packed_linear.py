@@ -1,7 +1,7 @@
-"""Matrix products of an archive: in f32 as it is stored, or with weights packed as fp16 or int8 numbers.
+"""Matrix products of an archive, with weights in f32 as they are stored, or packed as fp16 or int8.
 
-One frame at a time, the time of a product is the time in which its weights come from memory; half as many
-bytes take about half as long.
+For single frames a product takes as long as reading its weights from memory, so half the bytes take about
+half the time.
 """
 
 # No `from __future__ import annotations`: TorchScript needs the type of an attribute, not its text.
@@ -12,44 +12,45 @@ from torch import Tensor, nn
 
 
 class PackedLinear(nn.Module):
-    """`x W + b`, scriptable; `pack` chooses the numbers that W is kept in."""
+    """`x W + b`, scriptable; `pack` chooses the precision of W."""
 
     packed: Optional[torch.classes.quantized.LinearPackedParamsBase]  # noqa: UP045
 
     def __init__(self, weight: Tensor, bias: Tensor | None = None) -> None:
-        """Takes torch's weight (outputs, inputs) and a bias (outputs,), zero when None."""
+        """Copy a weight (outputs, inputs) in torch's layout and a bias (outputs,), zero if None."""
         super().__init__()
-        # In this order a handful of frames at once takes two thirds of the time.
+        # With this layout a handful of frames takes two thirds of the time.
         self.register_buffer("weight", weight.detach().t().contiguous())
         self.register_buffer("bias", torch.zeros(len(weight)) if bias is None else bias.detach().clone())
         self.precision = "f32"
         self.packed = None
 
     def forward(self, x: Tensor) -> Tensor:
-        """Products (..., outputs) of x (..., inputs), with the bias."""
+        """Return the products (..., outputs) of x (..., inputs), with the bias."""
         if self.precision == "f32":
             return torch.matmul(x, self.weight) + self.bias
         return self.with_packed(x)
 
     def onto(self, x: Tensor, other: Tensor) -> Tensor:
-        """The same of x (N, inputs), without a bias, added to `other` (N, outputs)."""
+        """Return the products of x (N, inputs), without a bias, plus `other` (N, outputs)."""
         if self.precision == "f32":
             return torch.addmm(other, x, self.weight)
         return self.with_packed(x) + other
 
     def with_packed(self, x: Tensor) -> Tensor:
-        """Products with the packed weights, with the bias."""
+        """Return the products with the packed weights, with the bias."""
         packed = torch.jit._unwrap_optional(self.packed)
         if self.precision == "fp16":
             return torch.ops.quantized.linear_dynamic_fp16(x, packed)
-        # Inputs of 7 bits: processors without VNNI add two products in 16 bits, which 8 would overflow.
+        # 7-bit inputs: processors without VNNI add two products in 16 bits, which 8-bit inputs would
+        # overflow.
         return torch.ops.quantized.linear_dynamic(x, packed, True)
 
     @torch.jit.export
     def pack(self, precision: str) -> None:
-        """Keeps the weights as "fp16" or "int8" from now on; "f32" leaves them as they are.
+        """Pack the weights as "fp16" or "int8"; "f32" leaves them as they are.
 
-        torch raises RuntimeError where this machine has no such products.
+        torch raises RuntimeError if this machine has no such products.
         """
         if precision == self.precision:
             return

@@ -1,8 +1,8 @@
-"""The papers' networks without recurrence (DIP appendix A): each pose comes from a field of frames around it.
+"""The paper's networks without recurrence (DIP appendix A): each pose depends on a receptive field of frames.
 
-A network has `past` and `future`, the frames of its field, and two methods: `hidden` takes sequences that
-are longer than the result by the field, and `heads` turns that into means and standard deviations. Where a
-sequence does not reach so far, its first and last frame stand in for those beyond.
+A network has `past` and `future`, the frames of its field, and two methods: `hidden` takes sequences that are
+longer than the result by the field, and `heads` turns the result into means and standard deviations. At the
+ends of a sequence, the first and last frames are repeated to fill the field.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from edgepose_export.networks.normalisation import Inputs
 from edgepose_export.networks.shape import SIGMA_FLOOR, NetworkShape, PoseDecoder
 
 KERNEL = 2
-"""Frames that a layer of the WaveNet joins."""
+"""Frames that a layer of the WaveNet combines."""
 
 DILATIONS = (1, 2, 4, 8, 16) * 2
-"""Frames between those, layer by layer: a field of 62 past frames. DIP does not give its sizes."""
+"""Distance of these frames, by layer: a field of 62 past frames. DIP does not state the sizes."""
 
 
 class _Heads(nn.Module):
@@ -38,35 +38,35 @@ class _Heads(nn.Module):
 
 
 def padded(x: Tensor, past: int, future: int) -> Tensor:
-    """Sequences (B, T, C) with their first and last frame repeated before and behind them."""
+    """Return sequences (B, T, C) padded with copies of their first and last frames."""
     before, behind = x[:, :1].expand(-1, past, -1), x[:, -1:].expand(-1, future, -1)
     return torch.cat([before, x, behind], dim=1)
 
 
 class FeedForward(nn.Module):
-    """Five dense layers over 20 past frames, the present and 5 future ones."""
+    """Five dense layers over 20 past frames, the present one and 5 future ones."""
 
     def __init__(self, shape: NetworkShape) -> None:
-        """Random weights for a shape; with 512 hidden units the layers are DIP's: 256, 512, 512, 256, 256."""
+        """Create random weights; with 512 hidden units the layers are DIP's: 256, 512, 512, 256, 256."""
         super().__init__()
         self.shape = shape
         self.past, self.future = 20, 5
         half = max(1, shape.hidden // 2)
         widths = [half, shape.hidden, shape.hidden, half, half]
-        # A dense layer over the field, at every frame, is a convolution.
+        # A dense layer over the field of every frame is a convolution.
         self.first = nn.Conv1d(shape.inputs, widths[0], self.past + 1 + self.future)
         self.others = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
         self.heads = _Heads(widths[-1], shape)
 
     def hidden(self, x: Tensor) -> Tensor:
-        """Last layer (B, T, units) of z-scored inputs (B, past + T + future, inputs)."""
+        """Return the last layer (B, T, units) for z-scored inputs (B, past + T + future, inputs)."""
         x = torch.relu(self.first(x.transpose(1, 2)).transpose(1, 2))
         for layer in self.others:
             x = torch.relu(layer(x))
         return x
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Normalised means and standard deviations (B, T, outputs) of z-scored inputs (B, T, inputs)."""
+        """Return normalised means and deviations (B, T, outputs) for z-scored inputs (B, T, inputs)."""
         mean, deviation = self.heads(self.hidden(padded(x, self.past, self.future)))
         return mean, deviation
 
@@ -82,17 +82,17 @@ class _DilatedLayer(nn.Module):
         self.residual = nn.Identity() if last else nn.Conv1d(channels, channels, 1)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """(B, channels, N - reach) for the next layer and for the output."""
+        """Return (B, channels, N - reach) for the next layer, and the same for the output."""
         filtered, gate = self.gates(x).chunk(2, dim=1)
         z = torch.tanh(filtered) * torch.sigmoid(gate)
         return self.residual(z) + x[:, :, self.reach :], self.skip(z)
 
 
 class WaveNet(nn.Module):
-    """Causal dilated convolutions: no future frames, a long past at the cost of ten layers."""
+    """Ten layers of causal dilated convolutions: a long past and no future frames."""
 
     def __init__(self, shape: NetworkShape) -> None:
-        """Random weights for a shape; `hidden` is the number of channels."""
+        """Create the layers with random weights; `hidden` is the number of channels."""
         super().__init__()
         self.shape = shape
         self.past, self.future = (KERNEL - 1) * sum(DILATIONS), 0
@@ -105,7 +105,7 @@ class WaveNet(nn.Module):
         self.heads = _Heads(shape.hidden, shape)
 
     def hidden(self, x: Tensor) -> Tensor:
-        """Last layer (B, T, units) of z-scored inputs (B, past + T, inputs)."""
+        """Return the last layer (B, T, units) for z-scored inputs (B, past + T, inputs)."""
         frames = x.shape[1] - self.past
         x = self.dense(x).transpose(1, 2)
         total = torch.zeros_like(x[:, :, :frames])
@@ -115,37 +115,37 @@ class WaveNet(nn.Module):
         return torch.relu(self.out(torch.relu(total).transpose(1, 2)))
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Normalised means and standard deviations (B, T, outputs) of z-scored inputs (B, T, inputs)."""
+        """Return normalised means and deviations (B, T, outputs) for z-scored inputs (B, T, inputs)."""
         mean, deviation = self.heads(self.hidden(padded(x, self.past, self.future)))
         return mean, deviation
 
 
 class FieldArchive(nn.Module):
-    """A network over a field of frames, from calibrated frames to poses.
+    """Archive of a network over a receptive field, from calibrated frames to poses.
 
-    Methods and shapes as in `BirnnArchive`. Whole sequence, window and stream give the same pose where all of
-    them reach over the field.
+    Methods and shapes are those of `BirnnArchive`. Whole sequence, window and stream give the same pose if
+    each contains the whole field.
     """
 
     def __init__(self, network: FeedForward | WaveNet, inputs: Inputs, decoder: PoseDecoder) -> None:
-        """Takes a trained network."""
+        """Combine a trained network with its inputs and its decoder."""
         super().__init__()
         self.network, self.inputs, self.decoder = network, inputs, decoder
         self.past, self.future = network.past, network.future
 
     def forward(self, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
-        """Poses of a whole sequence."""
+        """Return the poses of a whole sequence."""
         mean, deviation = self.network(self.inputs(orientation, acceleration))
         return self.decoder(orientation, mean, deviation)
 
     @torch.jit.export
     def pack(self, precision: str) -> None:
-        """There is only one precision, "f32"."""
+        """Check the precision; only "f32" is supported."""
         if precision != "f32":
             raise ValueError("networks without recurrence run in f32 only")
 
     def at(self, x: Tensor, orientation: Tensor, index: int) -> tuple[Tensor, Tensor]:
-        """Pose of frame `index` of inputs (B, T, inputs), with its own orientation (B, 6, 3, 3)."""
+        """Return the pose of frame `index` of inputs (B, T, inputs), with its orientation (B, 6, 3, 3)."""
         first, last = max(0, index - self.past), min(x.shape[1], index + self.future + 1)
         field = padded(x[:, first:last], self.past - index + first, self.future + 1 + index - last)
         mean, deviation = self.network.heads(self.network.hidden(field)[:, 0])
@@ -153,14 +153,14 @@ class FieldArchive(nn.Module):
 
     @torch.jit.export
     def window(self, orientation: Tensor, acceleration: Tensor, index: int) -> tuple[Tensor, Tensor]:
-        """Pose of frame `index` of a window."""
+        """Return the pose of frame `index` of a window."""
         return self.at(self.inputs(orientation, acceleration), orientation[:, index], index)
 
     @torch.jit.export
     def start(self, batch: int, future: int) -> list[Tensor]:
-        """State before the first frame of a stream in which each pose sees up to `future` later frames.
+        """Return the initial state of a stream in which each pose uses up to `future` later frames.
 
-        The state is [inputs of the frames that may still be seen, orientations of the frames that wait for a
+        The state is [inputs of the frames that are still needed, orientations of the frames that wait for a
         pose, a tensor whose length is `future`].
         """
         return [
@@ -170,7 +170,7 @@ class FieldArchive(nn.Module):
         ]
 
     def oldest(self, state: list[Tensor]) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Pose of the oldest waiting frame and the state without it."""
+        """Return the pose of the oldest waiting frame, and the state without it."""
         seen, waiting = state[0], state[1]
         index = seen.shape[1] - waiting.shape[1]
         rotations, std = self.at(seen, waiting[:, 0], index)
@@ -181,7 +181,7 @@ class FieldArchive(nn.Module):
     def stream(
         self, orientation: Tensor, acceleration: Tensor, state: list[Tensor]
     ) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """One frame on: the pose of the frame `future` frames ago, or none while too few have come."""
+        """Process one frame; return the pose of the frame `future` frames ago, if there is one."""
         x = self.inputs(orientation, acceleration).unsqueeze(1)
         state = [
             torch.cat([state[0], x], dim=1),
@@ -198,7 +198,7 @@ class FieldArchive(nn.Module):
     def stream_many(
         self, orientation: Tensor, acceleration: Tensor, state: list[Tensor]
     ) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Several frames (B, T, ...) on: all poses that are due."""
+        """Process several frames (B, T, ...) and return all poses that are due."""
         batch = orientation.shape[0]
         rotations: list[Tensor] = [torch.zeros(batch, 0, 24, 3, 3)]
         stds: list[Tensor] = [torch.zeros(batch, 0, 24)]
@@ -210,7 +210,7 @@ class FieldArchive(nn.Module):
 
     @torch.jit.export
     def drain(self, state: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Poses of all frames that still wait when a stream ends, oldest first."""
+        """Return the poses of all frames that still wait when a stream ends, oldest first."""
         batch = state[0].shape[0]
         rotations: list[Tensor] = [torch.zeros(batch, 0, 24, 3, 3)]
         stds: list[Tensor] = [torch.zeros(batch, 0, 24)]

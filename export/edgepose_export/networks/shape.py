@@ -1,4 +1,4 @@
-"""The networks of DIP 3.4 as they are trained, with `torch.nn.LSTM`, and what their numbers mean.
+"""The networks of DIP 3.4 in the form in which they are trained, with `torch.nn.LSTM`, and their decoder.
 
 `edgepose_export.networks.lstm` has the form in which the same weights run.
 """
@@ -16,14 +16,14 @@ from edgepose.skeleton import PARENTS, PREDICTED, UNOBSERVED
 from edgepose_export.networks.normalisation import tilt_of
 
 SIGMA_FLOOR = 0.02
-"""Smallest standard deviation a network may claim, in normalised units.
+"""Smallest standard deviation a network can predict, in normalised units.
 
-Without it, joints that never move take all gradient.
+Without it, joints that never move would dominate the gradient.
 """
 
 
 class NetworkShape(NamedTuple):
-    """What decides the weights' shapes, the meaning of the outputs and what is done with them.
+    """Choices that decide the shapes of the weights and the meaning and processing of the outputs.
 
     Attributes:
         kind: "birnn" or "rnn" (DIP 3.4), "feed-forward" or "wavenet" (DIP appendix A).
@@ -32,14 +32,14 @@ class NetworkShape(NamedTuple):
             each rotation in the root's frame).
         measured: "predicted" (the paper: all 15 joints come from the network) or "passed" (bones that carry a
             sensor take its orientation; the network predicts the other 10). "passed" needs "global-6d".
-        normalisation: of the inputs, one of `normalisation.SCHEMES`.
+        normalisation: normalisation of the inputs, one of `normalisation.SCHEMES`.
         acceleration: whether accelerations are inputs (without: DIP appendix D).
         smoothing: of a recurrent network, both poles of a low-pass over its rotations, 0 (none) to 0.99: each
-            of two stages keeps this share of what it gave in the last frame. It is there in training too, so
-            that the network learns to make up for its delay. It works on rotations as seen from a level
-            pelvis (`normalisation.tilt_of`). Seen from the pelvis itself a bone at rest moves whenever the
-            pelvis shakes, and smoothing would leave it that; seen from the room the body would stay behind
-            in every turn, of which the inputs tell nothing. Needs "global-6d".
+            of two stages keeps this share of its last output. It is active in training, too, so that the
+            network learns to compensate for its delay. It works in a level pelvis frame
+            (`normalisation.tilt_of`). In the frame of the pelvis itself, a bone at rest moves whenever the
+            pelvis shakes, and smoothing would not undo that. In the room's frame, the body would lag behind
+            in every turn, which the inputs do not show. Needs "global-6d".
     """
 
     kind: str = "birnn"
@@ -52,10 +52,10 @@ class NetworkShape(NamedTuple):
 
     @property
     def inputs(self) -> int:
-        """Numbers of the input: 60 in the paper."""
+        """Number of inputs: 60 in the paper."""
         sensors = len(PLACEMENTS) - (self.normalisation in ("root", "tilt"))
-        own = 3 + 3 * self.acceleration if self.normalisation == "tilt" else 0
-        return sensors * (9 + 3 * self.acceleration) + own
+        of_root = 3 + 3 * self.acceleration if self.normalisation == "tilt" else 0
+        return sensors * (9 + 3 * self.acceleration) + of_root
 
     @property
     def joints(self) -> tuple[int, ...]:
@@ -64,12 +64,12 @@ class NetworkShape(NamedTuple):
 
     @property
     def numbers(self) -> int:
-        """Numbers a joint."""
+        """Numbers per joint."""
         return 9 if self.targets == "local-matrix" else 6
 
     @property
     def pose_outputs(self) -> int:
-        """Numbers of the pose part of the output."""
+        """Number of outputs that encode the pose."""
         return len(self.joints) * self.numbers
 
 
@@ -77,7 +77,7 @@ class PoseNetwork(nn.Module):
     """Dense layer with ReLU, two LSTM layers, heads for means and standard deviations (DIP figure 12)."""
 
     def __init__(self, shape: NetworkShape) -> None:
-        """Random weights for a shape."""
+        """Create the layers with random weights."""
         super().__init__()
         self.shape = shape
         both = shape.kind == "birnn"
@@ -90,15 +90,15 @@ class PoseNetwork(nn.Module):
         self.deviation = nn.Linear(width, outputs)
 
     def forward(self, x: Tensor, future: int = 0) -> tuple[Tensor, Tensor]:
-        """Normalised means and standard deviations of z-scored inputs.
+        """Return normalised means and standard deviations for z-scored inputs.
 
         Args:
             x: (B, T, inputs).
-            future: of a bidirectional network: run it as a stream runs, in which a frame knows so many frames
-                after it; 0 for whole sequences.
+            future: run a bidirectional network as a stream, in which each pose uses `future` later frames; 0
+                for whole sequences.
 
         Returns:
-            Twice (B, T, outputs); of a stream (B, T - future, outputs), the frames whose future is known.
+            Both (B, T, outputs); in a stream (B, T - future, outputs), for the frames whose future is known.
         """
         x = torch.relu(self.dense(x))
         if future == 0:
@@ -109,8 +109,10 @@ class PoseNetwork(nn.Module):
         return self.mean(x), nn.functional.softplus(self.deviation(x)) + SIGMA_FLOOR
 
     def _streamed(self, x: Tensor, future: int) -> Tensor:
-        """Outputs (B, T - future, 2 hidden) of the recurrent layers as `recurrent.BirnnArchive.stream` gives
-        them: forward states go on, backward passes run over a frame and its future only.
+        """Return the outputs (B, T - future, 2 hidden) of the recurrent layers in a stream.
+
+        As in `lstm.BirnnArchive.stream`, forward states carry over, and backward passes run over a frame and
+        its future only.
         """
         forward1 = _direction(self.lstm1, x, "")
         backward1 = _direction(self.lstm1, _ahead(x, future), "_reverse")
@@ -122,35 +124,37 @@ class PoseNetwork(nn.Module):
 
 
 def smoothed(pose: Tensor, root: Tensor, smoothing: float) -> Tensor:
-    """Low-pass over the frames of "global-6d" numbers (B, T, 6 N) as seen from a level pelvis: weighted means
-    of each frame and all before it, which `recurrent.Ends.smoothed` carries on but for their scale.
+    """Apply the low-pass to "global-6d" numbers (B, T, 6 N) in the level frame of the pelvis.
+
+    The results are weighted means of each frame and all frames before it. Apart from their scale they equal
+    those of `lstm.NormalisationAndDecoding.smoothed`, which works frame by frame.
 
     Args:
-        pose: numbers in the targets' own units.
+        pose: numbers in the units of the targets.
         root: (B, T, 3, 3) orientation of the pelvis sensor's bone.
         smoothing: see `NetworkShape`.
     """
     frame = torch.arange(pose.shape[1], device=pose.device, dtype=pose.dtype)
     age = (frame[:, None] - frame).clamp_min(0.0)
-    weights = ((age + 1.0) * smoothing**age).tril()  # what two equal poles answer to an impulse
-    weights = weights * (weights > 1e-20)  # numbers that are smaller still make products slow
+    weights = ((age + 1.0) * smoothing**age).tril()  # impulse response of two equal poles
+    weights = weights * (weights > 1e-20)  # smaller weights would still slow the product down
     weights = weights / weights.sum(dim=1, keepdim=True)
     tilt = tilt_of(root)
     return turned(weights @ turned(pose, tilt), tilt.transpose(-1, -2))
 
 
 def turned(pose: Tensor, rotation: Tensor) -> Tensor:
-    """Numbers (..., 3 N), N vectors, turned by rotations (..., 3, 3)."""
+    """Rotate N vectors (..., 3 N) by rotations (..., 3, 3)."""
     return torch.matmul(pose.unflatten(-1, (-1, 3)), rotation.transpose(-1, -2)).flatten(-2)
 
 
 def _ahead(x: Tensor, future: int) -> Tensor:
-    """Each frame of (B, T, units) with its future: (B (T - future), 1 + future, units)."""
+    """Return each frame of (B, T, units) with its future: (B (T - future), 1 + future, units)."""
     return x.unfold(1, future + 1, 1).transpose(-1, -2).flatten(0, 1)
 
 
 def _direction(lstm: nn.LSTM, x: Tensor, suffix: str) -> Tensor:
-    """Outputs (B, T, hidden) of one direction of a layer: "" forwards, "_reverse" from last to first."""
+    """Return the outputs (B, T, hidden) of one direction of a layer: "" forwards, "_reverse" backwards."""
     names = ("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0")
     weights = [getattr(lstm, name + suffix) for name in names]
     zero = x.new_zeros(1, len(x), lstm.hidden_size)
@@ -160,7 +164,7 @@ def _direction(lstm: nn.LSTM, x: Tensor, suffix: str) -> Tensor:
 
 
 class PoseDecoder(nn.Module):
-    """Network outputs to SMPL's 24 local rotations; differentiable, scriptable."""
+    """Decoder from network outputs to SMPL's 24 local rotations; differentiable, scriptable."""
 
     def __init__(
         self,
@@ -169,13 +173,13 @@ class PoseDecoder(nn.Module):
         target_std: Tensor,
         std_scale: Tensor | None = None,
     ) -> None:
-        """Decoder of a network's outputs, whose pose part was normalised by these statistics.
+        """Store the statistics by which the targets were normalised.
 
         Args:
-            shape: of the network.
+            shape: shape of the network.
             target_mean: (pose outputs,) means of the targets.
-            target_std: (pose outputs,) their standard deviations.
-            std_scale: (24,) factors of the joints' standard deviations; ones when None.
+            target_std: (pose outputs,) standard deviations of the targets.
+            std_scale: (24,) factors of the joints' standard deviations; all 1 if None.
         """
         super().__init__()
         self.local = shape.targets == "local-matrix"
@@ -190,16 +194,16 @@ class PoseDecoder(nn.Module):
         self.register_buffer("variances", _variances(shape, target_std, scale))
 
     def forward(self, orientation: Tensor, mean: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
-        """Poses of frames.
+        """Return the poses of frames.
 
         Args:
             orientation: (..., 6, 3, 3) calibrated bone orientations R_TB.
             mean: (..., pose outputs + 15) means in normalised units.
-            deviation: the same shape, standard deviations.
+            deviation: standard deviations of the same shape.
 
         Returns:
-            (..., 24, 3, 3) local rotations, joint 0 the pelvis sensor's orientation; (..., 24) standard
-            deviations, radians.
+            (..., 24, 3, 3) local rotations, of which joint 0 is the pelvis sensor's orientation; (..., 24)
+            standard deviations, radians.
         """
         size = self.joints * self.numbers
         pose = mean[..., :size] * self.target_std + self.target_mean
@@ -207,12 +211,12 @@ class PoseDecoder(nn.Module):
 
     @torch.jit.export
     def deviations(self, deviation: Tensor) -> Tensor:
-        """Standard deviations (..., 24), radians, of those (..., pose outputs) in normalised units."""
+        """Convert standard deviations (..., pose outputs) in normalised units to (..., 24) radians."""
         return torch.sqrt(torch.matmul(deviation.square(), self.variances))
 
     @torch.jit.export
     def rotations(self, orientation: Tensor, pose: Tensor) -> Tensor:
-        """Local rotations (..., 24, 3, 3) of the pose part (..., pose outputs) in the targets' own units."""
+        """Return local rotations (..., 24, 3, 3) of the pose (..., pose outputs), in the targets' units."""
         y = pose.unflatten(-1, (self.joints, self.numbers))
         root = orientation[..., -1, :, :]
         identity = torch.eye(3, dtype=y.dtype).expand_as(root).unsqueeze(-3)
@@ -228,21 +232,21 @@ class PoseDecoder(nn.Module):
 
 
 def _sources(shape: NetworkShape) -> list[int]:
-    """For each of the 24 joints the row of [identity, predicted..., measured...] that holds its rotation."""
+    """Return for each of the 24 joints the row of [identity, predicted..., measured...] with its rotation."""
     rows = {joint: 1 + i for i, joint in enumerate(shape.joints)}
     if shape.measured == "passed":
         rows |= {bone: 1 + len(shape.joints) + i for i, bone in enumerate(BONES[:ROOT])}
     result = [0]
     for joint in range(1, 24):
-        # Feet, toes, wrists and hands rest: locally the identity, globally their parent's rotation.
+        # Feet, toes, wrists and hands stay at rest: locally the identity, globally their parent's rotation.
         rest = 0 if shape.targets == "local-matrix" else result[PARENTS[joint]]
         result.append(rows.get(joint, rest))
     return result
 
 
 def _variances(shape: NetworkShape, target_std: Tensor, std_scale: Tensor) -> Tensor:
-    """What each output's variance in normalised units adds to each joint's in rad^2, (pose outputs, 24)."""
-    # A small rotation by d moves a matrix's entries by sqrt(2) d, those of its first two columns by
+    """Return factors (pose outputs, 24) from each output's normalised variance to each joint's in rad^2."""
+    # A small rotation by d changes a matrix by sqrt(2) d (Frobenius norm), its first two columns by
     # sqrt(4/3) d on average.
     spread = 2.0 if shape.targets == "local-matrix" else 4.0 / 3.0
     joint = torch.tensor(shape.joints).repeat_interleave(shape.numbers)

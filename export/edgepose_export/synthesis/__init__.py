@@ -1,1 +1,1 @@
-"""Virtual sensors, and what makes them like real ones."""
+"""Virtual sensors, their errors, and augmentation of motion."""

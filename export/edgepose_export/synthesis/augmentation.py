@@ -1,4 +1,4 @@
-"""What training does to a batch so that a network bears a real wearer."""
+"""Data augmentation for robustness to real wearers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from edgepose_export.networks.normalisation import rotations_of, turn_about_y
 from edgepose_export.synthesis.posture_variation import Batch
 
 
-def _swapped(names: tuple[str, ...]) -> list[int]:
+def _mirror_indices(names: tuple[str, ...]) -> list[int]:
     other = {"left": "right", "right": "left"}
     sides = [name.partition("_") for name in names]
     return [
@@ -22,28 +22,29 @@ def _swapped(names: tuple[str, ...]) -> list[int]:
     ]
 
 
-SENSOR_MIRROR = _swapped(PLACEMENTS)
-JOINT_MIRROR = _swapped(JOINTS)
+SENSOR_MIRROR = _mirror_indices(PLACEMENTS)
+JOINT_MIRROR = _mirror_indices(JOINTS)
 
 
 class Augmentation(NamedTuple):
-    """Sizes of the disturbances; one draw a sequence unless said.
+    """Strengths of the disturbances. They are drawn once per sequence unless stated otherwise.
 
     Attributes:
-        mirror: share of sequences whose left and right are exchanged.
-        misalignment_deg: deviation of each sensor's error against its bone, a rotation vector's each
-            component (a calibration pose that was not quite the pose).
-        heading_deg: deviation of each sensor's heading against the pelvis sensor.
-        acceleration_noise: deviation of white noise on each frame's accelerations, m/s^2.
-        acceleration_scale: deviation of each sensor's scale error.
+        mirror: share of sequences in which left and right are swapped.
+        misalignment_deg: standard deviation of each sensor's misalignment with its bone, per component of a
+            rotation vector (as from an inexact calibration pose).
+        heading_deg: standard deviation of each sensor's heading relative to the pelvis sensor.
+        acceleration_noise: standard deviation of white noise on the accelerations of each frame, m/s^2.
+        acceleration_scale: standard deviation of each sensor's scale error.
         aligned: share of sequences without misalignment and heading errors, so that a network trusts sensors
             that agree with each other.
-        pelvis_pitch_deg: deviation of a turn of the pelvis about its own X axis, of bone and sensor alike: as
-            if another actor's skeleton, in whom the trunk leans otherwise against the pelvis, did the same.
-            `Trainer` leaves sequences with made sitting alone, which the pelvis' pitch tells from standing.
-        silent: share of sequences in which one sensor is silent for a while, unless that ends before the
-            sequence begins or begins after it (an eighth of them).
-        posture: factor on `postures.DEVIATIONS`, by which wearers hold their joints otherwise.
+        pelvis_pitch_deg: standard deviation of a rotation of the pelvis, bone and sensor, about its own X
+            axis. It imitates actors whose trunk leans differently relative to the pelvis. `Trainer` does not
+            apply it to sequences with synthetic sitting, since the pelvis pitch is what tells sitting from
+            standing.
+        silent: share of sequences in which one sensor is silent for some time. In an eighth of them that time
+            lies before or after the sequence.
+        posture: factor on `posture_variation.DEVIATIONS`, the variation of how wearers hold their joints.
     """
 
     mirror: float = 0.5
@@ -58,8 +59,9 @@ class Augmentation(NamedTuple):
 
 
 def mirror(orientation: Tensor, acceleration: Tensor, relative: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Left and right exchanged by a reflection in the plane X = 0 of T; shapes (..., 6, 3, 3), (..., 6, 3),
-    (..., 24, 3, 3).
+    """Swap left and right by a reflection in the plane X = 0 of T.
+
+    The shapes are (..., 6, 3, 3), (..., 6, 3) and (..., 24, 3, 3).
     """
     flip = torch.tensor([-1.0, 1.0, 1.0])
     signs = flip[:, None] * flip
@@ -73,47 +75,49 @@ def mirror(orientation: Tensor, acceleration: Tensor, relative: Tensor) -> tuple
 def drop_sensor(
     orientation: Tensor, acceleration: Tensor, sensor: int, first: Tensor, end: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Sequences (B, T, 6, 3, 3), (B, T, 6, 3) with a silent sensor, whose bone `pipeline.dropout` moves on.
+    """Return sequences in which a sensor is silent and its bone is extrapolated as in `pipeline.dropout`.
 
     Args:
-        orientation: in T.
-        acceleration: in T.
-        sensor: which one, for all sequences.
+        orientation: (B, T, 6, 3, 3) in T.
+        acceleration: (B, T, 6, 3) in T.
+        sensor: index of the silent sensor, the same in all sequences.
         first: (B,) first silent frame, 1 or later.
         end: (B,) first frame that is measured again.
     """
     frame = torch.arange(orientation.shape[1])
-    gone = ((frame >= first[:, None]) & (frame < end[:, None]))[..., None]
+    silent = ((frame >= first[:, None]) & (frame < end[:, None]))[..., None]
     before = first[:, None] - 1
     sequence = torch.arange(len(orientation))[:, None]
     lower_legs = [i for i, name in enumerate(PLACEMENTS) if name.endswith("lower_leg")]
     if sensor == ROOT or sensor in lower_legs:
         leading = lower_legs if sensor == ROOT else [ROOT]
-        angle = _turns(orientation[:, :, leading]).mean(-1)
-        about = torch.zeros(*angle.shape, 3)
-        about[..., 1] = angle - angle[sequence, before]
-        turn = rotations_of(about)
+        angle = _heading_changes(orientation[:, :, leading]).mean(-1)
+        vertical = torch.zeros(*angle.shape, 3)
+        vertical[..., 1] = angle - angle[sequence, before]
+        rotation = rotations_of(vertical)
     else:
         root = orientation[:, :, ROOT]
-        turn = root @ root[sequence, before].mT
+        rotation = root @ root[sequence, before].mT
     orientation, acceleration = orientation.clone(), acceleration.clone()
-    going = turn @ orientation[sequence, before, sensor]
-    orientation[:, :, sensor] = torch.where(gone[..., None], going, orientation[:, :, sensor])
-    rest = 0.0 if sensor == ROOT else acceleration[:, :, ROOT]
-    acceleration[:, :, sensor] = torch.where(gone, rest, acceleration[:, :, sensor])
+    extrapolated = rotation @ orientation[sequence, before, sensor]
+    orientation[:, :, sensor] = torch.where(silent[..., None], extrapolated, orientation[:, :, sensor])
+    substitute = 0.0 if sensor == ROOT else acceleration[:, :, ROOT]
+    acceleration[:, :, sensor] = torch.where(silent, substitute, acceleration[:, :, sensor])
     return orientation, acceleration
 
 
-def _turns(orientation: Tensor) -> Tensor:
-    """Heading (B, T, N) of (B, T, N, 3, 3) since their first frame, radians, whole turns counted."""
+def _heading_changes(orientation: Tensor) -> Tensor:
+    """Return the unwrapped heading (B, T, N) of (B, T, N, 3, 3) relative to the first frame, radians."""
     step = turn_about_y(orientation).diff(dim=1)
     step = torch.remainder(step + torch.pi, 2.0 * torch.pi) - torch.pi
     return nn.functional.pad(step.cumsum(1), (0, 0, 1, 0))
 
 
-def augment(batch: Batch, how: Augmentation, generator: torch.Generator) -> Batch:
-    """Disturbed copies of sequences; their true poses are mirrored and get other pelvises only. All but
-    `posture`, which needs the frames around them.
+def augment(batch: Batch, sizes: Augmentation, generator: torch.Generator) -> Batch:
+    """Return disturbed copies of sequences.
+
+    The true poses change only by mirroring and by the pelvis pitch. `posture` is not applied here, because it
+    needs the frames around the sequences; see `vary_postures`.
     """
     orientation, acceleration, relative = batch
     size = len(orientation)
@@ -121,47 +125,51 @@ def augment(batch: Batch, how: Augmentation, generator: torch.Generator) -> Batc
     def normal(*shape: int) -> Tensor:
         return torch.randn(shape, generator=generator)
 
-    if how.mirror:
-        chosen = torch.rand(size, generator=generator) < how.mirror
+    if sizes.mirror:
+        chosen = torch.rand(size, generator=generator) < sizes.mirror
         mirrored = mirror(orientation[chosen], acceleration[chosen], relative[chosen])
         orientation, acceleration, relative = orientation.clone(), acceleration.clone(), relative.clone()
         orientation[chosen], acceleration[chosen], relative[chosen] = mirrored
-    if how.pelvis_pitch_deg:
+    if sizes.pelvis_pitch_deg:
         pitch = torch.zeros(size, 1, 3)
-        pitch[..., 0] = torch.deg2rad(how.pelvis_pitch_deg * normal(size, 1))
-        turn = rotations_of(pitch)
+        pitch[..., 0] = torch.deg2rad(sizes.pelvis_pitch_deg * normal(size, 1))
+        rotation = rotations_of(pitch)
         orientation, relative = orientation.clone(), relative.clone()
-        orientation[:, :, ROOT] = orientation[:, :, ROOT] @ turn
-        relative[:, :, 1:] = turn.mT.unsqueeze(2) @ relative[:, :, 1:]
-    turned = (
-        (torch.rand(size, generator=generator) >= how.aligned).float() if how.aligned else torch.ones(size)
+        orientation[:, :, ROOT] = orientation[:, :, ROOT] @ rotation
+        relative[:, :, 1:] = rotation.mT.unsqueeze(2) @ relative[:, :, 1:]
+    misaligned = (
+        (torch.rand(size, generator=generator) >= sizes.aligned).float()
+        if sizes.aligned
+        else torch.ones(size)
     )
-    if how.misalignment_deg:
-        angles = how.misalignment_deg * normal(size, 1, 6, 3) * turned[:, None, None, None]
+    if sizes.misalignment_deg:
+        angles = sizes.misalignment_deg * normal(size, 1, 6, 3) * misaligned[:, None, None, None]
         error = rotations_of(torch.deg2rad(angles))
         orientation = orientation @ error
-    if how.heading_deg:
+    if sizes.heading_deg:
         vertical = torch.zeros(size, 1, 6, 3)
-        vertical[..., :-1, 1] = torch.deg2rad(how.heading_deg * normal(size, 1, 5) * turned[:, None, None])
-        turn = rotations_of(vertical)
-        orientation = turn @ orientation
-        acceleration = (turn @ acceleration.unsqueeze(-1)).squeeze(-1)
-    if how.acceleration_scale:
-        acceleration = acceleration * (1.0 + how.acceleration_scale * normal(size, 1, 6, 1))
-    if how.acceleration_noise:
-        acceleration = acceleration + how.acceleration_noise * normal(*acceleration.shape)
-    if how.silent:
+        vertical[..., :-1, 1] = torch.deg2rad(
+            sizes.heading_deg * normal(size, 1, 5) * misaligned[:, None, None]
+        )
+        rotation = rotations_of(vertical)
+        orientation = rotation @ orientation
+        acceleration = (rotation @ acceleration.unsqueeze(-1)).squeeze(-1)
+    if sizes.acceleration_scale:
+        acceleration = acceleration * (1.0 + sizes.acceleration_scale * normal(size, 1, 6, 1))
+    if sizes.acceleration_noise:
+        acceleration = acceleration + sizes.acceleration_noise * normal(*acceleration.shape)
+    if sizes.silent:
         orientation, acceleration = orientation.clone(), acceleration.clone()
         frames = orientation.shape[1]
-        # Some are silent before the sequence begins or longer than it lasts.
+        # The silence may begin before the sequence, or last longer than it.
         first, end = (
             (frames * (2.0 * torch.rand(size, 2, generator=generator) - 0.5)).long().sort().values.unbind(1)
         )
         which = torch.randint(len(PLACEMENTS), (size,), generator=generator)
-        which[torch.rand(size, generator=generator) >= how.silent] = -1
+        which[torch.rand(size, generator=generator) >= sizes.silent] = -1
         for sensor in range(len(PLACEMENTS)):
-            its = which == sensor
-            orientation[its], acceleration[its] = drop_sensor(
-                orientation[its], acceleration[its], sensor, first[its].clamp(1, frames), end[its]
+            rows = which == sensor
+            orientation[rows], acceleration[rows] = drop_sensor(
+                orientation[rows], acceleration[rows], sensor, first[rows].clamp(1, frames), end[rows]
             )
     return orientation, acceleration, relative

@@ -1,4 +1,4 @@
-"""What an IMU chip makes of ideal rates and forces: noise, bias, and no orientation."""
+"""Errors of IMU chips: noise and bias of rates, forces and magnetic field, and no orientation."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from edgepose.rotations import Array, quat_conjugate, quat_rotate
 
 
 class ImuErrorModel(NamedTuple):
-    """Errors of one kind of chip; biases are one standard deviation from chip to chip.
+    """Errors of one type of chip; biases are standard deviations between chips.
 
     Attributes:
         gyr_noise: rad/s/sqrt(Hz).
         gyr_bias: rad/s.
         acc_noise: m/s^2/sqrt(Hz).
         acc_bias: m/s^2.
-        mag_noise: uT, each sample.
+        mag_noise: uT, per sample.
     """
 
     gyr_noise: float
@@ -33,26 +33,26 @@ BMI270 = ImuErrorModel(
     gyr_noise=np.radians(0.007), gyr_bias=np.radians(0.5),
     acc_noise=160e-6 * GRAVITY, acc_bias=20e-3 * GRAVITY, mag_noise=0.5,
 )  # fmt: skip
-"""Bosch BST-BMI270-DS000, revision 1.3: noise densities, zero-rate and zero-g offset, all typical. The
-magnetometer, which it has none of, is of the size of common ones.
+"""Bosch BST-BMI270-DS000, revision 1.3: typical noise densities, zero-rate and zero-g offsets. The chip has
+no magnetometer; that noise is typical of common ones.
 """
 
 FIELD_UT = (0.0, 20.0, -40.0)
-"""Magnetic field in the inertial frame, about that of central Europe."""
+"""Magnetic field in the inertial frame, roughly that of central Europe."""
 
 
 def raw(data: SensorData, chip: ImuErrorModel, seed: int, magnetometer: bool) -> SensorData:
-    """What a chip would have measured of an ideal sensor: the same without orientation, with its errors.
+    """Return the measurements of a chip instead of an ideal sensor: without orientation, with errors.
 
     Raises:
-        ValueError: there is no rate, no force, or no orientation to make the magnetic field of.
+        ValueError: rates, forces, or the orientation that the magnetic field is derived from are missing.
     """
     if data.gyr is None or data.acc is None or (magnetometer and data.mag is None and data.quat is None):
-        raise ValueError("it has no rates and forces to add errors to")
+        raise ValueError("errors can only be added to rates and forces, which are missing")
     rng = np.random.default_rng(seed)
-    # The biases come first: they are the chip's, whatever it records.
+    # The biases are drawn first, so that a chip's biases do not depend on what it records.
     gyr_bias, acc_bias = rng.normal(0.0, chip.gyr_bias, 3), rng.normal(0.0, chip.acc_bias, 3)
-    # White noise up to half the rate of the samples.
+    # White noise up to half the sample rate.
     bandwidth = np.sqrt(0.5 / np.median(np.diff(data.time_s)))
 
     def add_errors(rows: Array, noise: float, bias: Array | float) -> Array:

@@ -1,4 +1,4 @@
-"""Virtual IMUs on a body that motion capture moves (DIP 3.2)."""
+"""Virtual IMUs on a body that moves as in motion capture (DIP 3.2)."""
 
 from __future__ import annotations
 
@@ -16,16 +16,14 @@ from edgepose_export.mocap import Motion
 Array = NDArray[np.float64]
 
 INERTIAL_FROM_BODY = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""R_IT of synthetic recordings: a wearer who faces +Z of T faces +X of I, so `heading:0` is their body
-frame.
-"""
+"""R_IT of synthetic recordings: wearers who face +Z of T face +X of I, so `heading:0` is their body frame."""
 
 BLEND_S = 1.0
-"""Seconds in which a held pose turns into the first pose of the take."""
+"""Duration of the transition from a held pose to the first pose of the take, seconds."""
 
 
 def straight_pose() -> Array:
-    """Global rotations (24, 3, 3) of the straight pose (N-pose): the zero pose with hanging arms."""
+    """Return global rotations (24, 3, 3) of the straight pose (N-pose): the zero pose with hanging arms."""
     pose = np.tile(np.eye(3), (24, 1, 1))
     pose[[16, 18, 20, 22]] = rot.rotation_about_axis("z", -np.pi / 2)
     pose[[17, 19, 21, 23]] = rot.rotation_about_axis("z", np.pi / 2)
@@ -33,32 +31,33 @@ def straight_pose() -> Array:
 
 
 def with_hold(motion: Motion, seconds: float) -> Motion:
-    """The take with the wearer standing straight for some seconds before it.
+    """Put some seconds of standing straight before a take.
 
-    The take is turned so that it begins facing +Z of T, which is what `heading:0` calibrates. The pelvis
-    stays where the first frame has it; another `BLEND_S` seconds lead from the straight pose to that frame's.
+    The take is rotated so that it begins facing +Z of T, which is what `heading:0` calibrates. The pelvis
+    stays at its position of the first frame. `BLEND_S` more seconds lead from the straight pose to the first
+    frame's pose.
     """
     forward = motion.rotations[0, 0, :, 2]
-    turn = rot.rotation_about_axis("y", -np.arctan2(forward[0], forward[2]))
-    rotations, translation = turn @ motion.rotations, motion.translation @ turn.T
-    # A smooth start and end (smoothstep), so that the virtual accelerometers see no jolt.
+    to_front = rot.rotation_about_axis("y", -np.arctan2(forward[0], forward[2]))
+    rotations, translation = to_front @ motion.rotations, motion.translation @ to_front.T
+    # A smooth start and end (smoothstep), so that the virtual accelerometers measure no jolt.
     t = np.linspace(0.0, 1.0, round(BLEND_S * motion.rate), endpoint=False)[:, None]
     first, last = rot.matrix_to_quat(straight_pose()), rot.matrix_to_quat(rotations[0])
-    way = rot.quat_to_matrix(rot.slerp(first, last, t * t * (3.0 - 2.0 * t)))
+    blend = rot.quat_to_matrix(rot.slerp(first, last, t * t * (3.0 - 2.0 * t)))
     hold = np.broadcast_to(straight_pose(), (round(seconds * motion.rate), 24, 3, 3))
-    still = np.broadcast_to(translation[0], (len(hold) + len(way), 3))
+    still = np.broadcast_to(translation[0], (len(hold) + len(blend), 3))
     return motion._replace(
-        rotations=np.concatenate([hold, way, rotations]), translation=np.concatenate([still, translation])
+        rotations=np.concatenate([hold, blend, rotations]), translation=np.concatenate([still, translation])
     )
 
 
 def random_mounting(seed: int) -> Array:
-    """R_BS (6, 3, 3) of sensors that are strapped on at random angles."""
+    """Return R_BS (6, 3, 3) of sensors that are strapped on at random angles."""
     return rot.rotvec_to_matrix(np.random.default_rng(seed).uniform(-np.pi, np.pi, (6, 3)))
 
 
 class VirtualImus(NamedTuple):
-    """What six virtual sensors measure.
+    """Measurements of six virtual sensors.
 
     Attributes:
         orientation: (T, 6, 4) unit quaternions, sensor to inertial (R_IS), in the order of PLACEMENTS.
@@ -72,15 +71,18 @@ class VirtualImus(NamedTuple):
 
 
 def virtual_imus(motion: Motion, body: Body, mounting: Array | None = None) -> VirtualImus:
-    """Sensors at the body's six skin points.
+    """Simulate sensors at the six sensor points on the body's skin.
 
-    Accelerations are central differences over neighbouring frames, DIP eq. 3 with n = 1; the first and last
-    frame repeat theirs.
+    Accelerations are central differences over neighbouring frames, DIP eq. 3 with n = 1. The first and the
+    last frame repeat those of their neighbours.
 
     Args:
-        motion: at the rate that is wanted of the sensors.
-        body: whose joints and sensor points are moved.
-        mounting: (6, 3, 3) R_BS, sensor frames in bone frames; aligned with the bones when None.
+        motion: motion at the sample rate of the sensors.
+        body: body with the joints and sensor points to move.
+        mounting: (6, 3, 3) R_BS, sensor frames in bone frames; None for sensors aligned with the bones.
+
+    Raises:
+        ValueError: the motion has fewer than 3 frames.
     """
     if len(motion.rotations) < 3:
         raise ValueError("a take needs at least 3 frames for accelerations")
@@ -95,19 +97,20 @@ def virtual_imus(motion: Motion, body: Body, mounting: Array | None = None) -> V
     if mounting is not None:
         sensors = sensors @ mounting
     force_inertial = acceleration @ INERTIAL_FROM_BODY.T + [0.0, 0.0, GRAVITY]
-    turns = rot.matrix_to_rotvec(rot.transpose(sensors[:-1]) @ sensors[1:]) * motion.rate
-    # The rate at a frame is between that before and that after it.
-    turns = np.concatenate([turns[:1], 0.5 * (turns[:-1] + turns[1:]), turns[-1:]])
+    rates = rot.matrix_to_rotvec(rot.transpose(sensors[:-1]) @ sensors[1:]) * motion.rate
+    # The rate at a frame is the mean of those before and after it.
+    rates = np.concatenate([rates[:1], 0.5 * (rates[:-1] + rates[1:]), rates[-1:]])
     return VirtualImus(
         orientation=rot.quat_continuous(rot.matrix_to_quat(sensors)),
         force=np.einsum("tsji,tsj->tsi", sensors, force_inertial),
-        rate_of_turn=turns,
+        rate_of_turn=rates,
     )
 
 
 def recording_arrays(motion: Motion, imus: VirtualImus, license_note: str) -> dict[str, NDArray]:
-    """Keys of an npz that is an IMU recording and an AMASS-like motion file at once: sensors, and the pose
-    they were made from.
+    """Return the arrays of an .npz file that is both an IMU recording and an AMASS-like motion file.
+
+    It holds the sensors and the poses that they were made from.
     """
     arrays: dict[str, NDArray] = {"t": np.arange(len(motion.rotations)) / motion.rate}
     for i, name in enumerate(PLACEMENTS):

@@ -1,1 +1,1 @@
-"""Training: data, loop, configuration."""
+"""Training: configuration, data, losses, loop, checkpoints."""

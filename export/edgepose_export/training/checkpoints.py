@@ -1,4 +1,4 @@
-"""Checkpoints: written whole, read without running pickled code, averaged where they belong together."""
+"""Checkpoints: atomic writing, reading without running pickled code, averaging of related ones."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ CHECKPOINT = "checkpoint.pt"
 
 
 def save_checkpoint(state: dict[str, Any], path: Path) -> None:
-    """Writes a checkpoint so that a crash leaves the old one or the new one, never half of one.
+    """Write a checkpoint so that a crash leaves either the old one or the new one, never a part of one.
 
     Raises:
-        EdgeposeError: it cannot be written (disk full).
+        EdgeposeError: the file cannot be written, for example because the disk is full.
     """
     content = io.BytesIO()
     torch.save(state, content)
@@ -34,10 +34,10 @@ def save_checkpoint(state: dict[str, Any], path: Path) -> None:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """A checkpoint's state, read without running pickled code.
+    """Read a checkpoint's state without running pickled code.
 
     Raises:
-        EdgeposeError: missing or not a checkpoint.
+        EdgeposeError: the file is missing or not a checkpoint.
     """
     try:
         state = torch.load(path, weights_only=True, map_location="cpu")
@@ -53,30 +53,36 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         Statistics(**state["statistics"])
     except (TypeError, ValueError, RuntimeError, AttributeError) as error:
         reason = str(error).splitlines()[0]
-        raise EdgeposeError(f"{path}: not a checkpoint that this edgepose reads ({reason})") from error
+        raise EdgeposeError(
+            f"{path}: not a checkpoint that this version of edgepose can read ({reason})"
+        ) from error
     return state
 
 
 RELATED = 0.9
-"""Least cosine between the weights of checkpoints that have a mean. Those that began from one another have
-0.97 and more, trainings of one seed from scratch up to 0.77, those of two seeds 0.02; their mean is nothing.
+"""Least cosine between the weights of checkpoints that may be averaged. Runs that started from each other
+have 0.97 and more. Runs from scratch have up to 0.77 with the same seed and 0.02 with different seeds, and
+their means are useless.
 """
 
 
 def mean_of(states: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
-    """The first of some checkpoints by name, with the mean of their averaged weights (Wortsman et al. 2022).
+    """Return the first of some checkpoints, with the mean of all averaged weights (Wortsman et al. 2022).
 
-    What the longest of them was trained on, and the licences of all, are noted.
+    The description of the training data is that of the checkpoint with the most hours, with all licences.
+
+    Args:
+        states: the checkpoints by name.
 
     Raises:
-        EdgeposeError: they did not begin from one another: networks, but for `smoothing`, or statistics
-            differ, or weights are unlike.
+        EdgeposeError: the checkpoints did not start from each other: networks (apart from `smoothing`) or
+            statistics differ, or the weights are not alike.
     """
     (name, first), *others = states.items()
     for other, state in others:
         if not _related(first, state):
             raise EdgeposeError(
-                f"{other}: did not begin from {name}, nor the reverse (train --init); they have no mean"
+                f"{other}: cannot be averaged with {name}: neither started from the other (train --init)"
             )
     weights = [state["averaged"] for state in states.values()]
     mean = {key: torch.stack([one[key] for one in weights]).mean(dim=0) for key in weights[0]}
@@ -96,9 +102,9 @@ def _related(one: dict[str, Any], other: dict[str, Any]) -> bool:
 
 
 def shape_of(state: dict[str, Any]) -> NetworkShape:
-    """The shape of the network that a checkpoint holds."""
+    """Return the shape of the network in a checkpoint."""
     return config_from(json.loads(state["config"])).network
 
 
 WEIGHTS_ONLY = ("config", "statistics", "averaged", "step", "data")
-"""Entries of `best.pt`: what `export` and fine-tuning need."""
+"""Entries of `best.pt`, which suffice for `export` and fine-tuning."""

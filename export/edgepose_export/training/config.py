@@ -1,4 +1,4 @@
-"""Configs of training runs: their fields, the TOML files that hold them, and what is refused."""
+"""Configs of training runs: fields, TOML files, and checks of the values."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from edgepose_export.synthesis.augmentation import Augmentation
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """One training run; what a config file holds.
+    """Settings of a training run, as in a config file.
 
     Attributes:
-        network: the network's shape.
+        network: shape of the network.
         augmentation: disturbances of the batches.
-        beta: weight of the beta-likelihood (Seitzer et al. 2022); 0 is the paper's Gaussian likelihood, which
-            lets entries that never move take all gradient.
-        acceleration_loss: whether the network shall give back the input accelerations too (DIP 3.4.2).
-        steps: optimiser steps.
-        sequences: sequences a step, of all processes together.
-        window: frames a sequence.
-        streamed: frames of look-ahead with which a BiRNN is trained as it streams; 0 trains it on whole
-            sequences, three times as fast.
-        joined: sequences may run over the ends of takes: a network that is never reset learns to recover from
-            a jump.
+        beta: parameter of the beta-likelihood (Seitzer et al. 2022); 0 is the paper's Gaussian likelihood, in
+            which entries that never move dominate the gradient.
+        acceleration_loss: whether the network also reconstructs the input accelerations (DIP 3.4.2).
+        steps: number of optimiser steps.
+        sequences: sequences per step, of all processes together.
+        window: frames per sequence.
+        streamed: frames of look-ahead if a BiRNN is trained as it streams; 0 trains it on whole sequences,
+            which is three times as fast.
+        joined: whether sequences may cross the ends of takes, so that a network that is never reset learns to
+            recover from a jump.
         free_share: share of the sequences taken from CMU's takes.
-        seated_share: share of the sequences taken from takes with made sitting, where there are any; the
-            other shares are of the rest.
+        seated_share: share of the sequences taken from takes with synthetic sitting, if there are any; the
+            other shares refer to the rest.
         input_dropout: share of the inputs set to zero (DIP: 0.2).
-        smoothness: weight of the squared second differences in time of the pose's error, in normalised units:
-            what it costs to tremble where the wearer does not.
-        learning_rate: of Adam.
-        warm_up: steps in which the learning rate rises to its first value.
+        smoothness: jitter penalty: weight of the squared second differences in time of the pose error, in
+            normalised units.
+        learning_rate: learning rate of Adam.
+        warm_up: steps over which the learning rate rises to its initial value.
         schedule: "exponential" (DIP: times 0.96 every 2000 steps) or "cosine" down to zero at the last step.
-        averaging: decay of the exponential moving average of the weights; 0 for none.
-        patience: stop after so many validations without a better likelihood; 0 never.
-        validate_every: steps between validations and checkpoints.
-        bf16: matrix products in bfloat16.
-        seed: of the weights, batches and disturbances.
+        averaging: decay of the exponential moving average of the weights; 0 for no averaging.
+        patience: number of validations without a better likelihood after which training stops; 0 for never.
+        validate_every: steps between validations, at which checkpoints are written, too.
+        bf16: whether matrix products are computed in bfloat16.
+        seed: seed of weights, batches and disturbances.
     """
 
     network: NetworkShape = field(default_factory=NetworkShape)
@@ -71,20 +71,21 @@ class TrainConfig:
 
 
 def read_config(path: Path) -> TrainConfig:
-    """A TOML file with TrainConfig's fields, `[network]` and `[augmentation]` tables.
+    """Read a TOML file with TrainConfig's fields and the tables `[network]` and `[augmentation]`.
 
-    With `base = "NAME"` it says only what differs from NAME.toml in the same folder.
+    A file with `base = "NAME"` contains only what differs from NAME.toml in the same folder.
 
     Raises:
-        EdgeposeError: no file, not TOML, an unknown field, or a value of a wrong type or out of its range.
+        EdgeposeError: the file is missing or not TOML, or has an unknown field, a value of a wrong type, or a
+            value out of range.
     """
     values = _toml(path)
     try:
         if "base" in values:
             name = values.pop("base")
             if not isinstance(name, str):
-                raise ValueError(f"base is {name!r}; it takes the name of a config beside this one")
-            values = _over(_toml(path.with_name(f"{name}.toml")), values)
+                raise ValueError(f"base is {name!r}; it must be the name of a config in the same folder")
+            values = _merged(_toml(path.with_name(f"{name}.toml")), values)
         return config_from(values)
     except ValueError as error:
         raise EdgeposeError(f"{path}: {error}") from error
@@ -96,8 +97,8 @@ def _toml(path: Path) -> dict[str, Any]:
     return read_toml(path)
 
 
-def _over(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
-    """Values laid over those of a base, tables entry by entry."""
+def _merged(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    """Return the values of a base, overridden by others; tables are merged entry by entry."""
     result = base | values
     for name, table in values.items():
         if isinstance(table, dict) and isinstance(base.get(name), dict):
@@ -106,17 +107,17 @@ def _over(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
 
 
 def config_from(values: dict[str, Any]) -> TrainConfig:
-    """TrainConfig of plain values; the inverse of `config_values`.
+    """Return the TrainConfig with some plain values; the inverse of `config_values`.
 
     Raises:
-        ValueError: an unknown field, or a value of a wrong type or out of its range; names the field.
+        ValueError: a field is unknown, or its value has the wrong type or is out of range; names the field.
     """
     values = dict(values)
     tables: dict[str, Any] = {"network": NetworkShape, "augmentation": Augmentation}
     for name, kind in tables.items():
         table = values.pop(name, {})
         if not isinstance(table, dict):
-            raise ValueError(f"{name} is {table!r}; it takes a table [{name}]")
+            raise ValueError(f"{name} is {table!r}; it must be a table [{name}]")
         values[name] = kind(**_checked(table, kind()._asdict(), f" in [{name}]"))
     defaults = {f.name: getattr(TrainConfig, f.name) for f in fields(TrainConfig) if f.name not in tables}
     config = TrainConfig(
@@ -126,15 +127,19 @@ def config_from(values: dict[str, Any]) -> TrainConfig:
     if config.network.measured == "passed" and config.network.targets != "global-6d":
         raise ValueError('measured = "passed" needs targets = "global-6d"')
     if config.acceleration_loss and not config.network.acceleration:
-        raise ValueError("a network without accelerations cannot give them back: acceleration_loss = false")
+        raise ValueError(
+            "a network without accelerations cannot reconstruct them: set acceleration_loss = false"
+        )
     if config.streamed and config.network.kind != "birnn":
-        raise ValueError('only kind = "birnn" can be trained as streamed')
+        raise ValueError('streamed needs kind = "birnn"')
     if config.network.smoothing and config.network.kind not in ("birnn", "rnn"):
-        raise ValueError('smoothing is for kind = "birnn" and "rnn"')
+        raise ValueError('smoothing needs kind = "birnn" or "rnn"')
     if config.network.smoothing and config.network.targets != "global-6d":
         raise ValueError('smoothing needs targets = "global-6d"')
     if config.streamed >= config.window:
-        raise ValueError(f"streamed is {config.streamed}; it takes fewer frames than the window has")
+        raise ValueError(
+            f"streamed is {config.streamed}; it must be less than window, which is {config.window}"
+        )
     return config
 
 
@@ -165,29 +170,29 @@ _RANGES: dict[str, tuple[float, float]] = {
     "silent": (0.0, 1.0),
     "smoothing": (0.0, 0.99),
 }
-"""Least and greatest value of numbers; those of other fields are 0 and 1000."""
+"""Least and greatest values of numbers; those of all other fields are 0 and 1000."""
 
 
 def _checked(values: dict[str, Any], defaults: dict[str, Any], where: str = "") -> dict[str, Any]:
-    """The same values, if each has its default's type (or is whole) and is in its range."""
+    """Return the values if each is in range and has the type of its default (or is whole, for a float)."""
     for name, value in values.items():
         if name not in defaults:
             raise ValueError(f"unknown field {name!r}{where}")
         kind = type(defaults[name])
         if type(value) is not kind and not (kind is float and type(value) is int):
-            words = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
-            raise ValueError(f"{name} is {value!r}; it takes {words[kind]}")
+            words = {bool: "true or false", int: "a whole number", float: "a number", str: "a string"}
+            raise ValueError(f"{name} is {value!r}; it must be {words[kind]}")
         if kind is str and value not in _CHOICES[name]:
-            raise ValueError(f"{name} is {value!r}; it takes {' or '.join(map(repr, _CHOICES[name]))}")
+            raise ValueError(f"{name} is {value!r}; it must be {' or '.join(map(repr, _CHOICES[name]))}")
         if kind in (int, float):
             low, high = _RANGES.get(name, (0, 1000))
             if not low <= value <= high:
-                raise ValueError(f"{name} is {value!r}; it takes {low:g} to {high:g}")
+                raise ValueError(f"{name} is {value!r}; it must be from {low:g} to {high:g}")
     return values
 
 
 def config_values(config: TrainConfig) -> dict[str, Any]:
-    """Plain values of a config, as a config file would hold them."""
+    """Return the plain values of a config, as in a config file."""
     return asdict(config) | {
         "network": config.network._asdict(),
         "augmentation": config.augmentation._asdict(),

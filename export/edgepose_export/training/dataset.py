@@ -1,4 +1,4 @@
-"""Synthetic recordings on disk to tensors for training and evaluation."""
+"""Synthetic recordings as takes and tensors for training and evaluation."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from edgepose_export.synthesis.virtual_imus import INERTIAL_FROM_BODY
 from edgepose_export.training.splits import part_of
 
 SEATED = ".seated"
-"""Ends the names of takes whose legs were made by `edgepose_export.synthesis.sitting`."""
+"""End of the names of takes with legs made by `edgepose_export.synthesis.sitting`."""
 
 RATE = 60.0
-"""Frames a second that the networks are made for."""
+"""Frames per second of all networks."""
 
 
 class Take(NamedTuple):
     """One synthetic recording.
 
     Attributes:
-        name: file name without folder and ending.
+        name: file name without folder and extension.
         orientation: (T, 6, 3, 3) float32 bone orientations R_TB.
         acceleration: (T, 6, 3) float32 accelerations in T without gravity, m/s^2.
         pose: (T, 24, 3, 3) float32 true local rotations.
-        license: the licence of the motion it was made from.
+        license: licence of the motion that the take was made from.
     """
 
     name: str
@@ -47,10 +47,10 @@ class Take(NamedTuple):
 
 
 def read_take(path: Path) -> Take:
-    """A recording that `edgepose synthesize` wrote with sensors aligned with the bones.
+    """Read a recording that `edgepose synthesize` wrote, with sensors aligned with the bones.
 
     Raises:
-        EdgeposeError: not such a file.
+        EdgeposeError: the file is of another kind.
     """
     try:
         with open_npz(path) as data:
@@ -66,7 +66,7 @@ def read_take(path: Path) -> Take:
         ) from error
     if rate != RATE:
         raise EdgeposeError(
-            f"{path}: has {rate:g} frames a second; networks need edgepose synthesize --rate 60"
+            f"{path}: has {rate:g} frames per second; make it again with edgepose synthesize --rate 60"
         )
     inertial = rot.quat_to_matrix(quats)
     orientation = INERTIAL_FROM_BODY.T @ inertial
@@ -77,7 +77,7 @@ def read_take(path: Path) -> Take:
             f"{path}: the sensors are not aligned with the bones; use edgepose synthesize without --mounting"
         )
     force_inertial = np.einsum("tsij,tsj->tsi", inertial, force.astype(float))
-    # A frame of a run holds the mean over the time since the frame before, see `FrameSynchronizer`.
+    # In a run a frame holds the mean since the previous frame, see `FrameSynchronizer`.
     force_inertial[1:] = 0.5 * (force_inertial[1:] + force_inertial[:-1])
     acceleration = (force_inertial - [0.0, 0.0, GRAVITY]) @ INERTIAL_FROM_BODY
     return Take(
@@ -90,10 +90,10 @@ def read_take(path: Path) -> Take:
 
 
 def take_paths(folder: Path, part: str) -> list[Path]:
-    """Files of all takes of one part of the split below a folder, by name; the part "all" is every take.
+    """Return the files of one part of the split below a folder, sorted by name; the part "all" is every take.
 
     Raises:
-        EdgeposeError: none found.
+        EdgeposeError: there is no such file.
     """
     paths = sorted(
         (p for p in folder.rglob("*.npz") if part in ("all", part_of(p.stem))), key=lambda p: p.stem
@@ -107,31 +107,31 @@ def take_paths(folder: Path, part: str) -> list[Path]:
 
 
 def training_paths(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Files of takes to train on and of takes that tell when to stop.
+    """Return the files of takes to train on, and of takes for validation.
 
-    Where no name belongs to the validation part (a user's own recordings), every tenth take goes there.
+    If no name belongs to the validation part (with a user's own recordings), every tenth take is used for it.
 
     Raises:
-        EdgeposeError: fewer than two takes, or none to train on.
+        EdgeposeError: there are fewer than two takes, or none to train on.
     """
     paths = take_paths(folder, "train")
     if any(part_of(path.stem) == "validation" for path in folder.rglob("*.npz")):
         return paths, take_paths(folder, "validation")
     if len(paths) < 2:
-        raise EdgeposeError(f"{folder}: one recording is not enough: another must tell when to stop training")
+        raise EdgeposeError(f"{folder}: one recording is not enough: another is needed for validation")
     return [path for i, path in enumerate(paths) if i % 10], paths[::10]
 
 
 class PackedTakes(NamedTuple):
-    """Takes one after the other, as tensors.
+    """Takes joined one after the other, as tensors.
 
     Attributes:
         orientation: (N, 6, 3, 3) R_TB.
         acceleration: (N, 6, 3) in T, m/s^2.
         relative: (N, 24, 3, 3) true global rotations in the root's frame.
-        starts: first frame of each take; one more entry holds N.
-        names: of the takes.
-        licenses: of each take's motion.
+        starts: first frame of each take, and N as the last entry.
+        names: names of the takes.
+        licenses: licence of each take's motion.
     """
 
     orientation: Tensor
@@ -153,7 +153,7 @@ class PackedTakes(NamedTuple):
 
 
 def tape(takes: list[Take]) -> PackedTakes:
-    """Joins takes; none give an empty tape."""
+    """Join takes; without any, the tape is empty."""
     lengths = [len(take.pose) for take in takes]
     return PackedTakes(
         torch.cat([torch.zeros(0, 6, 3, 3), *(torch.from_numpy(take.orientation) for take in takes)]),
@@ -168,7 +168,7 @@ def tape(takes: list[Take]) -> PackedTakes:
 
 
 def root_relative_pose(local: Tensor) -> Tensor:
-    """Global rotations (..., 24, 3, 3) in the root's frame of local ones."""
+    """Convert local rotations (..., 24, 3, 3) to global ones in the root's frame."""
     result = [torch.eye(3, dtype=local.dtype).expand((*local.shape[:-3], 3, 3))]
     for joint in range(1, 24):
         result.append(result[PARENTS[joint]] @ local[..., joint, :, :])
@@ -176,7 +176,7 @@ def root_relative_pose(local: Tensor) -> Tensor:
 
 
 def describe(licenses: Iterable[str], takes: int, frames: int) -> dict[str, Any]:
-    """What an archive's card says of the motion that it was trained on."""
+    """Return the description of the training motion for an archive's card."""
     licenses = sorted(set(licenses))
     return {
         "summary": " and ".join(text.split(",")[0].split(" (")[0] for text in licenses),

@@ -1,4 +1,4 @@
-"""The processes of a training run: one alone, or those that torchrun started, each with a share of takes."""
+"""Processes of a training run: a single one, or those started by torchrun, each with a share of the takes."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from torch import Tensor, distributed, nn
 
 
 class Processes(NamedTuple):
-    """This process among those of the run.
+    """This process and the others of the run.
 
     Attributes:
-        rank: its number; process 0 writes checkpoints and speaks.
-        size: how many there are.
-        device: where its network is.
+        rank: number of this process; process 0 writes checkpoints and prints messages.
+        size: number of processes.
+        device: device of this process's network.
     """
 
     rank: int = 0
@@ -26,19 +26,19 @@ class Processes(NamedTuple):
     device: torch.device = torch.device("cpu")
 
     def share(self, items: list[Any]) -> list[Any]:
-        """This process's share of a list that is the same everywhere."""
+        """Return this process's share of a list that all processes have."""
         return items[self.rank :: self.size]
 
     def total(self, tensor: Tensor) -> Tensor:
-        """The sum over all processes."""
+        """Return the sum over all processes."""
         if self.size == 1:
             return tensor
         tensor = tensor.to(self.device, copy=True)
         distributed.all_reduce(tensor)
         return tensor.cpu()
 
-    def everywhere(self, value: Any) -> list[Any]:
-        """Each process's value, by rank."""
+    def gathered(self, value: Any) -> list[Any]:
+        """Return the values of all processes, by rank."""
         if self.size == 1:
             return [value]
         values: list[Any] = [None] * self.size
@@ -46,7 +46,7 @@ class Processes(NamedTuple):
         return values
 
     def wrapped(self, network: nn.Module) -> nn.Module:
-        """The network such that gradients become the mean of those of all processes."""
+        """Wrap the network so that its gradients are averaged over all processes."""
         return nn.parallel.DistributedDataParallel(network) if self.size > 1 else network
 
 
@@ -55,11 +55,11 @@ ALONE = Processes()
 
 @contextmanager
 def joined() -> Iterator[Processes]:
-    """Meets the other processes that torchrun started, on a GPU each (nccl) or the processor (gloo).
+    """Connect to the other processes that torchrun started, each on a GPU (nccl), or all on the CPU (gloo).
 
-    Networks that `Processes.wrapped` wrapped have to be gone when the block ends, so make them in a function
-    that the block calls: the connections close with their last user, and DistributedDataParallel waits for
-    their threads in a way that can wait for ever.
+    Networks from `Processes.wrapped` must no longer exist when the block ends, so create them in a function
+    that the block calls. The connections close with their last user, and DistributedDataParallel waits for
+    their threads in a way that can block forever.
     """
     gpus = torch.cuda.device_count()
     if not distributed.is_torchelastic_launched():
@@ -68,14 +68,15 @@ def joined() -> Iterator[Processes]:
     local = int(os.environ["LOCAL_RANK"])
     if gpus:
         torch.cuda.set_device(local)
-    # Functions of this module have the group of the moment as a default argument. DistributedDataParallel
-    # imports it, and the group would outlive `destroy_process_group`: its threads can abort an ending Python.
+    # Functions of this module keep the current group as a default argument. If DistributedDataParallel
+    # imported it later, the group would outlive `destroy_process_group`, and its threads can abort Python at
+    # exit.
     importlib.import_module("torch.distributed.nn.functional")
     distributed.init_process_group("nccl" if gpus else "gloo")
     try:
         device = torch.device("cuda", local) if gpus else ALONE.device
         yield Processes(distributed.get_rank(), distributed.get_world_size(), device)
-        # None may leave while another still talks to it.
+        # No process may leave while another still communicates with it.
         distributed.barrier()
     finally:
         distributed.destroy_process_group()

@@ -1,4 +1,4 @@
-"""What training minimises."""
+"""Loss functions of training."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from torch import Tensor
 
 
 def likelihood_loss(mean: Tensor, deviation: Tensor, target: Tensor, beta: float) -> Tensor:
-    """Negative Gaussian log-likelihood (DIP eq. 4 and 5), each term weighted by deviation^(2 beta) without
-    gradient; a scalar.
+    """Return the negative Gaussian log-likelihood (DIP eq. 4 and 5), a scalar.
+
+    Each term is weighted by deviation^(2 beta), without a gradient through the weight.
     """
     loss = torch.log(deviation) + 0.5 * ((target - mean) / deviation).square()
     if beta:
@@ -17,10 +18,9 @@ def likelihood_loss(mean: Tensor, deviation: Tensor, target: Tensor, beta: float
 
 
 def smoothness_loss(mean: Tensor, target: Tensor) -> Tensor:
-    """Mean square of the second differences in time of the error of (B, T, numbers); a scalar.
+    """Return the mean square of the second differences in time of the error of (B, T, numbers), a scalar.
 
-    Of two poses that are as wrong it prefers that whose error changes slowly, so that motion stays as smooth
-    as it was.
+    This jitter penalty prefers errors that change slowly, so that the motion stays as smooth as the true one.
     """
     error = mean - target
     return (error[:, 2:] - 2.0 * error[:, 1:-1] + error[:, :-2]).square().mean()

@@ -1,8 +1,7 @@
-"""Takes packed into files that are mapped into memory, so that training needs little of it.
+"""Takes packed into memory-mapped files, so that training needs little memory.
 
-A packed tape is a folder with one file of raw float32 numbers for each of a tape's tensors, and `tape.json`,
-written last, with what else there is to know. It is made once and used again as long as the takes are the
-same files.
+A packed tape is a folder with one file of raw float32 numbers for each tensor of a tape, and `tape.json` with
+all other fields, which is written last. It is made once and reused as long as the recordings do not change.
 """
 
 from __future__ import annotations
@@ -29,12 +28,12 @@ _INDEX = "tape.json"
 def packed_tape(
     paths: list[Path], folder: Path, progress: Callable[[list[Path]], Iterable[Path]] = iter
 ) -> PackedTakes:
-    """The takes of some files as a tape whose tensors are mapped from a folder.
+    """Return the takes of some files as a tape of memory-mapped tensors.
 
     Args:
         paths: recordings that `edgepose synthesize` wrote.
-        folder: where the packed tape is, or is made with one take in memory at a time.
-        progress: shows how many takes have been packed.
+        folder: folder of the packed tape. If it is missing or outdated, it is made, one take at a time.
+        progress: wraps the list of files to report progress.
 
     Raises:
         EdgeposeError: a recording cannot be read, or the folder cannot be written.
@@ -79,7 +78,7 @@ def _pack(
 
 
 def _read_index(folder: Path) -> dict[str, Any] | None:
-    """What is packed in a folder; None if that is nothing, or not complete."""
+    """Return the index of a packed tape; None if it is missing or incomplete."""
     try:
         about = json.loads((folder / _INDEX).read_text(encoding="utf-8"))
         frames = sum(about["lengths"])
@@ -88,12 +87,12 @@ def _read_index(folder: Path) -> dict[str, Any] | None:
             return None
     except (FileNotFoundError, ValueError, TypeError, KeyError):
         return None
-    whole = all(sizes[name] == 4 * frames * np.prod(shape) for name, shape in FRAME.items())
-    return about if whole else None
+    complete = all(sizes[name] == 4 * frames * np.prod(shape) for name, shape in FRAME.items())
+    return about if complete else None
 
 
 def _mapped(folder: Path, name: str, frames: int) -> torch.Tensor:
     if frames == 0:
         return torch.zeros(0, *FRAME[name])
-    # Copy-on-write, because torch wants arrays that it could write to; the file is never changed.
+    # Copy-on-write, because torch wants writable arrays; the file never changes.
     return torch.from_numpy(np.memmap(_file(folder, name), "<f4", "c", shape=(frames, *FRAME[name])))

@@ -1,4 +1,4 @@
-"""Which takes are for training, which tell it when to stop, which are held out: `splits.toml`'s rules."""
+"""The split of takes into training, validation and held-out parts, by the rules in `splits.toml`."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ else:
 _RULES = tomllib.loads((Path(__file__).parent / "splits.toml").read_text(encoding="utf-8"))
 
 HELD_OUT = tuple(_RULES["held-out"])
-"""Parts of the split that no training sees."""
+"""Parts of the split that are never used in training."""
 
 _PATTERNS = [(part, re.compile(pattern)) for part, pattern in _RULES["held-out"].items()]
 _PATTERNS += [("validation", re.compile(pattern)) for pattern in _RULES["validation"].values()]
 
 
 def part_of(name: str) -> str:
-    """Part that a take belongs to, by its name: one of `HELD_OUT`, "validation" or "train"."""
+    """Return the part that a take belongs to, by its name: one of `HELD_OUT`, "validation" or "train"."""
     return next((part for part, pattern in _PATTERNS if pattern.search(name)), "train")

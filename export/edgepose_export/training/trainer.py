@@ -1,4 +1,4 @@
-"""Training of the networks (DIP 3.4): loss, batches, steps, checkpoints that can be resumed."""
+"""Training of the networks (DIP 3.4): statistics, loss, steps, validation, checkpoints."""
 
 from __future__ import annotations
 
@@ -33,17 +33,13 @@ from edgepose_export.training.config import TrainConfig, config_values
 from edgepose_export.training.dataset import PackedTakes, describe
 from edgepose_export.training.distributed import ALONE, Processes
 from edgepose_export.training.losses import likelihood_loss, smoothness_loss
+from edgepose_export.training.windows import sample_windows, window_starts, windows, windows_with_sitting
 
 __all__ = ["CHECKPOINT", "Trainer", "fit", "mean_of", "read_checkpoint", "save_checkpoint"]
 
-Starts = tuple[Tensor, Tensor]
-"""First frames of windows: of other takes, of CMU's."""
-
 
 def pose_targets(relative: Tensor, shape: NetworkShape) -> Tensor:
-    """Numbers (..., pose outputs) that the network shall give, before z-scoring, of root-relative rotations
-    (..., 24, 3, 3).
-    """
+    """Return targets (..., pose outputs), not yet z-scored, of root-relative rotations (..., 24, 3, 3)."""
     joints = list(shape.joints)
     if shape.targets == "global-6d":
         return rotation_to_6d(relative[..., joints, :, :]).flatten(-2)
@@ -52,20 +48,20 @@ def pose_targets(relative: Tensor, shape: NetworkShape) -> Tensor:
 
 
 def network_inputs_of(orientation: Tensor, acceleration: Tensor, shape: NetworkShape) -> Tensor:
-    """Inputs (..., T, inputs) of sequences, before z-scoring."""
+    """Return inputs (..., T, inputs) of sequences, not yet z-scored."""
     if shape.normalisation == "sequence":
         orientation, acceleration = seen_from_first(orientation, acceleration)
     return network_inputs(orientation, acceleration, shape.normalisation, shape.acceleration)
 
 
 def compute_statistics(tape: PackedTakes, shape: NetworkShape, processes: Processes = ALONE) -> Statistics:
-    """Means and deviations over the training tapes of all processes (DIP 4.4).
+    """Return means and standard deviations over the training tapes of all processes (DIP 4.4).
 
-    Local matrices are z-scored entry by entry as in the paper. Global rotations get one deviation for all
-    entries, so that a degree weighs the same at every joint.
+    Local matrices are z-scored entry by entry as in the paper. Global rotations share one standard deviation,
+    so that a degree weighs the same at every joint.
     """
     moments = torch.zeros(2, shape.inputs + shape.pose_outputs, dtype=torch.float64)
-    # Take by take: a tape may be larger than the memory.
+    # Take by take, because a tape may be larger than the memory.
     for start, end in pairwise(tape.starts.tolist()):
         x = network_inputs_of(tape.orientation[start:end], tape.acceleration[start:end], shape)
         numbers = torch.cat([x, pose_targets(tape.relative[start:end], shape)], dim=-1).double()
@@ -81,57 +77,9 @@ def compute_statistics(tape: PackedTakes, shape: NetworkShape, processes: Proces
     return Statistics(input_mean.clone(), input_std.clamp_min(1e-3), target_mean.clone(), target_std.clone())
 
 
-def window_starts(
-    tape: PackedTakes, window: int, joined: bool, chosen: Callable[[int], bool] = lambda take: True
-) -> Starts:
-    """First frames of all windows that the chosen takes of a tape hold."""
-    groups: tuple[list[Tensor], list[Tensor]] = ([], [])
-    last = int(tape.starts[-1]) - window
-    for i, free in enumerate(tape.free):
-        if not chosen(i):
-            continue
-        start, end = int(tape.starts[i]), int(tape.starts[i + 1])
-        end = min(end - 1, last) if joined else end - window
-        if end >= start:
-            groups[free].append(torch.arange(start, end + 1))
-    empty = torch.zeros(0, dtype=torch.long)
-    return torch.cat([empty, *groups[0]]), torch.cat([empty, *groups[1]])
-
-
-def windows_with_sitting(tape: PackedTakes, window: int) -> Tensor:
-    """Whether the windows from each frame (T,) of a tape on hold frames of takes with made sitting."""
-    frames = torch.zeros(int(tape.starts[-1]) + 1, dtype=torch.int32)
-    for i in (i for i, seated in enumerate(tape.seated) if seated):
-        frames[int(tape.starts[i]) + 1 : int(tape.starts[i + 1]) + 1] = 1
-    before = frames.cumsum(0)
-    first = torch.arange(len(before) - 1)
-    return before[(first + window).clamp(max=len(before) - 1)] > before[first]
-
-
-def sample_windows(starts: Starts, count: int, free_share: float, generator: torch.Generator) -> Tensor:
-    """First frames (count,) of random windows with the wanted share of CMU's."""
-    other, cmu = starts
-    if free_share == 0.0 or len(other) == 0 or len(cmu) == 0:
-        pool = torch.cat([other, cmu])
-        return pool[torch.randint(len(pool), (count,), generator=generator)]
-    free = round(count * free_share)
-    return torch.cat(
-        [
-            cmu[torch.randint(len(cmu), (free,), generator=generator)],
-            other[torch.randint(len(other), (count - free,), generator=generator)],
-        ]
-    )
-
-
-def windows(tape: PackedTakes, starts: Tensor, length: int) -> Batch:
-    """Orientations, accelerations and true rotations of windows, each (len(starts), length, ...)."""
-    index = starts[:, None] + torch.arange(length)
-    return tape.orientation[index], tape.acceleration[index], tape.relative[index]
-
-
 def describe_tape(tape: PackedTakes, processes: Processes = ALONE) -> dict[str, Any]:
-    """What an archive's card says of the takes of all processes."""
-    shares = processes.everywhere((tape.licenses, int(tape.starts[-1])))
+    """Return the description of the takes of all processes for an archive's card."""
+    shares = processes.gathered((tape.licenses, int(tape.starts[-1])))
     licenses = [text for texts, _ in shares for text in texts]
     return describe(licenses, len(licenses), sum(frames for _, frames in shares))
 
@@ -140,7 +88,7 @@ def describe_tape(tape: PackedTakes, processes: Processes = ALONE) -> dict[str, 
 
 
 class Trainer:
-    """State of one run: network, averaged weights, optimiser, generator, step."""
+    """A training run: network, averaged weights, optimiser, random generator, step."""
 
     def __init__(
         self,
@@ -150,18 +98,21 @@ class Trainer:
         data: dict[str, Any],
         processes: Processes = ALONE,
     ) -> None:
-        """Starts a run at step 0.
+        """Prepare a run at step 0.
 
         Args:
-            config: of the run.
-            train: takes to train on, this process's share.
-            validation: takes that tell when to stop, this process's share.
-            data: what the training takes are, for the archive's card: summary, takes, hours, licenses.
-            processes: that train together.
+            config: settings of the run.
+            train: this process's share of the takes to train on.
+            validation: this process's share of the takes for validation.
+            data: description of the training takes for the archive's card: summary, takes, hours, licenses.
+            processes: processes that train together.
+
+        Raises:
+            EdgeposeError: the sequences cannot be shared equally, or the takes are shorter than the window.
         """
         if config.sequences % processes.size:
             raise EdgeposeError(
-                f"{config.sequences} sequences a step cannot be shared by {processes.size} processes equally"
+                f"sequences is {config.sequences}; {processes.size} processes cannot share it equally"
             )
         torch.manual_seed(config.seed)
         self.config, self.train_tape, self.validation_tape = config, train, validation
@@ -169,12 +120,12 @@ class Trainer:
         seated = train.seated if config.seated_share else [False] * len(train.names)
         self.starts = window_starts(train, config.window, config.joined, lambda take: not seated[take])
         self.seated_starts = window_starts(train, config.window, config.joined, seated.__getitem__)
-        self.sits = windows_with_sitting(train, config.window)
-        counts = processes.everywhere(len(torch.cat(self.starts)))
+        self.has_sitting = windows_with_sitting(train, config.window)
+        counts = processes.gathered(len(torch.cat(self.starts)))
         if not all(counts):
-            at = f"process {counts.index(0)} has " if processes.size > 1 else ""
-            raise EdgeposeError(f"{at}no training take is as long as the window of {config.window} frames")
-        if not any(processes.everywhere(len(self._validation_starts()))):
+            where = f"process {counts.index(0)} has " if processes.size > 1 else ""
+            raise EdgeposeError(f"{where}no training take is as long as the window of {config.window} frames")
+        if not any(processes.gathered(len(self._validation_starts()))):
             raise EdgeposeError(f"no validation take is as long as the window of {config.window} frames")
         self.statistics = self._placed(compute_statistics(train, config.network, processes))
         self.network = new_network(config.network).to(processes.device)
@@ -188,7 +139,7 @@ class Trainer:
         self.worse = 0
 
     def _seed(self, step: int) -> None:
-        """Random numbers of this process from a step on."""
+        """Seed the random numbers of this process from a step on."""
         number = self.config.seed + step * self.processes.size + self.processes.rank
         self.generator = torch.Generator().manual_seed(number + 1)
         if self.processes.rank:
@@ -213,7 +164,7 @@ class Trainer:
         with torch.autocast(x.device.type, torch.bfloat16, enabled=config.bf16):
             seen = nn.functional.dropout(x, dropout, training=dropout > 0)
             mean, deviation = network(seen, config.streamed) if config.streamed else network(seen)
-        target = target[:, : mean.shape[1]]  # as a stream, the network leaves out frames without a future
+        target = target[:, : mean.shape[1]]  # when streamed, the last frames have no pose yet
         numbers, pose = target.shape[-1], config.network.pose_outputs
         mean = mean[..., :numbers].float()
         if config.network.smoothing:
@@ -226,7 +177,7 @@ class Trainer:
         return loss
 
     def train_step(self) -> float:
-        """One optimiser step; gives its loss."""
+        """Do one optimiser step and return its loss."""
         config = self.config
         rate = config.learning_rate * (
             0.96 ** (self.step / 2000)
@@ -247,7 +198,7 @@ class Trainer:
         nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self.optimiser.step()
         self.step += 1
-        # The average starts as the plain mean, so that it forgets the random first weights soon.
+        # The average starts as a plain mean, so that it soon forgets the random initial weights.
         decay = min(config.averaging, self.step / (self.step + 10.0))
         with torch.no_grad():
             for mean, new in zip(self.averaged.parameters(), self.network.parameters(), strict=True):
@@ -255,18 +206,20 @@ class Trainer:
         return self.processes.total(loss.detach()).item() / self.processes.size
 
     def _batch(self, starts: Tensor) -> Batch:
-        """Disturbed windows from some first frames on, those with made sitting last."""
-        how = self.config.augmentation
-        # The pelvis' pitch is what tells sitting from standing.
-        kinds = ((~self.sits[starts], how), (self.sits[starts], how._replace(pelvis_pitch_deg=0.0)))
+        """Return augmented windows by their first frames; those with synthetic sitting come last."""
+        sizes, sitting = self.config.augmentation, self.has_sitting[starts]
+        # The pitch of the pelvis tells sitting from standing, so it must not be disturbed there.
+        groups = ((~sitting, sizes), (sitting, sizes._replace(pelvis_pitch_deg=0.0)))
         parts = [
-            augment(self._windows(starts[kind]), its, self.generator) for kind, its in kinds if kind.any()
+            augment(self._windows(starts[rows]), chosen, self.generator)
+            for rows, chosen in groups
+            if rows.any()
         ]
         orientation, acceleration, relative = map(torch.cat, zip(*parts, strict=True))
         return orientation, acceleration, relative
 
     def _windows(self, starts: Tensor) -> Batch:
-        """Windows from some first frames on, in other postures if that is wanted."""
+        """Return windows by their first frames, in varied postures if the config asks for them."""
         tape, window, size = self.train_tape, self.config.window, self.config.augmentation.posture
         if not size:
             return windows(tape, starts, window)
@@ -282,7 +235,7 @@ class Trainer:
 
     @torch.no_grad()
     def validate(self) -> float:
-        """Likelihood loss of the averaged weights on undisturbed validation windows."""
+        """Return the likelihood loss of the averaged weights on undisturbed validation windows."""
         starts, total = self._validation_starts(), torch.zeros(2)
         for part in starts.split(128) if len(starts) else ():
             batch = windows(self.validation_tape, part, self.config.window)
@@ -291,8 +244,8 @@ class Trainer:
         return float(loss / count)
 
     def state(self) -> dict[str, Any]:
-        """Everything that `load` needs, as tensors and plain values; all processes have to ask together."""
-        generators = self.processes.everywhere((self.generator.get_state(), torch.get_rng_state()))
+        """Return all that `load` needs, as tensors and plain values; all processes must call it together."""
+        generators = self.processes.gathered((self.generator.get_state(), torch.get_rng_state()))
         return {
             "config": json.dumps(config_values(self.config)),
             "statistics": {name: value.clone() for name, value in self.statistics._asdict().items()},
@@ -308,13 +261,13 @@ class Trainer:
         }
 
     def load(self, state: dict[str, Any]) -> None:
-        """Goes on where a checkpoint stopped, with the same random numbers if the processes are as many.
+        """Continue from a checkpoint, with the same random numbers if the number of processes is the same.
 
         Raises:
-            EdgeposeError: the checkpoint is of another network, or holds weights only.
+            EdgeposeError: the checkpoint is of another network, or has no optimiser state.
         """
         if "optimiser" not in state:
-            raise EdgeposeError("the checkpoint holds weights only; begin a new run from it with --init")
+            raise EdgeposeError("the checkpoint holds weights only; start a new run from it with --init")
         self._check_shape(state)
         self.statistics = self._placed(Statistics(**state["statistics"]))
         self.network.load_state_dict(state["network"])
@@ -322,7 +275,7 @@ class Trainer:
         self.optimiser.load_state_dict(state["optimiser"])
         rank, states = self.processes.rank, torch.atleast_2d(state["generator"])
         if len(states) == self.processes.size:
-            # Copies: torch crashes on a state that is a view into other memory.
+            # Cloned, because torch crashes on a state that is a view of other memory.
             self.generator.set_state(states[rank].clone())
             torch.set_rng_state(torch.atleast_2d(state["torch_generator"])[rank].clone())
         else:
@@ -331,12 +284,12 @@ class Trainer:
         self.data = state["data"]
 
     def start_from(self, state: dict[str, Any]) -> None:
-        """Fine-tuning (DIP 3.4.4): takes a checkpoint's averaged weights and statistics.
+        """Start fine-tuning (DIP 3.4.4) from a checkpoint's averaged weights and statistics.
 
-        What it was trained on, and under which licences, is noted together with this run's takes.
+        Its training data and licences are added to the description of this run's takes.
 
         Raises:
-            EdgeposeError: the checkpoint is of another network; only its `smoothing` may differ.
+            EdgeposeError: the checkpoint is of another network; only `smoothing` may differ.
         """
         self._check_shape(state, smoothing=self.config.network.smoothing)
         self.statistics = self._placed(Statistics(**state["statistics"]))
@@ -351,10 +304,10 @@ class Trainer:
         }
 
     def _check_shape(self, state: dict[str, Any], **other: Any) -> None:
-        """The checkpoint's network is the config's, apart from `other` fields."""
+        """Check that the checkpoint's network is that of the config, apart from `other` fields."""
         shape = shape_of(state)
         if shape._replace(**other) != self.config.network:
-            raise EdgeposeError(f"the checkpoint holds {shape}, the config asks for {self.config.network}")
+            raise EdgeposeError(f"the checkpoint holds {shape}, but the config has {self.config.network}")
 
 
 def fit(
@@ -363,8 +316,18 @@ def fit(
     on_step: Callable[[int, float], None],
     on_validation: Callable[[int, float, float], None],
 ) -> None:
-    """Trains to the config's end, writing `checkpoint.pt` and, at the best validation loss, `best.pt` and a
-    line of `log.jsonl`.
+    """Train until the config's last step, or until early stopping.
+
+    Each validation writes `checkpoint.pt` and a line of `log.jsonl`; the best one so far also `best.pt`.
+
+    Args:
+        trainer: the run.
+        folder: folder of these files.
+        on_step: called with the step and its loss after each step.
+        on_validation: called with the step, the mean training loss and the validation loss.
+
+    Raises:
+        EdgeposeError: a loss is not finite, or a file cannot be written.
     """
     config, total, count = trainer.config, 0.0, 0
     while trainer.step < config.steps:
@@ -372,7 +335,7 @@ def fit(
         if not math.isfinite(loss):
             raise EdgeposeError(
                 f"the loss is {loss} at step {trainer.step}; "
-                "go on from the last checkpoint with a lower learning rate"
+                "continue from the last checkpoint with a lower learning rate"
             )
         total, count = total + loss, count + 1
         on_step(trainer.step, loss)
@@ -381,7 +344,7 @@ def fit(
             if not math.isfinite(validation):
                 raise EdgeposeError(
                     f"the validation loss is {validation} at step {trainer.step}; "
-                    "go on from the last checkpoint with a lower learning rate"
+                    "continue from the last checkpoint with a lower learning rate"
                 )
             better = validation < trainer.best
             trainer.best, trainer.worse = (validation, 0) if better else (trainer.best, trainer.worse + 1)

@@ -92,7 +92,7 @@ def test_learn_prior_reads_motion_and_leaves_held_out_takes_out(command, tmp_pat
     result = command("learn-prior", tmp_path, "--out", out, "--about", "mine, free")
     assert result.returncode == 0, result.stderr
     assert "720 poses" in result.stderr
-    assert "left out: " in result.stderr
+    assert "skipped: " in result.stderr
     assert "broken.bvh" in result.stderr
     prior = load_prior(out)
     assert prior.about == "mine, free"
