@@ -187,7 +187,8 @@ def one_instant(sensors):
         (
             drop_orientation,
             ["--protocol", "hipnuc"],
-            "head: hipnuc cannot represent its samples: quaternion, acceleration and angular rate are required",
+            "head: hipnuc cannot represent its samples: "
+            "quaternion, acceleration and angular rate are required",
         ),
         (one_instant, [], "left_forearm: needs at least two samples"),
     ],

@@ -97,6 +97,13 @@ def mt_manager(path: Path, recording: Recording, names: tuple[str, ...] = PLACEM
     return path
 
 
+def packed_session(path: Path, recording: Recording) -> Path:
+    xio_session(path / "walk", recording)
+    packed = shutil.make_archive(str(path), "zip", path)
+    shutil.rmtree(path)
+    return Path(packed)
+
+
 def totalcapture(path: Path, recording: Recording) -> Path:
     lines = [f"{len(NAMES)}\t{FRAMES}"]
     for i in range(FRAMES):
@@ -137,6 +144,7 @@ WRITERS: dict[str, Callable[[Path, Recording], Path]] = {
     "totalcapture": totalcapture,
     "xsens-session": mt_manager,
     "xio-session": xio_session,
+    "packed-session": packed_session,
 }
 
 
