@@ -251,7 +251,7 @@ def test_a_calibration_without_a_sensor(fail, wearer, tmp_path):
     del document["sensors"][PLACEMENTS[2]]
     file = tmp_path / "c.json"
     file.write_text(json.dumps(document))
-    assert f"{file}: no sensor {PLACEMENTS[2]}; calibrate anew with all six" in fail(calibration=file)
+    assert f"{file}: no sensor {PLACEMENTS[2]}; calibrate again with all six" in fail(calibration=file)
 
 
 # --- archives -----------------------------------------------------------------------------------------------
