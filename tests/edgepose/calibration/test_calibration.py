@@ -528,7 +528,10 @@ def of_head(**changes: Any) -> str:
         (corrupt(version=True), "format version True"),
         (corrupt(version=KeyError), "format version None"),
         (corrupt(sensors=[]), "'sensors' is missing or not an object"),
-        (corrupt(sensors__head=KeyError, sensors__pelvis=KeyError), "no sensor head, pelvis; calibrate again"),
+        (
+            corrupt(sensors__head=KeyError, sensors__pelvis=KeyError),
+            "no sensor head, pelvis; calibrate again with all six",
+        ),
         (corrupt(sensors__chest={}), "unknown sensor 'chest'"),
         (corrupt(sensors__head=3), "sensor head is not an object"),
         (of_head(bone_from_sensor=[1, 0, 0]), "sensor head: 'bone_from_sensor' is not a unit"),

@@ -128,7 +128,9 @@ def test_swapped_sensors_and_one_upside_down_are_told() -> None:
         calibration_of(measured(worn, np.zeros(6), slack_deg=20.0), np.zeros(6)), MAP, "rig.toml"
     )
     assert len(warnings) == 2
-    assert warnings[0].startswith("left_forearm and right_forearm look swapped: each is mounted as rig.toml says")
+    assert warnings[0].startswith(
+        "left_forearm and right_forearm look swapped: each is mounted as rig.toml says"
+    )
     assert warnings[1] == (
         "pelvis is mounted x down, z back (upside down), but rig.toml says x up, z back; "
         "check that no two sensors are swapped and that it is the right way round"
