@@ -91,7 +91,7 @@ def test_exchanged_sensors(command, real, calibrated, tmp_path, pairs):
     moved = {name for pair in pairs for name in pair}
     message = next(line for line in warnings if "swapped since the calibration" in line)
     assert set(re.findall(r"(\w+) is where", message)) == moved
-    assert set(re.findall(r"^(\w+): it sits where", table, re.MULTILINE)) == moved
+    assert set(re.findall(r"^(\w+): it is where", table, re.MULTILINE)) == moved
     assert code == 1
 
 
