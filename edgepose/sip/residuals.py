@@ -1,4 +1,4 @@
-"""How well poses explain the sensors: a table, advice about sensors that do not fit, and a picture."""
+"""Residuals of poses against the sensors: a table, advice about sensors that do not fit, and a plot."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from edgepose.sip.measurements import Measurements
 from edgepose.sip.solve import Solution
 
 TURN_LIMIT_DEG = 12.0
-"""RMS of an orientation residual above which a sensor does not fit; 3 to 7 are usual."""
+"""RMS of the orientation residual above which a sensor does not fit; 3 to 7 is usual."""
 
 PULL_LIMIT = 2.5
-"""RMS of an acceleration residual above which a sensor does not fit, m/s^2; 0.2 to 1 are usual."""
+"""RMS of the acceleration residual above which a sensor does not fit, m/s^2; 0.2 to 1 is usual."""
 
 
 def concatenate(solutions: Sequence[Solution]) -> Solution:
-    """Consecutive solutions as one."""
+    """Join consecutive solutions."""
     arrays = {
         name: np.concatenate([getattr(s, name) for s in solutions])
         for name in Solution._fields
@@ -30,7 +30,7 @@ def concatenate(solutions: Sequence[Solution]) -> Solution:
 
 
 def table(solution: Solution, measurements: Measurements) -> str:
-    """Cost a frame by term, and residuals by sensor."""
+    """Format the cost per frame by term, and the residuals by sensor."""
     costs = dict(zip(Costs._fields, solution.costs.mean(axis=0), strict=True))
     lines = [
         "cost a frame  "
@@ -46,17 +46,17 @@ def table(solution: Solution, measurements: Measurements) -> str:
 
 
 def misfits(solution: Solution, measurements: Measurements) -> list[str]:
-    """One line for each sensor that does not fit, with advice."""
+    """Return one line with advice for each sensor that does not fit."""
     return [
-        f"{name} does not fit the others ({turn:.0f} deg, {pull:.1f} m/s^2 off): is it worn where its name "
-        "says, and was it calibrated since it was put on?"
+        f"{name} does not fit the others ({turn:.0f} deg, {pull:.1f} m/s^2 off): check that it is worn where "
+        "its name says, and that it has been calibrated since it was put on"
         for name, turn, pull in _residuals(solution, measurements)
         if turn > TURN_LIMIT_DEG or pull > PULL_LIMIT
     ]
 
 
 def _residuals(solution: Solution, measurements: Measurements) -> list[tuple[str, float, float]]:
-    """Name and RMS residuals of each sensor: orientation in degrees, acceleration in m/s^2."""
+    """Return name and RMS residuals of each sensor: orientation in degrees, acceleration in m/s^2."""
     turns = np.degrees(np.sqrt(np.mean(solution.turn_rad**2, axis=0)))
     valid = measurements.valid[: len(solution.pull)]
     pulls = np.sqrt(np.sum(solution.pull**2, axis=0) / np.maximum(valid.sum(axis=0), 1))
@@ -64,7 +64,7 @@ def _residuals(solution: Solution, measurements: Measurements) -> list[tuple[str
 
 
 def plot(path: str | Path, solution: Solution, measurements: Measurements, overwrite: bool = True) -> None:
-    """Draw cost by term, and residuals by sensor, over time.
+    """Plot the cost by term and the residuals by sensor over time.
 
     Raises:
         EdgeposeError: matplotlib is not installed, or the file cannot be written.
