@@ -169,7 +169,7 @@ def _same_shape(predicted: ArrayLike, true: ArrayLike) -> tuple[Array, Array]:
     predicted, true = np.asarray(predicted, float), np.asarray(true, float)
     if predicted.shape != true.shape or predicted.shape[1:] != (24, 3, 3):
         raise ValueError(
-            f"poses of shapes {predicted.shape} and {true.shape}, expected (T, 24, 3, 3) for both"
+            f"poses of shapes {predicted.shape} and {true.shape}, expected two equal shapes (T, 24, 3, 3)"
         )
     return predicted, true
 
