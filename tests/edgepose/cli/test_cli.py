@@ -211,7 +211,7 @@ def test_a_recording_cut_in_two(fail, wearer, tmp_path):
     file = tmp_path / "cut.npz"
     file.write_bytes(content[: len(content) // 2])
     text = fail(file=file)
-    assert f"{file}: not a whole NPZ file" in text
+    assert f"{file}: not a complete NPZ file" in text
     assert "copy it again" in text
 
 

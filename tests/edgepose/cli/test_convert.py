@@ -288,7 +288,7 @@ def test_fifty_files_one_of_them_broken_by_two_processes(command, tmp_path):
         rf"^{folder / '7.csv'} +59 +0\.1  damaged: .*1 bad rows left out.* row 21 has 1 col", damaged
     )
     (failed,) = (line for line in lines if " failed: " in line)
-    assert re.search(rf"^{folder / 'deeper' / '9.npz'} +- +-  failed: .*not a whole NPZ file", failed)
+    assert re.search(rf"^{folder / 'deeper' / '9.npz'} +- +-  failed: .*not a complete NPZ file", failed)
     written = sorted(path for path in out.rglob("*") if path.is_file())
     assert len(written) == 49
     for path in written:
