@@ -75,7 +75,7 @@ def _numbers(path: Path, arrays: Mapping[str, NDArray[Any]], key: str, shape: tu
     """Return an array of `shape` as numbers, checked to be finite and plausible."""
     values = arrays[key]
     if values.dtype.kind not in "fiub" or values.shape != shape:
-        raise FileFormatError(f"{path}: {key!r} is {values.dtype} {values.shape} and not numbers {shape}")
+        raise FileFormatError(f"{path}: {key!r} is {values.dtype} {values.shape}, not numbers {shape}")
     numbers = values.astype(np.float64)
     bad = is_absurd(numbers, LARGEST_TIME if key in ("time_s", "frame") else LARGEST)
     if bad.any():

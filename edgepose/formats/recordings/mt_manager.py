@@ -1,7 +1,7 @@
 """Sessions of Xsens' MT Manager: a folder with one text file for each sensor.
 
-Lines `// key: value`, among them the update rate, then columns with names, separated by tabs or commas.
-Sensors of one session count packets together, in 16 bits.
+A file has lines `// key: value`, one of them the update rate, then named columns, separated by tabs or
+commas. Sensors of one session share a packet counter of 16 bits.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _METADATA = {
 
 
 def is_session(folder: Path) -> bool:
-    """Whether a folder holds files of MT Manager's sensors."""
+    """Return whether a folder contains sensor files of MT Manager."""
     return any(_is_sensor(path) for path in folder.glob("*.txt"))
 
 
@@ -51,26 +51,26 @@ def _is_sensor(path: Path) -> bool:
 
 
 def read_session(folder: Path, ids: Mapping[int, str] | None = None) -> Recording:
-    """The recording in a session; its time starts with the first packet.
+    """Read the recording of a session; its time starts with the first packet.
 
     Args:
         folder: of the session.
-        ids: placements by device id, with which MT Manager ends the names of files. Without them a file has
-            the placement in its name, such as "left_lower_leg_00B4D7D3.txt".
+        ids: placements by device id, which MT Manager puts at the end of file names. Without them, file names
+            contain the placement, such as "left_lower_leg_00B4D7D3.txt".
 
     Raises:
-        FileFormatError: no file is of a placement, two are of one, or a file is of another kind.
+        FileFormatError: no file has a placement, two have the same one, or a file is of another kind.
     """
-    places = by_placement(folder, sorted(path for path in folder.glob("*.txt") if _is_sensor(path)), ids)
+    paths = by_placement(folder, sorted(path for path in folder.glob("*.txt") if _is_sensor(path)), ids)
     problems: list[str] = []
     rows: list[ImuSample] = []
     first = None
-    for name, path in places.items():
+    for name, path in paths.items():
         rate, samples = _read(path, PLACEMENTS.index(name), problems)
         if samples:
             start = int(samples[0].time_s)
             first = start if first is None else first
-            # Counters that are near each other may be on either side of a wrap.
+            # Counters that are close may be on either side of a wrap.
             shift = (start - first + 0x8000) % 0x10000 - 0x8000 - start
             rows += [sample._replace(time_s=(sample.time_s + shift) / rate) for sample in samples]
     earliest = min((row.time_s for row in rows), default=0.0)
@@ -81,7 +81,7 @@ def read_session(folder: Path, ids: Mapping[int, str] | None = None) -> Recordin
 
 
 def _read(path: Path, index: int, problems: list[str]) -> tuple[float, list[ImuSample]]:
-    """Packets a second, and samples whose time is still the number of their packet."""
+    """Read packets a second, and samples whose time is the number of their packet."""
     try:
         with path.open(encoding="utf-8-sig", errors="replace") as file:
             lines = iter(lambda: file.readline(_MAX_LINE), "")
@@ -98,7 +98,7 @@ def _read(path: Path, index: int, problems: list[str]) -> tuple[float, list[ImuS
 
 
 def _head(path: Path, lines: Iterator[str]) -> tuple[float, list[str]]:
-    """Packets a second, and the names of the columns."""
+    """Read packets a second, and the names of the columns."""
     rate = None
     for line in islice(lines, _HEAD_LINES):
         found = _RATE.search(line)
@@ -106,9 +106,9 @@ def _head(path: Path, lines: Iterator[str]) -> tuple[float, list[str]]:
             rate = float(found[1])
         elif line.startswith(_COUNTER):
             if rate is None or not 0.1 < rate < 10_000.0:
-                raise FileFormatError(f"{path}: no possible 'Update Rate: ... Hz' in its first lines")
+                raise FileFormatError(f"{path}: no valid 'Update Rate: ... Hz' in its first lines")
             return rate, _cells(line)
-    raise FileFormatError(f"{path}: no line of columns that begins with {_COUNTER}")
+    raise FileFormatError(f"{path}: no line of column names that starts with {_COUNTER}")
 
 
 def _cells(line: str) -> list[str]:
@@ -116,7 +116,7 @@ def _cells(line: str) -> list[str]:
 
 
 def _samples(lines: Iterator[str], names: list[str], index: int) -> tuple[list[ImuSample], int]:
-    """Samples, and how many rows were bad; a quantity with an empty cell was not measured."""
+    """Parse samples, and count bad rows; a quantity with an empty cell was not measured."""
     columns = {
         quantity: [names.index(name) for name in wanted]
         for quantity, wanted in _QUANTITIES.items()
@@ -131,9 +131,9 @@ def _samples(lines: Iterator[str], names: list[str], index: int) -> tuple[list[I
                 raise ValueError
             step = (int(cells[0]) - count) & 0xFFFF if samples else int(cells[0]) & 0xFFFF
             values = {
-                quantity: tuple(float(cells[i]) for i in places)
-                for quantity, places in columns.items()
-                if all(cells[i] for i in places)
+                quantity: tuple(float(cells[i]) for i in indices)
+                for quantity, indices in columns.items()
+                if all(cells[i] for i in indices)
             }
             if (samples and not 0 < step < 0x8000) or not all(
                 isfinite(v) for t in values.values() for v in t

@@ -234,9 +234,7 @@ def test_a_damaged_xio_session(tmp_path):
     assert np.isnan(recording.sensors["head"].acc).any(axis=1).sum() == 2
     assert len(list(iter_samples(recording))) == len(written)
     (session / "head" / "Quaternion.csv").write_text("W,X\n")
-    assert (
-        "starts with 'W,X' and not with 'Timestamp (us)'" in convert(Job(session, tmp_path / "a.csv")).problem
-    )
+    assert "starts with 'W,X', not with 'Timestamp (us)'" in convert(Job(session, tmp_path / "a.csv")).problem
     (session / "head" / "Quaternion.csv").unlink()
     (session / "Head 2").mkdir()
     shutil.copy(file, session / "Head 2")
