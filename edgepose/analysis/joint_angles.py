@@ -91,7 +91,7 @@ class WalkingBout(NamedTuple):
     left: NDArray[np.bool_]
 
 
-def walks(local: Array, offsets: Array, rate: float) -> list[WalkingBout]:
+def walking_bouts(local: Array, offsets: Array, rate: float) -> list[WalkingBout]:
     """Find bouts of walking or running.
 
     Args:

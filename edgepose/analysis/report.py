@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.analysis.figures import INK, PREDICTION, require_matplotlib, skeleton_strip
-from edgepose.analysis.joint_angles import ANGLES, LIMBS, WalkingBout, joint_angles, walks
+from edgepose.analysis.joint_angles import ANGLES, LIMBS, WalkingBout, joint_angles, walking_bouts
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseSequence, held_sensors, longest_holds
 from edgepose.skeleton import Body
@@ -56,7 +56,7 @@ def write_report(path: Path, poses: PoseSequence, body: Body, name: str, overwri
     """
     require_matplotlib("a report")
     angles = joint_angles(poses.rotations)
-    bouts = walks(poses.rotations, body.offsets, poses.rate)
+    bouts = walking_bouts(poses.rotations, body.offsets, poses.rate)
     times = poses.time_s - poses.time_s[0]
     parts = [
         f"<h1>{html.escape(name)}</h1>",

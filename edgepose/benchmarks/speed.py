@@ -102,7 +102,7 @@ def _calibration() -> Calibration:
 # --- steps --------------------------------------------------------------------------------------------------
 
 
-def _each(step: Callable[[Item], Result], items: Iterable[Item]) -> tuple[list[Result], float]:
+def _timed(step: Callable[[Item], Result], items: Iterable[Item]) -> tuple[list[Result], float]:
     """Run a step on each item; return the results and the total processor time, microseconds."""
     items = list(items)
     started = time.process_time()
@@ -130,17 +130,17 @@ def step_costs(engine: Engine, folder: Path) -> dict[str, float]:
         return frame, *apply_calibration(calibration, frame.orientation, frame.force)
 
     costs = {}
-    samples, costs["decode"] = _each(lambda chunk: _decode(decoder, chunk), _chunks())
+    samples, costs["decode"] = _timed(lambda chunk: _decode(decoder, chunk), _chunks())
     samples = [batch for batch in samples if batch]
-    _, costs["filter, where sensors send none"] = _each(orienter.orient, samples)
-    batches, costs["frames"] = _each(to_frames, samples)
-    bodies, costs["calibration"] = _each(calibrated, [frame for frames in batches for frame in frames])
-    outputs, costs["network"] = _each(lambda body: engine.push(*body), bodies)
+    _, costs["filter, where sensors send none"] = _timed(orienter.orient, samples)
+    batches, costs["frames"] = _timed(to_frames, samples)
+    bodies, costs["calibration"] = _timed(calibrated, [frame for frames in batches for frame in frames])
+    outputs, costs["network"] = _timed(lambda body: engine.push(*body), bodies)
     poses = [pose_frame(output) for batch in outputs for output in batch]
-    _, costs["UDP binary, not yet sent"] = _each(encode_binary, poses)
-    _, costs["UDP JSON, not yet sent"] = _each(encode_json, poses)
+    _, costs["UDP binary, not yet sent"] = _timed(encode_binary, poses)
+    _, costs["UDP JSON, not yet sent"] = _timed(encode_json, poses)
     with CsvSink(folder / "poses.csv") as sink:
-        _, costs["CSV"] = _each(sink.write, poses)
+        _, costs["CSV"] = _timed(sink.write, poses)
     return {name: cost / len(bodies) for name, cost in costs.items()}
 
 

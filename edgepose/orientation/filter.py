@@ -229,12 +229,12 @@ class OrientationFilter:
         quats /= np.linalg.norm(quats, axis=1, keepdims=True)
         rotations = rot.quat_to_matrix(quats)
         rotation, last = rotations[:-1], rotations[-1]
-        grown = model.transition(dt, rotation, gyr, acc - self._acc_bias)
+        transition = model.transition(dt, rotation, gyr, acc - self._acc_bias)
         rate = float(np.linalg.norm(gyr - self._bias, axis=1).mean())
         noise = model.process_noise(s, self._block_s, rate, self._lost_angle, self._lost_speed)
-        self._velocity = self._velocity + grown.velocity
+        self._velocity = self._velocity + transition.velocity
         self._rest.update(self._block_s, gyr, acc, self._bias, float(self._bias_sigma.max()))
-        kalman.predict(F=grown.matrix, Q=noise)
+        kalman.predict(F=transition.matrix, Q=noise)
         field = self._mean_field(rotation, mag)
         self._field_age_s += self._block_s
         states, errors, variances = self._measure(field, rate)
@@ -242,7 +242,7 @@ class OrientationFilter:
         kalman.update(np.array(errors), R=np.diag(variances), H=np.eye(model.SIZE)[states])
         kalman.P = 0.5 * (kalman.P + kalman.P.T)
         self._correct_state(kalman.x, last)
-        self._record_step(row, grown.matrix, kalman.P_prior, kalman.x)
+        self._record_step(row, transition.matrix, kalman.P_prior, kalman.x)
         kalman.x = np.zeros(model.SIZE)
         self._begin_block()
         if field is not None and not self._has_heading:

@@ -55,16 +55,16 @@ class Solution(NamedTuple):
     Attributes:
         rotations: (T, 24, 3, 3) local rotations, joint 0 against the body frame T.
         costs: (T, 4) weighted cost of the terms, as in `edgepose.sip.energy.Costs`.
-        turn_rad: (T, N) angle between estimated and measured orientation of each sensor, rad.
-        pull: (T, N) length of each sensor's acceleration residual, m/s^2; 0 where none was measured.
+        orientation_residual: (T, N) angle between each sensor's estimated and measured orientation, rad.
+        acceleration_residual: (T, N) length of each residual, m/s^2; 0 where none was measured.
         acceleration: (T, 3) of the pelvis in T, m/s^2; NaN where no sensor measured any.
         evaluations: number of cost evaluations.
     """
 
     rotations: Array
     costs: Array
-    turn_rad: Array
-    pull: Array
+    orientation_residual: Array
+    acceleration_residual: Array
     acceleration: Array
     evaluations: int
 
@@ -212,7 +212,7 @@ def _crossfade(before: Solution, after: Solution) -> Solution:
     middle = frames // 2
     columns: dict[str, Any] = {
         name: np.concatenate([getattr(before, name)[:middle], getattr(after, name)[middle:]])
-        for name in ("costs", "turn_rad", "pull", "acceleration")
+        for name in ("costs", "orientation_residual", "acceleration_residual", "acceleration")
     }
     rotations = np.concatenate([between, after.rotations[frames:]])
     return after._replace(rotations=rotations, **columns)

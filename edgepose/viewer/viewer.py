@@ -175,7 +175,7 @@ class Viewer:
                 with self._server.atomic():
                     track.show(i)
                     if second is not None:
-                        second.show(_beside(second.poses, poses, i))
+                        second.show(_nearest_reference(second.poses, poses, i))
                 shown = i
             if now - self._updated_s >= TABLE_S:
                 self._updated_s = now
@@ -251,7 +251,7 @@ class _Track:
     def __init__(self, figure: SkeletonView, poses: PoseSequence, body: Body) -> None:
         self.poses = poses
         self._figure = figure
-        self._positions = _on_the_ground(poses, body)
+        self._positions = _grounded_positions(poses, body)
 
     def show(self, i: int) -> None:
         position = None if self._positions is None else self._positions[i]
@@ -315,14 +315,14 @@ def plain(status: str) -> str:
     return re.sub(r"[^A-Za-z0-9_ ;]", "?", status[:200])
 
 
-def _beside(reference: PoseSequence, poses: PoseSequence, i: int) -> int:
+def _nearest_reference(reference: PoseSequence, poses: PoseSequence, i: int) -> int:
     """Return the index of the reference pose nearest to pose i."""
     common = reference.time_s[0] <= poses.time_s[-1] and poses.time_s[0] <= reference.time_s[-1]
     start = 0.0 if common else poses.time_s[0] - reference.time_s[0]
     return int(np.abs(reference.time_s - (poses.time_s[i] - start)).argmin())
 
 
-def _on_the_ground(poses: PoseSequence, body: Body) -> Array | None:
+def _grounded_positions(poses: PoseSequence, body: Body) -> Array | None:
     """Return pelvis positions (T, 3), metres, lowest point of all on the ground; None if unknown."""
     if poses.translation is None:
         return None
