@@ -1,1 +1,1 @@
-"""Poses measured, described and drawn."""
+"""Analysis of poses: metrics, joint angles, figures and reports."""

@@ -1,7 +1,8 @@
-"""Pictures of poses for people; needs matplotlib, which is imported only when one is drawn."""
+"""Pictures of poses; needs matplotlib, which is imported only when one is drawn."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,9 +22,9 @@ Array = NDArray[np.float64]
 PICTURES = (".png", ".pdf", ".svg")
 
 AZIMUTH = np.deg2rad(25.0)
-"""The viewer stands this far round from the figure's front towards its left side."""
+"""Direction of the viewer: this angle from the figure's front towards its left side."""
 
-# Limbs as chains of joints with their thickness in metres; "left" and "right" are the figure's own.
+# Limbs as chains of joints with their thickness in metres; "left" and "right" as seen by the figure.
 LIMBS = (
     ("left", (1, 4, 7, 10), 0.075),
     ("right", (2, 5, 8, 11), 0.075),
@@ -34,7 +35,7 @@ TORSO_THICKNESS = 0.065
 NECK_THICKNESS = 0.07
 RIM = 0.025
 
-# Points that are no joints: joint, place in its bone frame, metres.
+# Points other than joints: joint, position in its bone frame, metres.
 LEFT_WAIST, RIGHT_WAIST, HEAD_CENTRE, NOSE = range(24, 28)
 EXTRA_POINTS = (
     (3, (0.075, 0.02, 0.0)),
@@ -59,7 +60,7 @@ class FlatBody(NamedTuple):
 
     Attributes:
         points: (28, 2) joints and `EXTRA_POINTS`, right and up.
-        depths: (28,) how far each is towards the viewer.
+        depths: (28,) distance of each towards the viewer.
     """
 
     points: Array
@@ -67,10 +68,10 @@ class FlatBody(NamedTuple):
 
 
 def project(points: ArrayLike, azimuth: float = AZIMUTH) -> tuple[Array, Array]:
-    """Points (..., 3) in the body frame T as (..., 2), right and up, and depths (...) towards the viewer.
+    """Project points (..., 3) in T to (..., 2), right and up, and depths (...) towards the viewer.
 
     The figure faces the viewer, so its left (+X) is at the viewer's right. The viewer stands `azimuth`
-    radians round from its front towards its left side.
+    radians from its front towards its left side.
     """
     x, y, z = np.moveaxis(np.asarray(points, float), -1, 0)
     c, s = np.cos(azimuth), np.sin(azimuth)
@@ -78,7 +79,7 @@ def project(points: ArrayLike, azimuth: float = AZIMUTH) -> tuple[Array, Array]:
 
 
 def require_matplotlib(what: str) -> None:
-    """Raises EdgeposeError, naming what needs it, unless matplotlib is there; it is an extra."""
+    """Raise EdgeposeError unless matplotlib, an optional extra, is installed; `what` names what needs it."""
     try:
         import matplotlib.figure  # noqa: F401
     except ImportError as error:
@@ -88,8 +89,11 @@ def require_matplotlib(what: str) -> None:
 
 
 def check_picture(path: Path, what: str, overwrite: bool = False) -> None:
-    """Before long work: raises EdgeposeError unless this kind of picture can be drawn in this folder without
-    loss."""
+    """Check before long work that a picture can be written to `path`.
+
+    Raises:
+        EdgeposeError: matplotlib is missing, or the kind of picture or the folder is unsuitable.
+    """
     require_matplotlib(what)
     if is_stream(path):
         return
@@ -101,12 +105,13 @@ def check_picture(path: Path, what: str, overwrite: bool = False) -> None:
 
 
 def save_picture(figure: Figure, path: str | Path, *, overwrite: bool, **options: Any) -> None:
-    """Write a figure; the file is whole or as it was before.
+    """Write a figure; on failure the file stays as it was.
 
     Args:
         figure: to draw.
-        path: of the picture; the ending says the kind (png, svg, pdf), a device or pipe without one gets png.
-        overwrite: whether it may take the place of a file.
+        path: of the picture; its ending sets the kind (png, svg, pdf), and a device or pipe without one gets
+            png.
+        overwrite: whether an existing file may be replaced.
         options: of matplotlib's `savefig`.
 
     Raises:
@@ -134,7 +139,7 @@ def skeleton_strip(
     """Draw stick figures at K instants side by side, with reference figures in a second row.
 
     Args:
-        path: picture to write; the ending says the kind (png, svg, pdf).
+        path: picture to write; its ending sets the kind (png, svg, pdf).
         poses: (K, 24, 3, 3) local rotations.
         times: (K,) seconds, written below the figures.
         offsets: (24, 3) joint position minus its parent's in the zero pose, metres.
@@ -145,14 +150,20 @@ def skeleton_strip(
         EdgeposeError: matplotlib is not installed, or the file cannot be written.
     """
     require_matplotlib("drawing poses")
-    from matplotlib.figure import Figure
-
     times = np.asarray(times, float)
     rows = [(flatten(poses, offsets), PREDICTION)]
     if reference is not None:
         rows.append((flatten(reference, offsets), REFERENCE))
     if any(len(figures) != len(times) for figures, _ in rows) or not len(times):
         raise ValueError("poses, times and reference must be for the same instants, at least one")
+    save_picture(_draw_rows(rows, times, title), path, overwrite=True, dpi=DPI)
+
+
+def _draw_rows(
+    rows: Sequence[tuple[list[FlatBody], dict[str, str]]], times: Array, title: str | None
+) -> Figure:
+    """Draw rows of figures, each with its colours, above their times, with a legend and a title."""
+    from matplotlib.figure import Figure
 
     centres, width = _columns([figures for figures, _ in rows])
     height = max(_top(f) for figures, _ in rows for f in figures) + 0.12
@@ -160,7 +171,7 @@ def skeleton_strip(
     title_in, legend_in = 0.3 if title else 0.0, 0.36  # inches above the figures
     head_in = title_in + legend_in
     total = len(rows) * height + label
-    # Few figures would make a picture of giants: leave room at their sides instead.
+    # Leave room at the sides of a few figures instead of drawing them huge.
     canvas = max(width, total * WIDTH_IN / (1.8 * len(rows) + 1.2))
     scale = WIDTH_IN / canvas  # inches per metre
     body_in = total * scale
@@ -182,16 +193,16 @@ def skeleton_strip(
     inch = 1.0 / (body_in + head_in)  # of the figure's height
     if title:
         figure.text(0.02, 1.0 - 0.6 * title_in * inch, title, ha="left", va="center", fontsize=10, color=INK)
-    _legend(figure, 1.0 - (title_in + 0.5 * legend_in) * inch, reference is not None)
-    save_picture(figure, path, overwrite=True, dpi=DPI)
+    _legend(figure, 1.0 - (title_in + 0.5 * legend_in) * inch, len(rows) > 1)
+    return figure
 
 
 def flatten(poses: ArrayLike, offsets: ArrayLike, azimuth: float = AZIMUTH) -> list[FlatBody]:
-    """Poses (K, 24, 3, 3) on the picture plane, pelvis at x = 0, lowest point on the ground line y = 0."""
+    """Project poses (K, 24, 3, 3) to the picture plane, pelvis at x = 0, lowest point on the ground y = 0."""
     offsets = np.array(offsets, float)
     offsets[0] = 0.0
     rotations, joints = forward_kinematics(poses, offsets)
-    extra = [joints[:, j] + rotations[:, j] @ np.array(place) for j, place in EXTRA_POINTS]
+    extra = [joints[:, j] + rotations[:, j] @ np.array(position) for j, position in EXTRA_POINTS]
     points, depths = project(np.concatenate([joints, np.stack(extra, axis=1)], axis=1), azimuth)
     lowest = np.minimum(points[:, :24, 1].min(axis=1) - 0.03, points[:, HEAD_CENTRE, 1] - HEAD_RADIUS)
     points[..., 1] -= lowest[:, None]
@@ -203,7 +214,7 @@ def _top(figure: FlatBody) -> float:
 
 
 def _columns(rows: list[list[FlatBody]]) -> tuple[list[float], float]:
-    """Where the pelvis of each column stands, so that no figure touches the next, and the width; metres."""
+    """Return the pelvis position of each column, so that figures do not touch, and the width; metres."""
     gap, centres, edge = 0.22, [], 0.0
     for column in zip(*rows, strict=True):
         left = max(0.3, *(-f.points[:, 0].min() for f in column))
@@ -216,16 +227,13 @@ def _columns(rows: list[list[FlatBody]]) -> tuple[list[float], float]:
 def draw_body(
     axes: Any, figure: FlatBody, at: Array, colours: dict[str, str], points_per_metre: float
 ) -> None:
-    """One body, moved by `at`.
-
-    What is nearer to the viewer lies over what is further, each part with a white rim.
-    """
+    """Draw one body, moved by `at`, with nearer parts over further ones, each with a white rim."""
     from matplotlib.patches import Circle, Polygon
 
     points = figure.points + at
     for side, limb, thickness in LIMBS:
         chain = list(limb)
-        # Without the shoulder or hip, so that a forearm before the chest is drawn before the chest.
+        # Without the shoulder or hip, so that a forearm in front of the chest is drawn in front of it.
         depth = 10.0 + figure.depths[chain[1:]].mean()
         for extra, colour, order in ((RIM, "white", depth), (0.0, colours[side], depth + 1e-3)):
             axes.plot(

@@ -1,7 +1,7 @@
-"""Angles and steps that people read in poses: flexion of joints, lean of the trunk, cadence of a walk.
+"""Joint angles and steps from poses: flexion of joints, lean of the trunk, bouts of walking.
 
-Angles are those between directions of bones, so that they mean the same however a joint got there; degrees.
-In the zero pose (T-pose) legs, elbows and trunk are at 0 and the shoulders at 90.
+Angles, in degrees, are between directions of bones, so they do not depend on the path of a joint. In the zero
+pose (T-pose) legs, elbows and trunk are at 0 and the shoulders at 90.
 """
 
 from __future__ import annotations
@@ -28,19 +28,22 @@ ANGLES = {
     "trunk rotation": "chest turned to the left of the pelvis",
     "trunk lean": "chest from upright",
 }
-"""The angles, those of limbs on either side, and what they are."""
+"""Angles and their descriptions; those of limbs exist for either side."""
 
 LIMBS = tuple(name for name in ANGLES if not name.startswith("trunk"))
 
 
 def _axis(joint: str, x: float, y: float, z: float, local: Array) -> tuple[Array, Array, Array]:
-    """Components (T,) of a direction that a joint turns, in its parent's frame."""
-    turned = local[:, JOINTS.index(joint)] @ np.array([x, y, z])
-    return turned[:, 0], turned[:, 1], turned[:, 2]
+    """Return the components (T,), in the parent's frame, of a direction that is fixed in a joint's frame."""
+    rotated = local[:, JOINTS.index(joint)] @ np.array([x, y, z])
+    return rotated[:, 0], rotated[:, 1], rotated[:, 2]
 
 
 def joint_angles(local: Array) -> dict[str, Array]:
-    """The angles (T,) of `ANGLES`, degrees, of local rotations (T, 24, 3, 3); limbs as "left hip flexion"."""
+    """Compute the angles (T,) of `ANGLES`, degrees, from local rotations (T, 24, 3, 3).
+
+    The keys of limbs have the form "left hip flexion".
+    """
     world, _ = forward_kinematics(local, np.zeros((len(JOINTS), 3)))
     chest = world[:, JOINTS.index("spine3")]
     result = {}
@@ -66,30 +69,30 @@ def joint_angles(local: Array) -> dict[str, Array]:
 # --- steps --------------------------------------------------------------------------------------------------
 
 STEP_M = 0.15
-"""A foot that comes this much further to the front than before, against the other one, has made a step."""
+"""A foot that moves this much to the front, relative to the other one, has made a step."""
 
 FASTEST_STEP_S, SLOWEST_STEP_S = 0.25, 1.2
-"""Between steps of a walk, seconds; a longer pause ends it."""
+"""Shortest and longest time between steps of a bout of walking, seconds; a longer pause ends it."""
 
 LEAST_STEPS = 6
-"""Fewer in a row are no walk."""
+"""Smallest number of steps of a bout of walking."""
 
 
 class WalkingBout(NamedTuple):
-    """Steps one after the other without a pause.
+    """Consecutive steps without a pause.
 
     Attributes:
-        frames: (N,) indices of the poses in which a foot was furthest to the front, which is about when it
-            touches the ground.
-        left: (N,) whether it was the left one.
+        frames: (N,) indices of the poses in which a foot was furthest to the front, about when it touches the
+            ground.
+        left: (N,) whether it was the left foot.
     """
 
     frames: NDArray[np.int64]
     left: NDArray[np.bool_]
 
 
-def walks(local: Array, offsets: Array, rate: float) -> list[WalkingBout]:
-    """Stretches of walking or running.
+def walking_bouts(local: Array, offsets: Array, rate: float) -> list[WalkingBout]:
+    """Find bouts of walking or running.
 
     Args:
         local: (T, 24, 3, 3) local rotations.
@@ -99,16 +102,16 @@ def walks(local: Array, offsets: Array, rate: float) -> list[WalkingBout]:
     from scipy.signal import find_peaks
 
     world, joints = forward_kinematics(local, offsets)
-    ahead = world[:, 0, :, 2] * [1.0, 0.0, 1.0]  # to the wearer's front, level
-    ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
-    apart = joints[:, JOINTS.index("left_ankle")] - joints[:, JOINTS.index("right_ankle")]
-    lead = np.sum(apart * ahead, axis=1)  # of the left foot before the right one
+    forward = world[:, 0, :, 2] * [1.0, 0.0, 1.0]  # level
+    forward /= np.maximum(np.linalg.norm(forward, axis=1, keepdims=True), 1e-9)
+    between = joints[:, JOINTS.index("left_ankle")] - joints[:, JOINTS.index("right_ankle")]
+    lead = np.sum(between * forward, axis=1)  # of the left foot over the right one
     least = max(1, round(FASTEST_STEP_S * rate))
     left, right = (find_peaks(s * lead, prominence=STEP_M, distance=least)[0] for s in (1.0, -1.0))
     frames = np.concatenate([left, right])
     order = np.argsort(frames)
     frames, is_left = frames[order], (np.arange(len(frames)) < len(left))[order]
-    # A walk ends where the feet do not alternate, or after a pause.
+    # A bout ends where the feet do not alternate, or after a pause.
     pause = (np.diff(frames) > SLOWEST_STEP_S * rate) | (is_left[1:] == is_left[:-1])
     starts = np.concatenate([[0], np.flatnonzero(pause) + 1, [len(frames)]])
     return [WalkingBout(frames[a:b], is_left[a:b]) for a, b in pairwise(starts) if b - a >= LEAST_STEPS]

@@ -1,11 +1,12 @@
-"""How far poses are from reference poses, in the measures of the literature.
+"""Error metrics of poses against reference poses, as used in the literature.
 
-Every measure gives one value a frame, so that a mean can stand with its deviation and number of frames. Poses
-are local rotations (T, 24, 3, 3). "Root-aligned" means that the pelvis of both bodies has the identity for
-its orientation and stands at the origin: where a person faces, what the pelvis sensor says, does not count.
+Every metric has one value per frame, so that a mean can be reported with its deviation and number of frames.
+Poses are local rotations (T, 24, 3, 3). "Root-aligned" means that the pelvis of both bodies is at the origin
+with the identity as its orientation: the direction a person faces, which the pelvis sensor measures, does not
+count.
 
 Sources: DIP is Huang et al., Deep Inertial Poser, 2018; SIP is von Marcard et al., Sparse Inertial Poser,
-2017; equations, tables and sections have the numbers of these papers.
+2017; numbers of equations, tables and sections are those of these papers.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ LABELS = {
     "jitter_km_s3": "jitter, km/s^3",
     "jitter_reference_km_s3": "jitter of the reference, km/s^3",
 }
-"""The keys of `per_frame` and `summary` and how a person reads them."""
+"""Labels of the keys of `per_frame` and `summary`."""
 
 HEADINGS = {
     "sip_error_deg": "SIP, deg",
@@ -42,11 +43,11 @@ HEADINGS = {
     "jitter_km_s3": "jitter, km/s^3",
     "jitter_reference_km_s3": "reference jitter",
 }
-"""The same, short enough for the head of a column."""
+"""The same, short enough for a column heading."""
 
 
 class Metric(NamedTuple):
-    """Mean and standard deviation of a measure over a number of frames; NaN where there are none."""
+    """Mean and standard deviation of a metric over a number of frames; NaN if there are none."""
 
     mean: float
     std: float
@@ -54,23 +55,23 @@ class Metric(NamedTuple):
 
 
 def sip_error(predicted: ArrayLike, true: ArrayLike) -> Array:
-    """SIP error (T,), degrees: mean geodesic distance of hips' and shoulders' root-aligned global rotations.
+    """Return the SIP error (T,), degrees: the joint angle error of hips and shoulders.
 
-    SIP eq. 33 without the square. The authors' evaluation of DIP takes its joint angle error over these four
-    joints, so the angles in DIP's tables 2 to 5 compare with this.
+    SIP eq. 33 without the square. The authors' evaluation of DIP computes the joint angle error over these
+    four joints, so this is comparable to the angles in DIP's tables 2 to 5.
     """
     return joint_angle_error(predicted, true, SIP_JOINTS)
 
 
 def joint_angle_error(predicted: ArrayLike, true: ArrayLike, joints: Sequence[int] = PREDICTED) -> Array:
-    """Mean geodesic distance (T,), degrees, of the root-aligned global rotations of some joints.
+    """Return the mean geodesic distance (T,), degrees, of the root-aligned global rotations of some joints.
 
-    The field's usage; say with each number which joints it is about.
+    This is the usual definition; state the joints with each number.
 
     Args:
         predicted: (T, 24, 3, 3) local rotations.
         true: (T, 24, 3, 3) local rotations.
-        joints: the 15 that a network predicts, or `UNOBSERVED`, the 10 of them without a sensor.
+        joints: the 15 joints that a network predicts, or `UNOBSERVED`, the 10 of them without a sensor.
     """
     predicted, true = _same_shape(predicted, true)
     no_offsets = np.zeros((24, 3))
@@ -81,10 +82,10 @@ def joint_angle_error(predicted: ArrayLike, true: ArrayLike, joints: Sequence[in
 
 
 def position_error(predicted: ArrayLike, true: ArrayLike, offsets: ArrayLike) -> Array:
-    """Mean distance (T,), cm, of the root-aligned positions of all 24 joints.
+    """Return the mean distance (T,), cm, of the root-aligned positions of all 24 joints.
 
     The pelvis, always at the origin, is one of the 24. DIP 5.1; SIP eq. 34 without the square. `offsets`
-    (24, 3), metres, is the body that both poses are put on.
+    (24, 3), metres, is the body for both poses.
     """
     predicted, true = _same_shape(predicted, true)
     _, positions = _root_aligned(predicted, offsets)
@@ -93,17 +94,17 @@ def position_error(predicted: ArrayLike, true: ArrayLike, offsets: ArrayLike) ->
 
 
 def jitter(local: ArrayLike, offsets: ArrayLike, rate: float) -> Array:
-    """Mean norm (T - 3,), km/s^3, of the third time derivative of joint positions; the field's usage.
+    """Return the mean norm (T - 3,), km/s^3, of the third time derivative of joint positions.
 
-    Third differences of consecutive frames at `rate` Hz over dt^3, of all 24 joints of the body `offsets`
-    (24, 3), metres, with the pelvis at one place and turning as it does.
+    This is the usual definition: third differences of consecutive frames at `rate` Hz over dt^3, of all 24
+    joints of the body `offsets` (24, 3), metres, with the pelvis fixed in position but not in orientation.
     """
     _, positions = forward_kinematics(local, offsets)
     return np.linalg.norm(np.diff(positions, n=3, axis=0), axis=-1).mean(axis=-1) * rate**3 / 1000.0
 
 
 def measure(values: ArrayLike) -> Metric:
-    """Mean, deviation and number of per-frame values, of one sequence or of several joined together."""
+    """Return mean, deviation and number of per-frame values, of one sequence or of several joined ones."""
     values = np.asarray(values, float)
     if not len(values):
         return Metric(float("nan"), float("nan"), 0)
@@ -111,7 +112,7 @@ def measure(values: ArrayLike) -> Metric:
 
 
 def per_frame(predicted: ArrayLike, true: ArrayLike, offsets: ArrayLike, rate: float) -> dict[str, Array]:
-    """All measures of one sequence, frame by frame: arguments as in `summary`, keys as in `LABELS`."""
+    """Compute all metrics of one sequence, frame by frame: arguments as in `summary`, keys as in `LABELS`."""
     return {
         "sip_error_deg": sip_error(predicted, true),
         "joint_angle_error_15_deg": joint_angle_error(predicted, true, PREDICTED),
@@ -123,7 +124,7 @@ def per_frame(predicted: ArrayLike, true: ArrayLike, offsets: ArrayLike, rate: f
 
 
 def summary(predicted: ArrayLike, true: ArrayLike, offsets: ArrayLike, rate: float) -> dict[str, Metric]:
-    """All measures of one sequence.
+    """Compute all metrics of one sequence.
 
     Args:
         predicted: (T, 24, 3, 3) local rotations.
@@ -138,13 +139,13 @@ def summary(predicted: ArrayLike, true: ArrayLike, offsets: ArrayLike, rate: flo
 
 
 def format_table(summaries: Mapping[str, Mapping[str, Metric]]) -> str:
-    """A table to print: a line a method, a column a measure, in each cell "mean ± deviation".
+    """Format a table with one line per method, one column per metric and "mean ± deviation" in each cell.
 
-    Numbers of frames, those of the errors, stand in a column of their own where methods differ in them,
-    otherwise in the last line. Jitter has three frames fewer a sequence.
+    If the methods differ in the number of frames (of the errors), it has its own column; otherwise it is in
+    the last line. Jitter has three frames fewer per sequence.
 
     Args:
-        summaries: for each method what `summary` gives.
+        summaries: result of `summary` for each method.
     """
     keys = [key for key in LABELS if any(key in row for row in summaries.values())]
     frames = {name: max((m.frames for m in row.values()), default=0) for name, row in summaries.items()}
@@ -164,17 +165,17 @@ def format_table(summaries: Mapping[str, Mapping[str, Metric]]) -> str:
 
 
 def _same_shape(predicted: ArrayLike, true: ArrayLike) -> tuple[Array, Array]:
-    # Broadcasting one frame against many would give numbers that look right.
+    # Broadcasting one frame against many would return plausible numbers.
     predicted, true = np.asarray(predicted, float), np.asarray(true, float)
     if predicted.shape != true.shape or predicted.shape[1:] != (24, 3, 3):
         raise ValueError(
-            f"poses of shapes {predicted.shape} and {true.shape}, expected two (T, 24, 3, 3) alike"
+            f"poses of shapes {predicted.shape} and {true.shape}, expected two equal shapes (T, 24, 3, 3)"
         )
     return predicted, true
 
 
 def _root_aligned(local: Array, offsets: ArrayLike) -> tuple[Array, Array]:
-    """Global rotations and positions with the pelvis unturned at the origin."""
+    """Return global rotations and positions with the pelvis at the origin and the identity orientation."""
     local, offsets = local.copy(), np.array(offsets, float)
     local[:, 0] = np.eye(3)
     offsets[0] = 0.0

@@ -1,6 +1,6 @@
-"""One page about the poses of a file: angles over time, ranges of motion, steps, sensors, figures.
+"""One-page report on a file of poses: angles over time, ranges of motion, steps, sensors, figures.
 
-The page is HTML with everything inside it. Needs matplotlib, which is imported only when a page is made.
+The page is a self-contained HTML file. Needs matplotlib, which is imported only when a page is made.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.analysis.figures import INK, PREDICTION, require_matplotlib, skeleton_strip
-from edgepose.analysis.joint_angles import ANGLES, LIMBS, WalkingBout, joint_angles, walks
+from edgepose.analysis.joint_angles import ANGLES, LIMBS, WalkingBout, joint_angles, walking_bouts
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseSequence, held_sensors, longest_holds
 from edgepose.skeleton import Body
@@ -26,10 +26,10 @@ from edgepose.utils.durable_files import write_whole
 Array = NDArray[np.float64]
 
 FIGURES = 8
-"""Instants that are drawn."""
+"""Number of instants that are drawn."""
 
 POINTS = 3000
-"""Of a line in a plot; more would not be seen."""
+"""Largest number of points of a plotted line; more would not be visible."""
 
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 60rem; margin: 2rem auto; }
@@ -45,27 +45,27 @@ def write_report(path: Path, poses: PoseSequence, body: Body, name: str, overwri
     """Write the page.
 
     Args:
-        path: file to write, replaced if it is there.
+        path: file to write.
         poses: at least one.
-        body: for the figures, and for the steps, which are told by the feet.
+        body: for the figures, and for the steps, which are found from the feet.
         name: of the poses, for the heading.
-        overwrite: whether it may take the place of a file.
+        overwrite: whether an existing file may be replaced.
 
     Raises:
         EdgeposeError: matplotlib is not installed, or the file cannot be written.
     """
     require_matplotlib("a report")
     angles = joint_angles(poses.rotations)
-    found = walks(poses.rotations, body.offsets, poses.rate)
+    bouts = walking_bouts(poses.rotations, body.offsets, poses.rate)
     times = poses.time_s - poses.time_s[0]
     parts = [
         f"<h1>{html.escape(name)}</h1>",
         f"<p>{len(times)} poses, {times[-1]:.1f} s, {poses.rate:g} a second</p>",
         _image(_strip(poses, times, body), "Figures at instants of the recording"),
         "<h2>Steps</h2>",
-        *_steps(found, times, poses.rate),
+        *_steps(bouts, times, poses.rate),
         "<h2>Angles over time</h2>",
-        _image(_plots(times, angles, found), "Joint angles over time"),
+        _image(_plots(times, angles, bouts), "Joint angles over time"),
         "<p class='note'>Light: left, dark: right. Grey: walking.</p>",
         "<h2>Range of motion</h2>",
         _ranges(angles),
@@ -98,26 +98,26 @@ def _strip(poses: PoseSequence, times: Array, body: Body) -> bytes:
 
 
 def extremes(values: Array) -> NDArray[np.int64]:
-    """Rows of values (T,) that a plot needs, rising: the least and the largest of every so many."""
+    """Return the rows of values (T,) that a plot needs, in order: the minimum and maximum of each bin."""
     if len(values) <= POINTS:
         return np.arange(len(values))
     step = -(-len(values) // (POINTS // 2))
     starts = np.arange(0, len(values), step)
-    # The last few are filled up with the last one.
+    # The last bin is filled up with the last value.
     bins = np.pad(values, (0, -len(values) % step), mode="edge").reshape(-1, step)
     rows = np.concatenate([starts + bins.argmin(axis=1), starts + bins.argmax(axis=1)])
     return np.unique(np.minimum(rows, len(values) - 1))
 
 
-def _plots(times: Array, angles: dict[str, Array], found: Sequence[WalkingBout]) -> bytes:
-    """A panel an angle, left and right in one."""
+def _plots(times: Array, angles: dict[str, Array], bouts: Sequence[WalkingBout]) -> bytes:
+    """Plot each angle in a panel, left and right together."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, 1.35 * len(ANGLES)), dpi=110, facecolor="white", layout="constrained")
     panels: Any = figure.subplots(len(ANGLES), 1, sharex=True)
     for panel, name in zip(panels, ANGLES, strict=True):
-        for walk in found:
-            panel.axvspan(times[walk.frames[0]], times[walk.frames[-1]], color="#EEEEEE", linewidth=0)
+        for bout in bouts:
+            panel.axvspan(times[bout.frames[0]], times[bout.frames[-1]], color="#EEEEEE", linewidth=0)
         sides = ("left", "right") if name in LIMBS else ("trunk",)
         for side in sides:
             values = angles[f"{side} {name}" if name in LIMBS else name]
@@ -135,7 +135,7 @@ def _plots(times: Array, angles: dict[str, Array], found: Sequence[WalkingBout])
 
 
 def _ranges(angles: dict[str, Array]) -> str:
-    """Smallest, largest, range and mean; single odd poses do not count."""
+    """Tabulate smallest and largest value, range and mean of each angle, without outliers."""
     rows = []
     for name, about in ANGLES.items():
         for key in (f"left {name}", f"right {name}") if name in LIMBS else (name,):
@@ -147,17 +147,17 @@ def _ranges(angles: dict[str, Array]) -> str:
     return f"{table}<p class='note'>{note}</p>"
 
 
-def _steps(found: Sequence[WalkingBout], times: Array, rate: float) -> list[str]:
-    """Counts, cadence and evenness of all walks."""
-    if not found:
+def _steps(bouts: Sequence[WalkingBout], times: Array, rate: float) -> list[str]:
+    """Tabulate step count, cadence and step times over all bouts of walking."""
+    if not bouts:
         return ["<p>No walking was found.</p>"]
-    step_s = np.concatenate([np.diff(walk.frames) for walk in found]) / rate
+    step_s = np.concatenate([np.diff(bout.frames) for bout in bouts]) / rate
     # A step of the left foot ends with the left foot in front.
-    left = np.concatenate([walk.left[1:] for walk in found])
-    seconds = sum(times[walk.frames[-1]] - times[walk.frames[0]] for walk in found)
+    left = np.concatenate([bout.left[1:] for bout in bouts])
+    seconds = sum(times[bout.frames[-1]] - times[bout.frames[0]] for bout in bouts)
     cadence = 60.0 / step_s
     rows = [
-        ("steps", f"{sum(len(walk.frames) for walk in found)} in {seconds:.0f} s of walking"),
+        ("steps", f"{sum(len(bout.frames) for bout in bouts)} in {seconds:.0f} s of walking"),
         ("cadence", f"{60.0 / step_s.mean():.0f} steps a minute (deviation {cadence.std():.0f})"),
         ("time of a left step", f"{step_s[left].mean():.2f} s"),
         ("time of a right step", f"{step_s[~left].mean():.2f} s"),
@@ -166,7 +166,7 @@ def _steps(found: Sequence[WalkingBout], times: Array, rate: float) -> list[str]
 
 
 def _sensors(poses: PoseSequence) -> list[str]:
-    """How often each sensor's last values were repeated."""
+    """Tabulate how often each sensor's last values were repeated."""
     held, rate = held_sensors(poses.held), poses.rate
     rows = [
         (name.replace("_", " "), str(column.sum()), f"{100 * column.mean():.1f} %", f"{longest / rate:.2f} s")

@@ -1,1 +1,1 @@
-"""How fast and how accurate the parts are, on data with known truth."""
+"""Benchmarks of speed, and of accuracy on data with ground truth."""

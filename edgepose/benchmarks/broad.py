@@ -1,6 +1,6 @@
-"""BROAD, the benchmark of orientation filters by Laidig, Caruso, Cereatti and Seel: its trials and measures.
+"""BROAD, the benchmark of orientation filters by Laidig, Caruso, Cereatti and Seel: its trials and metrics.
 
-Data 6(7):72, 2021, https://doi.org/10.3390/data6070072; the data are CC BY 4.0.
+Data 6(7):72, 2021, https://doi.org/10.3390/data6070072; the data is CC BY 4.0.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _START_S = 1.0
 
 
 class Trial(NamedTuple):
-    """One trial.
+    """One trial of BROAD.
 
     Attributes:
         name: of its file.
@@ -33,8 +33,8 @@ class Trial(NamedTuple):
         acc: (N, 3) specific force, sensor frame, m/s^2.
         mag: (N, 3) magnetic field, sensor frame, uT.
         quat: (N, 4) true orientation from optical capture, sensor to inertial, X east, Y north, Z up; NaN
-            where the cameras lost it.
-        movement: (N,) bool, the part that counts.
+            where the cameras lost the sensor.
+        movement: (N,) bool, the part that is evaluated.
     """
 
     name: str
@@ -47,17 +47,17 @@ class Trial(NamedTuple):
 
     @property
     def time_s(self) -> Array:
-        """Times (N,) of the samples, s."""
+        """Times of the samples (N,), s."""
         return np.arange(len(self.gyr)) / self.rate
 
     @property
     def disturbed(self) -> bool:
-        """Whether the trial is one of those with disturbances, which say so in their names."""
+        """Whether the trial has disturbances, as its name says."""
         return "_disturbed_" in self.name
 
 
 class Errors(NamedTuple):
-    """Root mean square errors of a trial, deg: the whole angle, its part about the vertical, the rest."""
+    """Root mean square errors of a trial, deg: of the whole angle, its part about the vertical, the rest."""
 
     total: float
     heading: float
@@ -65,7 +65,7 @@ class Errors(NamedTuple):
 
 
 def find_trials(folder: Path) -> list[Path]:
-    """Files of trials in a folder, sorted: BROAD's own `data_mat/*.mat`, or the same arrays as .npz.
+    """Find the files of trials in a folder, sorted: BROAD's own `data_mat/*.mat`, or the same arrays as .npz.
 
     Raises:
         EdgeposeError: there is none.
@@ -79,10 +79,10 @@ def find_trials(folder: Path) -> list[Path]:
 
 
 def read_trial(path: Path) -> Trial:
-    """A trial.
+    """Read a trial.
 
     Raises:
-        EdgeposeError: the file cannot be read, or is none of a trial.
+        EdgeposeError: the file cannot be read, or is not a trial.
     """
     try:
         arrays = _load(path)
@@ -90,7 +90,7 @@ def read_trial(path: Path) -> Trial:
         raise EdgeposeError(f"{path}: cannot read it: {error}") from None
     missing = [key for key in (*_COLUMNS, "movement", "sampling_rate") if key not in arrays]
     if missing:
-        raise EdgeposeError(f"{path}: is no trial of BROAD: has no {', '.join(missing)}")
+        raise EdgeposeError(f"{path}: not a trial of BROAD: it has no {', '.join(missing)}")
     count = len(np.atleast_1d(arrays["imu_gyr"]))
     numbers = {}
     for key, width in _COLUMNS.items():
@@ -98,14 +98,14 @@ def read_trial(path: Path) -> Trial:
             raise EdgeposeError(
                 f"{path}: {key!r} is {arrays[key].dtype} {arrays[key].shape}, not ({count}, {width})"
             )
-        # In rows one after the other: some filters read the memory as it is.
+        # Row after row in memory: some filters read the buffer directly.
         numbers[key] = np.ascontiguousarray(arrays[key], float)
     movement = np.asarray(arrays["movement"]).astype(bool)
     rate = float(np.asarray(arrays["sampling_rate"]).reshape(-1)[0])
     if movement.shape != (count,) or not 1.0 < rate < 1e5:
-        raise EdgeposeError(f"{path}: 'movement' or 'sampling_rate' is not that of {count} samples")
+        raise EdgeposeError(f"{path}: 'movement' or 'sampling_rate' does not fit {count} samples")
     if not (movement & ~np.isnan(numbers["opt_quat"][:, 0])).any():
-        raise EdgeposeError(f"{path}: has no movement of which the true orientation is known")
+        raise EdgeposeError(f"{path}: has no movement with a known true orientation")
     return Trial(
         path.stem,
         rate,
@@ -129,7 +129,7 @@ def _load(path: Path) -> dict[str, Any]:
 
 
 def trials(folder: Path) -> Iterator[Trial]:
-    """All trials of a folder, one at a time.
+    """Read all trials of a folder, one at a time.
 
     Raises:
         EdgeposeError: there is none, or one cannot be read.
@@ -138,7 +138,7 @@ def trials(folder: Path) -> Iterator[Trial]:
 
 
 def errors(quat: Array, trial: Trial) -> Errors:
-    """BROAD's measure of estimated orientations (N, 4): over movement, where the reference is known."""
+    """Compute BROAD's errors of orientations (N, 4): over movement, where the reference is known."""
     total, heading, inclination = (
         np.rad2deg(np.sqrt(np.nanmean(angle[trial.movement] ** 2)))
         for angle in error_angles(quat, trial.quat)
@@ -147,7 +147,7 @@ def errors(quat: Array, trial: Trial) -> Errors:
 
 
 def error_angles(quat: Array, reference: Array) -> tuple[Array, Array, Array]:
-    """Total, heading and inclination error (N,) of each orientation (N, 4), rad; NaN where not known."""
+    """Return total, heading and inclination errors (N,) of orientations (N, 4), rad; NaN where unknown."""
     w, x, y, z = np.moveaxis(rot.quat_multiply(quat, rot.quat_conjugate(reference)), -1, 0)
     return (
         2.0 * np.arctan2(np.sqrt(x * x + y * y + z * z), np.abs(w)),
@@ -157,8 +157,9 @@ def error_angles(quat: Array, reference: Array) -> tuple[Array, Array, Array]:
 
 
 def same_heading(quat: Array, trial: Trial) -> Array:
-    """Orientations (N, 4) turned to the reference's heading in the first second of motion: without a
-    magnetometer the heading counts from anywhere.
+    """Align orientations (N, 4) with the reference's heading in the first second of motion.
+
+    Without a magnetometer, the heading has an arbitrary origin.
     """
     moving = np.flatnonzero(trial.movement & ~np.isnan(trial.quat[:, 0]))
     start = moving[moving < moving[0] + _START_S * trial.rate]

@@ -1,4 +1,4 @@
-"""Orientation filters against each other on trials with known truth."""
+"""Comparison of orientation filters on trials with ground truth."""
 
 from __future__ import annotations
 
@@ -14,22 +14,23 @@ from edgepose.benchmarks.reference_filters import ReferenceFilter, contenders
 from edgepose.orientation.filter import OrientationFilter
 
 WARM_UP = 300
-"""Samples that each filter runs over before its time is taken: what it imports is no part of its cost."""
+"""Samples that each filter processes before it is timed, so that imports do not count."""
 
 
 class Score(NamedTuple):
-    """What a filter reached in a trial.
+    """Result of a filter in a trial.
 
     Attributes:
-        trial: its name.
-        disturbed: it is one with disturbances.
-        filter: its name.
-        offline: it saw the whole trial.
-        magnetometer: it had the magnetometer; if not, its heading was set to the truth's at the start.
+        trial: name of the trial.
+        disturbed: the trial has disturbances.
+        filter: name of the filter.
+        offline: the filter saw the whole trial.
+        magnetometer: the filter used the magnetometer; if not, its heading was aligned with the true one at
+            the start.
         total: error, deg.
         heading: its part about the vertical, deg.
         inclination: the rest, deg.
-        us: time of one core a sample, microseconds.
+        us: time of one core per sample, microseconds.
     """
 
     trial: str
@@ -44,7 +45,7 @@ class Score(NamedTuple):
 
 
 def compare(files: Iterable[Path]) -> Iterator[list[Score]]:
-    """Scores of all filters, trial by trial.
+    """Yield the scores of all filters, trial by trial.
 
     Raises:
         EdgeposeError: a trial cannot be read.
@@ -53,15 +54,15 @@ def compare(files: Iterable[Path]) -> Iterator[list[Score]]:
     for number, path in enumerate(files):
         trial = read_trial(path)
         if number == 0:
-            for one in filters:
-                one.run(_beginning(trial), True)
-        yield [_score(one, trial, mag) for mag in (True, False) for one in filters]
+            for filter in filters:
+                filter.run(_start_of(trial), True)
+        yield [_score(filter, trial, mag) for mag in (True, False) for filter in filters]
 
 
 def cost_us(trial: Trial, hz: float = 286.0) -> float:
-    """Microseconds of one core that our filter takes for each sample of a sensor that sends `hz` of them.
+    """Return the microseconds of one core that our filter takes per sample of a sensor at `hz`.
 
-    A trial of a lower rate has each of its samples several times.
+    Each sample of a trial with a lower rate is repeated.
     """
     times = max(1, round(hz / trial.rate))
     gyr, acc, mag = (np.repeat(part, times, axis=0) for part in (trial.gyr, trial.acc, trial.mag))
@@ -72,7 +73,7 @@ def cost_us(trial: Trial, hz: float = 286.0) -> float:
     return (time.process_time() - started) / len(gyr) * 1e6
 
 
-def _beginning(trial: Trial) -> Trial:
+def _start_of(trial: Trial) -> Trial:
     gyr, acc, mag = trial.gyr[:WARM_UP], trial.acc[:WARM_UP], trial.mag[:WARM_UP]
     return trial._replace(gyr=gyr, acc=acc, mag=mag)
 

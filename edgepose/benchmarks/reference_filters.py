@@ -1,4 +1,4 @@
-"""Filters that compete in `edgepose bench orientation`: ours, and others' where they are installed."""
+"""Filters compared by `edgepose bench orientation`: ours, and other packages' where installed."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ Array = NDArray[np.float64]
 
 
 class ReferenceFilter(NamedTuple):
-    """A filter.
+    """A filter in the comparison.
 
     Attributes:
         name: for the table.
         offline: it sees the whole recording.
-        run: orientations (N, 4), X east, Y north, Z up, of a trial, with or without its magnetometer.
+        run: returns orientations (N, 4), X east, Y north, Z up, of a trial, with or without its magnetometer.
     """
 
     name: str
@@ -33,7 +33,7 @@ class ReferenceFilter(NamedTuple):
 
 
 def contenders() -> list[ReferenceFilter]:
-    """Those that can run here."""
+    """Return the filters whose packages are installed."""
     result = [
         ReferenceFilter("edgepose", False, _kalman),
         ReferenceFilter("edgepose smoother", True, _smoother),
@@ -63,7 +63,7 @@ def _inputs(trial: Trial, magnetometer: bool) -> tuple[Array, Array, Array, Arra
 
 
 def _vqf(trial: Trial, magnetometer: bool) -> Array:
-    """With its default parameters."""
+    """Run VQF with its default parameters."""
     from vqf import VQF
 
     mag = trial.mag if magnetometer else None
@@ -72,7 +72,7 @@ def _vqf(trial: Trial, magnetometer: bool) -> Array:
 
 
 def _offline_vqf(trial: Trial, magnetometer: bool) -> Array:
-    """With its default parameters."""
+    """Run the offline version of VQF with its default parameters."""
     from vqf import offlineVQF
 
     mag = trial.mag if magnetometer else None
@@ -85,14 +85,14 @@ def _vqf_key(magnetometer: bool) -> str:
 
 
 def _imufusion(trial: Trial, magnetometer: bool) -> Array:
-    """With its bias estimation, and the best of a small grid of gains and rejections (in degrees)."""
+    """Run imufusion with its bias estimation, and the best of a small grid of gains and rejections."""
     import imufusion
 
     settings = imufusion.AhrsSettings()
     settings.convention = imufusion.CONVENTION_ENU
     settings.sample_rate = trial.rate
     settings.gain = 0.1
-    settings.acceleration_rejection = settings.magnetic_rejection = 90.0
+    settings.acceleration_rejection = settings.magnetic_rejection = 90.0  # degrees
     filter = imufusion.Ahrs()
     filter.set_settings(settings)
     bias_settings = imufusion.BiasSettings()
@@ -112,17 +112,17 @@ def _imufusion(trial: Trial, magnetometer: bool) -> Array:
 
 
 def _madgwick(trial: Trial, magnetometer: bool) -> Array:
-    """With the gain that BROAD found best over all its trials."""
+    """Run Madgwick's filter with the gain that BROAD found best over all its trials."""
     from ahrs.filters import Madgwick
 
     mag = {"mag": trial.mag} if magnetometer else {}
     quat = Madgwick(gyr=trial.gyr, acc=trial.acc, **mag, frequency=trial.rate, gain=0.12).Q
-    # It has X to the north.
+    # Its X axis points north.
     return rot.quat_multiply(rot.quat_about_z(np.pi / 2.0), quat)
 
 
 def _mahony(trial: Trial, magnetometer: bool) -> Array:
-    """With the gains that BROAD found best over all its trials."""
+    """Run Mahony's filter with the gains that BROAD found best over all its trials."""
     from ahrs.filters import Mahony
 
     mag = {"mag": trial.mag} if magnetometer else {}

@@ -1,7 +1,7 @@
-"""How long each step of the walk takes on this machine, and how fast the networks are against torch's own.
+"""Speed of each pipeline step on this machine, and of the networks compared with torch's own LSTM.
 
-Made-up sensors, one process, one core. Costs are processor time, which other programs disturb least; the
-percentiles are times of the clock, what a wearer waits for.
+Simulated sensors, one process, one core. Costs are processor time, which other programs disturb least;
+percentiles are wall-clock time, which is what a wearer waits for.
 """
 
 from __future__ import annotations
@@ -52,20 +52,20 @@ _SECONDS = 10
 _PACED_S = 5
 _ROUNDS = 7
 _FRAMES = {"stream": 100, "window": 20}
-"""Frames a round; medians over rounds are told."""
+"""Frames per round; results are medians over rounds."""
 
 _DIP_OUTPUTS = 150
-"""Means of 15 rotation matrices and 5 accelerations; as many deviations (DIP appendix B)."""
+"""Means of 15 rotation matrices and 5 accelerations; there are as many deviations (DIP appendix B)."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-# --- made-up sensors ----------------------------------------------------------------------------------------
+# --- simulated sensors --------------------------------------------------------------------------------------
 
 
 def _chunks() -> list[bytes]:
-    """What six sensors send on one line, a chunk each 1/60 s."""
+    """Simulate the bytes of six sensors on one line, one chunk per 1/60 s."""
     encode = PROTOCOLS["native"].encode
     chunks = [b""] * (int(RATE) * _SECONDS + 1)
     for seq in range(_SENSOR_HZ * _SECONDS):
@@ -92,7 +92,7 @@ def _decode(decoder: Decoder, chunk: bytes) -> list[ImuSample]:
 
 
 def _calibration() -> Calibration:
-    """All sensors on their bones as in the T-pose."""
+    """Return the calibration of sensors aligned with their bones in the T-pose."""
     none = np.tile([1.0, 0.0, 0.0, 0.0], (len(PLACEMENTS), 1))
     up = np.array([0.5, -0.5, -0.5, -0.5])  # T's Y is I's Z
     zero = np.zeros(len(PLACEMENTS))
@@ -102,8 +102,8 @@ def _calibration() -> Calibration:
 # --- steps --------------------------------------------------------------------------------------------------
 
 
-def _each(step: Callable[[Item], Result], items: Iterable[Item]) -> tuple[list[Result], float]:
-    """What a step makes of some items, and microseconds of processor time it took in all."""
+def _timed(step: Callable[[Item], Result], items: Iterable[Item]) -> tuple[list[Result], float]:
+    """Run a step on each item; return the results and the total processor time, microseconds."""
     items = list(items)
     started = time.process_time()
     results = [step(item) for item in items]
@@ -111,11 +111,11 @@ def _each(step: Callable[[Item], Result], items: Iterable[Item]) -> tuple[list[R
 
 
 def step_costs(engine: Engine, folder: Path) -> dict[str, float]:
-    """Microseconds of processor time a frame of every step, sensors at 100 Hz.
+    """Measure the processor time of every step per frame, microseconds, with sensors at 100 Hz.
 
     Args:
-        engine: makes the poses.
-        folder: to write into.
+        engine: runs the network.
+        folder: for the CSV output.
     """
     decoder, clock = PROTOCOLS["native"].decoder(), FrameSynchronizer(RATE)
     headings, orienter = HeadingRezero(_calibration()), OrientationEstimator("kalman")
@@ -126,32 +126,32 @@ def step_costs(engine: Engine, folder: Path) -> dict[str, float]:
 
     def calibrated(frame: ImuFrame) -> tuple[ImuFrame, Any, Any]:
         calibration = headings.calibration_for(frame)
-        assert calibration is not None, "the headings are known"
+        assert calibration is not None, "without hold_first there is always one"
         return frame, *apply_calibration(calibration, frame.orientation, frame.force)
 
     costs = {}
-    samples, costs["decode"] = _each(lambda chunk: _decode(decoder, chunk), _chunks())
-    samples = [some for some in samples if some]
-    _, costs["filter, where sensors send none"] = _each(orienter.orient, samples)
-    made, costs["frames"] = _each(to_frames, samples)
-    bodies, costs["calibration"] = _each(calibrated, [frame for frames in made for frame in frames])
-    outputs, costs["network"] = _each(lambda body: engine.push(*body), bodies)
-    poses = [pose_frame(output) for some in outputs for output in some]
-    _, costs["UDP binary, not yet sent"] = _each(encode_binary, poses)
-    _, costs["UDP JSON, not yet sent"] = _each(encode_json, poses)
+    samples, costs["decode"] = _timed(lambda chunk: _decode(decoder, chunk), _chunks())
+    samples = [batch for batch in samples if batch]
+    _, costs["filter, where sensors send none"] = _timed(orienter.orient, samples)
+    batches, costs["frames"] = _timed(to_frames, samples)
+    bodies, costs["calibration"] = _timed(calibrated, [frame for frames in batches for frame in frames])
+    outputs, costs["network"] = _timed(lambda body: engine.push(*body), bodies)
+    poses = [pose_frame(output) for batch in outputs for output in batch]
+    _, costs["UDP binary, not yet sent"] = _timed(encode_binary, poses)
+    _, costs["UDP JSON, not yet sent"] = _timed(encode_json, poses)
     with CsvSink(folder / "poses.csv") as sink:
-        _, costs["CSV"] = _each(sink.write, poses)
+        _, costs["CSV"] = _timed(sink.write, poses)
     return {name: cost / len(bodies) for name, cost in costs.items()}
 
 
 class Latency(NamedTuple):
-    """From the arrival of a frame's packets to its pose's being sent, milliseconds.
+    """Time from the arrival of a frame's packets until its pose is sent, milliseconds.
 
     Attributes:
         p50_ms: median.
-        p99_ms: 99 of 100 are shorter.
-        max_ms: the longest.
-        frames: how many were measured.
+        p99_ms: 99th percentile.
+        max_ms: longest.
+        frames: number of measured frames.
         per_s: frames a second.
     """
 
@@ -163,7 +163,7 @@ class Latency(NamedTuple):
 
 
 def whole_walk(engine: Engine, paced: bool) -> Latency:
-    """Runs packets to datagrams through all steps, at full speed or at 60 frames a second."""
+    """Run packets through all steps to datagrams, at full speed or at 60 frames a second."""
     decoder = PROTOCOLS["native"].decoder()
     chunks = _chunks()[: int(RATE) * _PACED_S] if paced else _chunks()
 
@@ -195,19 +195,19 @@ def whole_walk(engine: Engine, paced: bool) -> Latency:
 
 
 class Speed(NamedTuple):
-    """One way of running a model.
+    """Speed of a model in one mode and precision.
 
     Attributes:
         model: its name.
-        mode: "stream", "window", or "reference": `torch.nn.LSTM` of the same size in torch's defaults, a
-            window of past, present and future for each frame or, of a unidirectional model, a step; network
-            alone, without what comes before and after it.
+        mode: "stream", "window", or "reference": a `torch.nn.LSTM` of the same size with torch's defaults.
+            The reference runs the network only, without pre- and postprocessing: for each frame over a window
+            of past, present and future, or one step if the model is unidirectional.
         precision: of the weights.
-        us: processor time a frame, microseconds.
-        p50_us: of the clock.
-        p99_us: of the clock.
-        max_us: of the clock.
-        times: how many times faster than the reference, rounds compared one by one.
+        us: processor time per frame, microseconds.
+        p50_us: median wall-clock time.
+        p99_us: 99th percentile of the wall-clock time.
+        max_us: longest wall-clock time.
+        times: speed relative to the reference, median over pairs of rounds.
     """
 
     model: str
@@ -221,7 +221,7 @@ class Speed(NamedTuple):
 
 
 class _Reference(nn.Module):
-    """The papers' network as everybody writes it."""
+    """The papers' network in its usual torch implementation."""
 
     def __init__(self, hidden: int, both: bool) -> None:
         super().__init__()
@@ -238,7 +238,7 @@ def _reference(about: dict[str, Any]) -> Callable[[], object]:
     both = about["kind"] == "birnn"
     module = _Reference(about["hidden"], both)
     x = torch.randn(1, about["past"] + 1 + about["future"] if both else 1, INPUTS)
-    carried: list[Any] = [None]
+    carried: list[Any] = [None]  # state of a unidirectional network
 
     def step() -> None:
         torch.backends.mkldnn.enabled = True  # type: ignore[assignment]  # torch's default
@@ -254,7 +254,7 @@ def _reference(about: dict[str, Any]) -> Callable[[], object]:
 
 
 def load_engine(info: archive.ArchiveInfo, trust: bool, precision: str, mode: str = "stream") -> Engine:
-    """A model ready to run in its default past and future, with what is alive put aside as `run` does."""
+    """Load a model with its default past and future, and freeze the garbage collector as `run` does."""
     module = archive.load(info, trust)
     quantise_weights(module, info, precision)
     kind = StreamEngine if mode == "stream" else WindowEngine
@@ -265,7 +265,7 @@ def load_engine(info: archive.ArchiveInfo, trust: bool, precision: str, mode: st
 
 
 def model_speeds(info: archive.ArchiveInfo, trust: bool) -> list[Speed]:
-    """Speeds of a model in all its modes and precisions that this machine has; the reference comes first."""
+    """Measure a model in all its modes and all precisions of this machine; the reference comes first."""
     about = info.metadata
     stored = str(about.get("precision", "f32"))
     ways: dict[tuple[str, str], Callable[[], object]] = {}
@@ -279,7 +279,7 @@ def model_speeds(info: archive.ArchiveInfo, trust: bool) -> list[Speed]:
             except EdgeposeError:
                 if precision == stored:
                     raise
-                continue  # not on this machine, or not in this kind of network
+                continue  # not supported by this machine or by this kind of network
             for _ in range(about["past"] + about["future"]):
                 engine.push(None, orientation, acceleration)
             ways[mode, precision] = partial(engine.push, None, orientation, acceleration)
@@ -290,16 +290,16 @@ def model_speeds(info: archive.ArchiveInfo, trust: bool) -> list[Speed]:
             frames = _FRAMES["stream" if way[0] == "stream" else "window"]
             started = time.process_time()
             for _ in range(frames):
-                began = time.perf_counter()
+                step_started = time.perf_counter()
                 step()
-                clocks[way].append(1e6 * (time.perf_counter() - began))
+                clocks[way].append(1e6 * (time.perf_counter() - step_started))
             costs[way].append(1e6 * (time.process_time() - started) / frames)
     base = next(iter(costs.values()))
     rows = []
-    for way, own in costs.items():
-        times = statistics.median(one / other for one, other in zip(base, own, strict=True))
+    for way, cost in costs.items():
+        times = statistics.median(reference / us for reference, us in zip(base, cost, strict=True))
         p50, p99, most = np.percentile(clocks[way], [50, 99, 100])
-        rows.append(Speed(info.path.stem, *way, statistics.median(own), p50, p99, most, times))
+        rows.append(Speed(info.path.stem, *way, statistics.median(cost), p50, p99, most, times))
     return rows
 
 
@@ -307,12 +307,12 @@ def model_speeds(info: archive.ArchiveInfo, trust: bool) -> list[Speed]:
 
 
 class Start(NamedTuple):
-    """What a fresh process takes until a model is ready to run.
+    """Cost of a fresh process until a model is ready to run.
 
     Attributes:
         imports_s: importing edgepose's steps with numpy and torch, seconds.
         load_s: loading, packing and warming up the model, seconds.
-        memory_mb: resident then, megabytes; None where the system does not tell.
+        memory_mb: resident memory then, megabytes; None if unknown.
     """
 
     imports_s: float
@@ -331,22 +331,22 @@ print(json.dumps([imported - started, time.perf_counter() - imported, speed.memo
 
 
 def start_up(info: archive.ArchiveInfo, trust: bool) -> Start:
-    """Starts a process that loads a model.
+    """Measure a new process that loads a model.
 
     Raises:
         EdgeposeError: the model is not trusted, or the process fails.
     """
     if not (info.trusted or trust):
-        archive.load(info)  # says why not
-    words = [sys.executable, "-c", _FRESH, str(info.path)]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise EdgeposeError(f"{info.path}: a fresh process cannot load it: {done.stderr.strip()[-200:]}")
-    return Start(*json.loads(done.stdout))
+        archive.load(info)  # raises the error that explains why
+    command = [sys.executable, "-c", _FRESH, str(info.path)]
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
+    if process.returncode:
+        raise EdgeposeError(f"{info.path}: a new process cannot load it: {process.stderr.strip()[-200:]}")
+    return Start(*json.loads(process.stdout))
 
 
 def memory_mb() -> float | None:
-    """Resident memory of this process, megabytes, where /proc tells."""
+    """Return the resident memory of this process, megabytes; None without /proc."""
     try:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     except OSError:
@@ -355,7 +355,7 @@ def memory_mb() -> float | None:
 
 
 def machine() -> dict[str, str]:
-    """What the figures were made on."""
+    """Describe the machine: processor, Python and torch versions."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

@@ -1,7 +1,7 @@
-"""From oriented sensors to bones in the body frame (DIP 4.2): heading reset, body frame, bone offsets.
+"""Calibration from oriented sensors to bones (DIP 4.2): heading reset, body frame, bone offsets.
 
 Frames: I inertial (Z up), S one sensor, T body (X to the wearer's left, Y up, Z forward), B one bone. Angles
-are radians, except where a name ends in `_deg`: those are for a person.
+are in radians, except those whose names end in `_deg`, which are for people to read.
 """
 
 from edgepose.calibration.body_frame import body_from_inertial, check_body_frame

@@ -1,4 +1,4 @@
-"""The body frame T in the inertial frame I: which way the wearer faces (DIP eq. 6)."""
+"""Body frame T in the inertial frame I, from the direction that the wearer faces (DIP eq. 6)."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 
 def check_body_frame(text: str) -> str:
-    """`text` if it is `head`, `SENSOR:AXIS` or `heading:DEG`.
+    """Return `text` if it is `head`, `SENSOR:AXIS` or `heading:DEG`.
 
     Raises:
-        CalibrationError: it is none of them.
+        CalibrationError: it is none of these.
     """
     name, _, value = text.partition(":")
     axis_given = (
@@ -44,16 +44,16 @@ def _finite(text: str) -> float | None:
 
 
 def body_from_inertial(orientation: Array, body_frame: str) -> Array:
-    """R_TI (3, 3) of a wearer who holds the calibration pose.
+    """Return R_TI (3, 3) of a wearer who holds the calibration pose.
 
     Args:
         orientation: (6, 4) mean quaternions of the hold, sensor to inertial, headings reset.
         body_frame: `head`: the head sensor's axes lie along T (DIP eq. 6). `SENSOR:AXIS`: the horizontal
-            direction of that axis of that sensor is forward, gravity gives up. `heading:DEG`: the wearer
-            faces this angle from X of I towards Y.
+            direction of that axis of that sensor is forward, gravity shows which way is up. `heading:DEG`:
+            the wearer faces this angle from X of I towards Y.
 
     Raises:
-        CalibrationError: the named sensor is not worn so that this way works.
+        CalibrationError: the way in which the named sensor is worn rules the method out.
     """
     name, _, value = check_body_frame(body_frame).partition(":")
     if name == "head":
@@ -83,6 +83,6 @@ def _frame_of_head(r_is: Array) -> Array:
 
 
 def _frame_facing(forward: Array) -> Array:
-    """R_TI (3, 3) of a wearer who faces the horizontal part of a direction in I."""
+    """Return R_TI (3, 3) of a wearer who faces the horizontal part of a direction in I."""
     ahead = np.array([forward[0], forward[1], 0.0]) / math.hypot(forward[0], forward[1])
     return np.stack([np.cross(_UP, ahead), _UP, ahead])  # left, up, forward in I

@@ -1,4 +1,4 @@
-"""Checks of a hold: whether all sensors reported, held still and measured gravity upwards."""
+"""Checks of a hold: all sensors reported, held still and measured gravity upwards."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ GRAVITY_TILT_LIMIT_DEG = 10.0
 
 
 class MovedError(CalibrationError):
-    """A hold with movement in it: holding still once more helps."""
+    """A hold with movement in it; the wearer can try again."""
 
 
 class HoldSummary(NamedTuple):
-    """A hold that passed its checks.
+    """Means of a hold that passed its checks.
 
     Attributes:
         samples: (6,) number of samples.
@@ -53,14 +53,14 @@ class HoldSummary(NamedTuple):
 
 
 def check_hold(hold: Hold, advice: str = "stand still and repeat") -> HoldSummary:
-    """Means of a hold in which every sensor reported, was held still, and measured gravity along +Z of I.
+    """Check that every sensor reported, was held still and measured gravity along +Z of I; return the means.
 
     Args:
         hold: six sensors' samples.
         advice: what to do about movement, for the message.
 
     Raises:
-        MovedError: sensors moved; names all of them and how much.
+        MovedError: sensors moved; names all of them and their movement.
         CalibrationError: any other fault of the hold; names the sensors and what to do.
     """
     check_reported(hold)
@@ -93,7 +93,7 @@ def check_hold(hold: Hold, advice: str = "stand still and repeat") -> HoldSummar
             + "; give every sensor a placement of its own"
         )
     mean = np.stack([rot.mean_rotation(quat) for quat in quats])
-    spread = np.array([_rms(_angles(quat, own)) for quat, own in zip(quats, mean, strict=True)])
+    spread = np.array([_rms(_angles(quat, centre)) for quat, centre in zip(quats, mean, strict=True)])
     moved = [
         text
         for name, s, quat, rms in zip(PLACEMENTS, hold, quats, spread, strict=True)
@@ -106,12 +106,12 @@ def check_hold(hold: Hold, advice: str = "stand still and repeat") -> HoldSummar
 
 
 def _not_rotations(quat: Array) -> int:
-    # Not (x < limit) rather than x >= limit: NaN has to count.
+    # `not x < limit` instead of `x >= limit`, so that NaN counts.
     return int(np.count_nonzero(~(np.abs(np.linalg.norm(quat, axis=-1) - 1.0) < 0.01)))
 
 
 def _angles(quat: Array, reference: Array) -> Array:
-    """Rotation angle (n,) between unit quaternions (n, 4) and one (4,), radians."""
+    """Return the rotation angles (n,) between unit quaternions (n, 4) and one (4,), radians."""
     return np.linalg.norm(rot.quat_to_rotvec(rot.quat_multiply(rot.quat_conjugate(reference), quat)), axis=-1)
 
 
@@ -120,10 +120,10 @@ def _rms(x: Array) -> float:
 
 
 def detect_alternating_devices(quat: Array) -> float | None:
-    """Angle in degrees between two devices whose samples (n, 4) alternate under one name; None if one."""
+    """Return the angle, degrees, between two devices whose samples (n, 4) alternate; None if it is one."""
     from_first = _angles(quat, quat[0])
     far = from_first > from_first.max() / 2
-    # One wearer passes through the angles between, and does not change sides every few samples.
+    # A single moving sensor passes through the angles between, and does not change sides every few samples.
     if np.count_nonzero(far[1:] != far[:-1]) < max(4, len(quat) / 10):
         return None
     near, other = quat[~far], quat[far]
@@ -134,7 +134,7 @@ def detect_alternating_devices(quat: Array) -> float | None:
 
 
 def _movement(name: str, s: SensorHold, quat: Array, spread: float) -> str | None:
-    """How one sensor moved, for a person; None if it held still."""
+    """Describe the movement of one sensor; None if it held still."""
     quarter = max(1, len(quat) // 4)
     drift = _angles(rot.mean_rotation(quat[-quarter:])[None], rot.mean_rotation(quat[:quarter]))[0]
     if math.degrees(spread) > SPREAD_LIMIT_DEG or math.degrees(drift) > DRIFT_LIMIT_DEG:
@@ -145,7 +145,7 @@ def _movement(name: str, s: SensorHold, quat: Array, spread: float) -> str | Non
 
 
 def _gravity(hold: Hold, quats: list[Array]) -> tuple[Array, list[str]]:
-    """Mean specific force of each sensor in I (6, 3), m/s^2, and warnings about its size; up or an error."""
+    """Return mean specific forces in I (6, 3), m/s^2, and warnings about their size; raise if not upwards."""
     force, warnings, wrong = np.full((len(PLACEMENTS), 3), np.nan), [], []
     for i, (name, s, quat) in enumerate(zip(PLACEMENTS, hold, quats, strict=True)):
         measured = np.isfinite(s.acc).all(axis=-1)
@@ -158,7 +158,7 @@ def _gravity(hold: Hold, quats: list[Array]) -> tuple[Array, list[str]]:
         at_rest = _rms(np.linalg.norm(acc, axis=-1))
         if at_rest < 0.5:
             wrong.append(
-                f"{name} measures {at_rest:.2f} m/s^2 (gravity is removed already; send specific force)"
+                f"{name} measures {at_rest:.2f} m/s^2 (gravity is already removed; send specific force)"
             )
         elif tilt_deg(force[i]) > GRAVITY_TILT_LIMIT_DEG:
             wrong.append(f"{name} {tilt_deg(force[i]):.0f} deg off ({diagnose_gravity_direction(quat, acc)})")
@@ -175,11 +175,11 @@ def _gravity(hold: Hold, quats: list[Array]) -> tuple[Array, list[str]]:
 
 
 def diagnose_gravity_direction(quat: Array, acc: Array) -> str:
-    """A guess at the convention that a device uses instead of ours, from one hold."""
+    """Guess from one hold which convention a device uses instead of ours."""
     guesses: list[tuple[str, Array]] = [
         ("looks negated: acceleration instead of specific force, or Z down", -rot.quat_rotate(quat, acc)),
         (
-            "looks like an inverse: the quaternion must turn sensor to inertial",
+            "looks like an inverse: the quaternion must rotate sensor to inertial",
             rot.quat_rotate(rot.quat_conjugate(quat), acc),
         ),
         (

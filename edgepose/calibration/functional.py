@@ -1,8 +1,8 @@
-"""Heading reset from motion: segments that are flexed show which way their wearer faces.
+"""Heading reset from motion: the flexion of segments shows which way the wearer faces.
 
-What was the vertical of a segment in the straight pose leans forward when a trunk bows or a heel is lifted
-behind, and back when a forearm is lifted forward. Turns of a limb about that axis, which would spoil the
-direction of its angular rate, do not show in where it points.
+The axis of a segment that was vertical in the straight pose leans forward when the trunk bows or a heel is
+lifted behind, and back when a forearm is lifted forward. A limb's rotation about that axis would distort the
+direction of its angular rate, but does not change where the axis points.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 
 MIN_LEAN_DEG = 6.0
-"""Less than this is swaying; walkers' pelves lean by 8 to 10."""
+"""Smallest lean that counts; less is swaying. A walker's pelvis leans by 8 to 10."""
 
 SPREAD_WARNING_DEG, SPREAD_LIMIT_DEG = 30.0, 40.0
 ONE_WAY = 0.4
-"""Least surplus of lean to one side, as a share: without it forward cannot be told from back."""
+"""Smallest surplus of lean to one side, as a share; with less, forward cannot be told from back."""
 
 
 class WeakMotionError(CalibrationError):
-    """Motion that shows no heading: moving once more, more clearly, helps."""
+    """Motion that shows no heading; the wearer can try again with clearer movements."""
 
 
 class Exercise(NamedTuple):
-    """One part of the motion that `ROUTINE` asks for: what to do, and the sensors that it moves."""
+    """One part of the motion that `ROUTINE` asks for: the instruction, and the sensors that it moves."""
 
     text: str
     sensors: tuple[str, ...]
@@ -46,40 +46,40 @@ ROUTINE = (
     Exercise("Lift the RIGHT heel up behind you and put it down, twice", ("right_lower_leg",)),
 )
 EXERCISE_S = 4.0
-"""Time for each of them, seconds."""
+"""Time for each exercise, seconds."""
 
 _BACK = ("left_forearm", "right_forearm")
 _STEP_S = 0.1
 
 
 def headings_from_motion(moving: Hold, upright: Array) -> HeadingReset:
-    """Heading reset from movements of a wearer who faces one way; the common frame's X axis is forward.
+    """Reset headings from movements of a wearer who faces one way; the common frame's X axis is forward.
 
     Args:
-        moving: what the sensors said meanwhile; `ROUTINE` is best, walking does.
+        moving: samples of the movements; `ROUTINE` is best, walking works.
         upright: (6, 4) mean quaternions of the straight pose, held shortly before or after.
 
     Raises:
         WeakMotionError: a sensor was moved too little, in all directions, or forward as much as back.
     """
     check_reported(moving)
-    leans = [_leans(s.quat, own) for s, own in zip(moving, upright, strict=True)]
+    leans = [_leans(s.quat, mean) for s, mean in zip(moving, upright, strict=True)]
     forward, spread, wrong = [], [], []
     for name, lean in zip(PLACEMENTS, leans, strict=True):
         direction, spread_deg, one_way = _direction(lean)
         reach = np.degrees(np.arcsin(min(1.0, np.percentile(np.linalg.norm(lean, axis=-1), 98))))
         if reach < MIN_LEAN_DEG:
-            wrong.append(f"{name} leant by {reach:.0f} deg only")
+            wrong.append(f"{name} leaned by only {reach:.0f} deg")
         elif spread_deg > SPREAD_LIMIT_DEG:
-            wrong.append(f"{name} leant in all directions ({spread_deg:.0f} deg)")
+            wrong.append(f"{name} leaned in all directions ({spread_deg:.0f} deg)")
         elif one_way < ONE_WAY:
-            wrong.append(f"{name} leant forward as much as back")
+            wrong.append(f"{name} leaned forward as much as back")
         forward.append(-direction if name in _BACK else direction)
         spread.append(spread_deg)
     if wrong:
         raise WeakMotionError(
-            f"no heading from this motion: {', '.join(wrong)}; face one way, and bow, lift each forearm "
-            "forward and each heel behind, all clearly"
+            f"no heading from this motion: {', '.join(wrong)}; face one way, bow, and lift each forearm "
+            "forward and each heel behind, with clear movements"
         )
     ahead = np.array(forward)
     warnings = [
@@ -92,17 +92,18 @@ def headings_from_motion(moving: Hold, upright: Array) -> HeadingReset:
 
 
 def _leans(quat: Array, upright: Array) -> Array:
-    """Level part (n, 2), in I, of the axis that was vertical in the straight pose."""
+    """Return the level part (n, 2), in I, of the axis that was vertical in the straight pose."""
     vertical = rot.quat_rotate(rot.quat_conjugate(upright), [0.0, 0.0, 1.0])
     return rot.quat_rotate(quat, vertical)[:, :2]
 
 
 def _direction(lean: Array) -> tuple[Array, float, float]:
-    """Direction (2,) to which it leant most, spread about that line in degrees, surplus over the other way.
+    """Return the main direction (2,) of lean, the spread about its line in degrees, and its surplus.
 
-    Weighted with the square of the speed, and of the lean where it is about the side.
+    The surplus is the share by which the lean to one side of the line exceeds that to the other. Direction
+    and spread are weighted with the square of the speed, the surplus with the square of the lean.
     """
-    # How it leans on average is posture, of which little is straight ahead; how that changes is movement.
+    # The mean lean is posture and hardly straight ahead; changes of the lean are movement.
     change = np.diff(lean, axis=0)
     squares, axes = np.linalg.eigh(change.T @ change)
     direction = axes[:, 1]
@@ -113,9 +114,9 @@ def _direction(lean: Array) -> tuple[Array, float, float]:
 
 
 def _wrong_order(times: Sequence[Array], leans: Sequence[Array]) -> list[str]:
-    """Warnings about sensors that moved when `ROUTINE` asked for another one's movement.
+    """Warn of sensors that moved when `ROUTINE` asked for another one's movement.
 
-    Only if the limbs moved one after the other: in walking they move together, and nothing can be told.
+    That only shows if the limbs moved one after the other; in walking they move together.
     """
     active = {}
     for name, time_s, lean in zip(PLACEMENTS, times, leans, strict=True):
@@ -129,7 +130,7 @@ def _wrong_order(times: Sequence[Array], leans: Sequence[Array]) -> list[str]:
                 return []
     found = sorted(limbs, key=lambda name: float(np.median(active[name])))
     return [
-        f"the sensor said to be at {name} moved when {place} should: are sensors swapped?"
-        for name, place in zip(found, limbs, strict=True)
-        if name != place
+        f"the sensor labelled {name} moved when {expected} should have: are sensors swapped?"
+        for name, expected in zip(found, limbs, strict=True)
+        if name != expected
     ]

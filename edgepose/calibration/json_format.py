@@ -1,4 +1,4 @@
-"""Calibrations on disk: JSON that people can read, every value checked when it is read."""
+"""Calibration files: human-readable JSON, every value checked on reading."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _FORMAT, _VERSION = "edgepose-calibration", 1
 
 
 def to_json(calibration: Calibration) -> str:
-    """The calibration as JSON for `from_json` and for people: sensors by name, degrees, w, x, y, z."""
+    """Format a calibration as JSON for `from_json` and for people: sensors by name, degrees, w, x, y, z."""
     sensors = {
         name: {
             "heading_offset_deg": math.degrees(calibration.heading_offset[i]),
@@ -48,37 +48,37 @@ def to_json(calibration: Calibration) -> str:
         "metadata": dict(calibration.metadata),
     }
     text = json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    # Quaternions on one line each; a line break inside of a text is escaped and so never matches.
+    # Quaternions on one line each; a line break inside a string is escaped and so never matches.
     text = re.sub(r"\[\n[-+.\de,\s]+\]", lambda numbers: " ".join(numbers[0].split()), text)
-    # Names of files may hold what sets a terminal.
+    # File names may contain control sequences of a terminal.
     return "".join(c if c.isprintable() or c == "\n" else json.dumps(c)[1:-1] for c in text)
 
 
 def from_json(text: str, where: str = "calibration") -> Calibration:
-    """The calibration of a JSON text, every value checked; `where` names the text in messages.
+    """Read a calibration from JSON text and check every value; `where` names the text in messages.
 
     Raises:
         CalibrationError: not a calibration of this version, or a sensor or value is missing or impossible.
     """
 
-    def fail(what: str) -> EdgeposeError:
-        return CalibrationError(f"{where}: {what}")
+    def fail(problem: str) -> EdgeposeError:
+        return CalibrationError(f"{where}: {problem}")
 
     try:
         document = json.loads(text, object_pairs_hook=_no_duplicates, parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
         raise fail(
-            f"not valid JSON ({str(error).splitlines()[0]}); make it anew with `edgepose calibrate`"
+            f"not valid JSON ({str(error).splitlines()[0]}); make a new one with `edgepose calibrate`"
         ) from None
     if not isinstance(document, dict) or document.get("format") != _FORMAT:
         raise fail("not an edgepose calibration; make one with `edgepose calibrate`")
     if document.get("version") != _VERSION or isinstance(document.get("version"), bool):
         raise fail(
-            f"format version {document.get('version')!r}; this program reads {_VERSION}, calibrate anew"
+            f"format version {document.get('version')!r}; this program reads {_VERSION}, calibrate again"
         )
     sensors = _member(document, "sensors", dict, fail)
     if missing := [name for name in PLACEMENTS if name not in sensors]:
-        raise fail(f"no sensor {', '.join(missing)}; calibrate anew with all six")
+        raise fail(f"no sensor {', '.join(missing)}; calibrate again with all six")
     if unknown := [name for name in sensors if name not in PLACEMENTS]:
         raise fail(f"unknown sensor {', '.join(map(repr, unknown))}; the sensors are {', '.join(PLACEMENTS)}")
     if bare := [name for name in PLACEMENTS if not isinstance(sensors[name], dict)]:
@@ -90,43 +90,45 @@ def from_json(text: str, where: str = "calibration") -> Calibration:
         body_frame = check_body_frame(_member(document, "body_frame", str, fail))
     except EdgeposeError as error:
         raise fail(str(error).removeprefix(f"{where}: ")) from None
-    # Files of versions without filters say nothing about them.
-    made = _member({"orientation": {"filter": "none", "north": True}} | document, "orientation", dict, fail)
-    if made.get("filter") not in FILTERS or not isinstance(made.get("north"), bool):
-        raise fail(f"'orientation' must say filter ({', '.join(FILTERS)}) and north (true or false)")
-    own = {name: _numbers_of(name, sensors[name], fail) for name in PLACEMENTS}
+    # Files of versions without filters lack this entry.
+    source = _member({"orientation": {"filter": "none", "north": True}} | document, "orientation", dict, fail)
+    if source.get("filter") not in FILTERS or not isinstance(source.get("north"), bool):
+        raise fail(f"'orientation' must have filter ({', '.join(FILTERS)}) and north (true or false)")
+    offsets, mounts, residuals = zip(
+        *(_numbers_of(name, sensors[name], fail) for name in PLACEMENTS), strict=True
+    )
     return Calibration(
         body_from_inertial=_unit_quaternion(document, "body_from_inertial", "", fail),
-        heading_offset=np.radians([own[name][0] for name in PLACEMENTS]),
-        bone_from_sensor=np.stack([own[name][1] for name in PLACEMENTS]),
-        residual_deg=np.array([own[name][2] for name in PLACEMENTS]),
+        heading_offset=np.radians(offsets),
+        bone_from_sensor=np.stack(mounts),
+        residual_deg=np.array(residuals),
         pose=pose,
         body_frame=body_frame,
         created=_member(document, "created", str, fail),
         metadata=_member(document, "metadata", dict, fail),
-        filter=made["filter"],
-        north=made["north"],
+        filter=source["filter"],
+        north=source["north"],
     )
 
 
 def save(calibration: Calibration, path: str | Path, overwrite: bool = True) -> None:
-    """Writes the calibration as JSON; the file is whole or as it was before.
+    """Write a calibration as JSON; on failure the file stays as it was.
 
     Raises:
-        CalibrationError: it cannot be written, or is there already and not to be overwritten.
+        CalibrationError: the file cannot be written, or exists and must not be overwritten.
     """
     write_whole(path, to_json(calibration), "the calibration", overwrite=overwrite)
 
 
 def load_calibration(path: str | Path) -> Calibration:
-    """The calibration in a JSON file; see `from_json` for errors, which name the file."""
+    """Read a calibration from a JSON file; see `from_json` for errors, which name the file."""
     try:
         text = read_text(Path(path))
     except OSError as error:
         raise CalibrationError(f"{path}: cannot read the calibration ({error.strerror or error})") from error
     except UnicodeDecodeError as error:
         raise CalibrationError(
-            f"{path}: not valid JSON (not UTF-8 text); make it anew with `edgepose calibrate`"
+            f"{path}: not valid JSON (not UTF-8 text); make a new one with `edgepose calibrate`"
         ) from error
     return from_json(text, str(path))
 
@@ -169,10 +171,10 @@ def _unit_quaternion(owner: dict[str, Any], key: str, of: str, fail: _Fail) -> A
 
 
 def _numbers_of(name: str, sensor: dict[str, Any], fail: _Fail) -> tuple[float, Array, float]:
-    """Heading offset (deg), R_BS (4,) and residual (deg) of one sensor's entry."""
+    """Return heading offset (deg), R_BS (4,) and residual (deg) of one sensor's entry."""
     offset, residual = _number(sensor.get("heading_offset_deg")), _number(sensor.get("residual_deg"))
     if offset is None:
         raise fail(f"sensor {name}: 'heading_offset_deg' is not a number")
     if residual is None or residual < 0:
-        raise fail(f"sensor {name}: 'residual_deg' is not a number from 0 up")
+        raise fail(f"sensor {name}: 'residual_deg' is not a number of at least 0")
     return offset, _unit_quaternion(sensor, "bone_from_sensor", f"sensor {name}: ", fail), residual

@@ -1,4 +1,4 @@
-"""Tells during a run when its calibration cannot be that of the wearer."""
+"""Detection, during a run, of a calibration that does not belong to the wearer."""
 
 from __future__ import annotations
 
@@ -15,32 +15,33 @@ from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 
 START_S = 20.0
-"""Time from the start in which a wearer who stands still is looked for in the pose, seconds."""
+"""Time from the start within which the wearer should stand still in the pose, seconds."""
 
 REST_S, REST_DEG = 1.5, 3.0
-"""Standing: for so long no sensor turns by more."""
+"""The wearer stands still if no sensor turns by more than `REST_DEG` for `REST_S`."""
 
 STRANGE_DEG = 60.0
-"""Tilt of one sensor against the pose that is no matter of standing loosely."""
+"""Tilt of one sensor against the pose that a sloppy stance does not explain."""
 
 IMPOSSIBLE_S = 3.0
-"""How long a bone has to be as none can be before it is told; sensors knock against each other."""
+"""Time in an impossible orientation before a bone is reported: sensors may be knocked for a moment."""
 
 COMPARE_S = 2.0
-"""When the rig is compared with that of the calibration: all sensors have reported by then."""
+"""Time after which the rig is compared with the calibration's: all sensors have reported by then."""
 
 _EVERY_S = 0.5
 
 
 class MisfitDetector:
-    """Watches frames; each thing is told once."""
+    """Checks frames against the calibration and warns of each problem once."""
 
     def __init__(self, calibration: Calibration, compare: Callable[[], str | None] = lambda: None) -> None:
-        """Nothing has come.
+        """Create the detector.
 
         Args:
             calibration: of the run.
-            compare: asked once what else is different from when it was made, one line.
+            compare: called once; returns one line on any other difference from when the calibration was
+                made, or None.
         """
         self._calibration, self._compare = calibration, compare
         self._start_s: float | None = None
@@ -49,15 +50,15 @@ class MisfitDetector:
         self._looking = True
         self._compared = False
         self._nearest: PoseFit | None = None  # of the rests so far
-        self._told_no_pose = False
+        self._warned_no_pose = False
         self._impossible_s = dict.fromkeys(PLACEMENTS, 0.0)
 
     def update(self, frame: ImuFrame, bones: Array) -> list[str]:
-        """What there is to tell of a frame, one line each.
+        """Return the warnings that a frame gives rise to, one line each.
 
         Args:
             frame: as measured.
-            bones: (6, 3, 3) of it, R_TB.
+            bones: (6, 3, 3) its bones, R_TB.
         """
         if self._start_s is None:
             self._start_s = frame.time_s
@@ -69,15 +70,15 @@ class MisfitDetector:
             return []
         self._next_s = frame.time_s + _EVERY_S
         passed_s = frame.time_s - self._start_s
-        lines = self._bodies(frame, bones)
+        lines = self._check_bones(frame, bones)
         if not self._compared and passed_s >= COMPARE_S:
             lines += self._comparison()
         if self._looking:
-            lines += self._pose(passed_s)
+            lines += self._check_pose(passed_s)
         return lines
 
     def at_end(self) -> list[str]:
-        """What there is to tell after the last frame."""
+        """Return the warnings that are left after the last frame."""
         lines = [] if self._compared or self._start_s is None else self._comparison()
         return lines + (self._no_pose() if self._looking else [])
 
@@ -86,59 +87,60 @@ class MisfitDetector:
         line = self._compare()
         return [] if line is None else [line]
 
-    def _bodies(self, frame: ImuFrame, bones: Array) -> list[str]:
+    def _check_bones(self, frame: ImuFrame, bones: Array) -> list[str]:
         wrong = [name for name in impossible_bones(bones) if not frame.held[PLACEMENTS.index(name)]]
-        told = []
+        reported = []
         for name, since_s in self._impossible_s.items():
             self._impossible_s[name] = since_s + _EVERY_S if name in wrong else min(since_s, 0.0)
             if self._impossible_s[name] > IMPOSSIBLE_S:
                 self._impossible_s[name] = -np.inf
-                told.append(name)
-        if not told:
+                reported.append(name)
+        if not reported:
             return []
         return [
-            f"warning: {', '.join(told)}: turned against the pelvis as no body can: is the calibration that "
-            "of this wearer and rig, and does each sensor sit where it did? calibrate again"
+            f"warning: {', '.join(reported)}: turned against the pelvis as no body can turn; check that the "
+            "calibration is of this wearer and rig and that no sensor has moved, or calibrate again"
         ]
 
-    def _pose(self, passed_s: float) -> list[str]:
+    def _check_pose(self, passed_s: float) -> list[str]:
         rest = _rest(self._frames)
         if rest is not None:
             fit = fit_pose(self._calibration, rest)
             self._looking = fit.sits_at is None and not fit.good
             if fit.sits_at is not None:
                 return [
-                    f"warning: sensors are exchanged since the calibration: {fit.exchanged}; "
-                    "exchange them, or calibrate again"
+                    f"warning: sensors were swapped since the calibration: {fit.exchanged}; "
+                    "swap them back, or calibrate again"
                 ]
             if self._nearest is None or fit.off_deg < self._nearest.off_deg:
                 self._nearest = fit
         return self._no_pose() if self._looking and passed_s > START_S else []
 
     def _no_pose(self) -> list[str]:
-        nearest, told = self._nearest, self._told_no_pose
-        self._told_no_pose = True
-        if told or nearest is None or (nearest.in_pose and nearest.tilt_deg.max() < STRANGE_DEG):
+        nearest, warned = self._nearest, self._warned_no_pose
+        self._warned_no_pose = True
+        if warned or nearest is None or (nearest.in_pose and nearest.tilt_deg.max() < STRANGE_DEG):
             return []
         tilt = ", ".join(f"{n} {angle:.0f}" for n, angle in zip(PLACEMENTS, nearest.tilt_deg, strict=True))
         return [
-            f"warning: nobody has stood still in the calibration's pose (tilt off by {tilt} deg): if "
-            "somebody meant to, it is of another wearer or rig; calibrate again"
+            f"warning: the wearer has not stood still in the calibration's pose (tilt off by {tilt} deg); if "
+            "they have, the calibration is of another wearer or rig: calibrate again"
         ]
 
 
 def _rest(frames: deque[ImuFrame]) -> Array | None:
-    """Mean orientations (6, 4) of frames in which nothing turned; None if something did."""
+    """Mean orientations (6, 4) of frames in which no sensor turned; None if one did."""
     silent = any(frame.held.any() for frame in frames)
     if silent or frames[-1].time_s - frames[0].time_s < REST_S - _EVERY_S:
         return None
-    if _turn_deg(frames[0].orientation, frames[-1].orientation).max() > REST_DEG:  # mostly, and quickly seen
+    # A cheap check that catches most motion.
+    if _angles_deg(frames[0].orientation, frames[-1].orientation).max() > REST_DEG:
         return None
     orientation = np.stack([frame.orientation for frame in frames])
-    mean = np.stack([rot.mean_rotation(own) for own in orientation.swapaxes(0, 1)])
-    return mean if _turn_deg(mean, orientation).max() < REST_DEG else None
+    mean = np.stack([rot.mean_rotation(quats) for quats in orientation.swapaxes(0, 1)])
+    return mean if _angles_deg(mean, orientation).max() < REST_DEG else None
 
 
-def _turn_deg(one: Array, other: Array) -> Array:
+def _angles_deg(one: Array, other: Array) -> Array:
     """Angles between unit quaternions (..., 4), degrees."""
     return np.degrees(2.0 * np.arccos(np.clip(np.abs(np.sum(one * other, axis=-1)), 0.0, 1.0)))

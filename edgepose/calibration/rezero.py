@@ -1,7 +1,8 @@
-"""Headings of a run: as calibrated, or found anew while the wearer holds the calibration pose again.
+"""Headings of a run: as calibrated, or reset while the wearer holds the calibration pose again.
 
-Gyroscopes cannot keep a heading for long, and without a north a filter starts with any. The pose shows what
-is missing (see `edgepose.calibration.headings_from_pose`), and the way the wearer faces becomes forward.
+Gyroscopes cannot keep a heading for long, and without a north a filter starts with an arbitrary one. The pose
+shows the offsets (see `edgepose.calibration.headings_from_pose`); the direction that the wearer faces becomes
+forward.
 """
 
 from __future__ import annotations
@@ -22,26 +23,26 @@ HOLD_S = 1.0
 """Length of the hold that is averaged, seconds."""
 
 START_HOLD_S = 2.0
-"""The same at the start, where filters have hardly begun and nobody waits for poses."""
+"""The same at the start, seconds: longer, as filters have not settled and there are no poses to delay."""
 
 SPREAD_LIMIT_DEG = 3.0
 TILT_LIMIT_DEG = 20.0
-"""Gravity shows that the pose is another one, or that a sensor has slipped."""
+"""With more tilt against the calibration, the pose is another one or a sensor has slipped."""
 
 HELD_LIMIT = 0.5
-"""Largest share of a hold in which a sensor may have been silent."""
+"""Largest share of a hold for which a sensor may be silent."""
 
 BLEND_S = 1.0
-"""Seconds in which new headings replace the old ones: networks know limbs that turn, none that jump."""
+"""Time over which new headings replace the old ones, seconds: the network has never seen limbs jump."""
 
 REPEAT_S = 5.0
-"""Time between two remarks on why a start is not complete yet, seconds."""
+"""Time between two messages on why the start is not complete yet, seconds."""
 
 _POSE = {"straight": "stand straight, arms hanging, palms to the thighs", "t-pose": "stand in the T-pose"}
 
 
 class HeadingRezero:
-    """The calibration of each frame of a run."""
+    """Provides the calibration for each frame of a run, with headings reset on request."""
 
     def __init__(
         self,
@@ -51,13 +52,13 @@ class HeadingRezero:
         requests: Callable[[], list[float]] = list,
         notify: Callable[[str], None] = lambda text: None,
     ) -> None:
-        """As calibrated.
+        """Start with the calibration's headings.
 
         Args:
             calibration: of the wearer.
-            hold_first: its headings are worth nothing; there are no poses before the first good hold.
-            requests: asked at each frame for new wishes to begin a hold, in how many seconds each.
-            notify: hears what the wearer has to know.
+            hold_first: its headings are not valid; there are no poses before the first good hold.
+            requests: called at each frame; returns the delay in seconds of each newly requested hold.
+            notify: called with each message for the wearer.
         """
         self._calibration = calibration
         self._requests, self._notify = requests, notify
@@ -66,25 +67,25 @@ class HeadingRezero:
         self._blend_from_s = -np.inf
         self._hold: list[ImuFrame] = []
         self._hold_from_s: float | None = None
-        self._told_s = -np.inf
+        self._notified_s = -np.inf
         if hold_first:
-            notify(f"{_POSE[calibration.pose]}, facing forward, and hold still: poses begin after that")
+            notify(f"{_POSE[calibration.pose]}, facing forward, and hold still: poses start after that")
 
     def calibration_for(self, frame: ImuFrame) -> Calibration | None:
-        """The calibration for a frame; None until the first hold, if there must be one."""
-        wishes = self._requests()
+        """Return the calibration for a frame; None until the first hold, if there must be one."""
+        requests = self._requests()
         if self._old is None:
-            self._start(frame)
+            self._first_hold(frame)
         else:
-            for delay_s in wishes[-1:]:
+            for delay_s in requests[-1:]:
                 self._hold, self._hold_from_s = [], frame.time_s + delay_s
                 wait = f"in {delay_s:g} s" if delay_s else "now"
                 self._notify(f"re-zero {wait}: {_POSE[self._calibration.pose]}, facing forward")
             if self._hold_from_s is not None and frame.time_s >= self._hold_from_s:
-                self._again(frame)
+                self._later_hold(frame)
         return self._blended(frame.time_s)
 
-    def _start(self, frame: ImuFrame) -> None:
+    def _first_hold(self, frame: ImuFrame) -> None:
         self._hold.append(frame)
         if frame.time_s - self._hold[0].time_s < START_HOLD_S:
             return
@@ -92,8 +93,8 @@ class HeadingRezero:
             found = _from_hold(self._calibration, self._hold)
         except EdgeposeError as error:
             del self._hold[: len(self._hold) // 4 + 1]
-            if frame.time_s - self._told_s > REPEAT_S:
-                self._told_s = frame.time_s
+            if frame.time_s - self._notified_s > REPEAT_S:
+                self._notified_s = frame.time_s
                 self._notify(f"waiting for the pose: {error}")
             return
         self._hold = []
@@ -101,7 +102,7 @@ class HeadingRezero:
         self._calibration = replace(self._calibration, heading_offset=found.offset)
         self._notify(f"headings found; tilt off by {_by_sensor(found.error_deg)} deg. You can move now")
 
-    def _again(self, frame: ImuFrame) -> None:
+    def _later_hold(self, frame: ImuFrame) -> None:
         self._hold.append(frame)
         if frame.time_s - self._hold[0].time_s < HOLD_S:
             return
@@ -133,16 +134,16 @@ class HeadingRezero:
 
 
 def _from_hold(calibration: Calibration, frames: list[ImuFrame]) -> HeadingReset:
-    """Heading reset from frames of the held pose.
+    """Reset headings from frames of the held pose.
 
     Raises:
-        CalibrationError: the wearer moved, or gravity says that it is another pose; names the sensors.
+        CalibrationError: the wearer moved, or gravity shows another pose; names the sensors.
     """
-    # What a short loss repeats is no other pose.
+    # Repeated values of a short dropout do no harm.
     if silent := _names(np.mean([frame.held for frame in frames], axis=0) > HELD_LIMIT):
         raise CalibrationError(f"nothing new from {silent}")
     orientation = np.stack([frame.orientation for frame in frames])
-    mean = np.stack([rot.mean_rotation(own) for own in orientation.swapaxes(0, 1)])
+    mean = np.stack([rot.mean_rotation(quats) for quats in orientation.swapaxes(0, 1)])
     away = np.linalg.norm(
         rot.quat_to_rotvec(rot.quat_multiply(rot.quat_conjugate(mean), orientation)), axis=-1
     )
@@ -152,14 +153,14 @@ def _from_hold(calibration: Calibration, frames: list[ImuFrame]) -> HeadingReset
     found = headings_from_pose(calibration, mean)
     if crooked := _names(found.error_deg > TILT_LIMIT_DEG, found.error_deg):
         raise CalibrationError(
-            f"another tilt than in the calibration: {crooked}; "
+            f"tilt differs from the calibration's: {crooked}; "
             "take its pose, or calibrate again if a sensor has slipped"
         )
     return found
 
 
 def _names(wrong: Array | np.ndarray, angle_deg: Array | None = None) -> str:
-    """The sensors that are marked, for a message."""
+    """List the marked sensors, for a message."""
     return ", ".join(
         PLACEMENTS[i] if angle_deg is None else f"{PLACEMENTS[i]} {angle_deg[i]:.0f} deg"
         for i in np.flatnonzero(wrong)
@@ -171,5 +172,5 @@ def _by_sensor(angle_deg: Array) -> str:
 
 
 def _wrapped(angle: Array) -> Array:
-    """Angles brought to -pi .. pi."""
+    """Wrap angles to -pi .. pi."""
     return np.arctan2(np.sin(angle), np.cos(angle))

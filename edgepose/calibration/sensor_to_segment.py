@@ -1,4 +1,4 @@
-"""The calibration itself: bone offsets of a known pose (DIP eq. 7), and bones from oriented frames."""
+"""The calibration: bone offsets from a known pose (DIP eq. 7), and bones from oriented frames."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 
 
-def _arms(turn: float) -> Array:
-    """R_TB0 (6, 3, 3) with the left forearm turned by `turn` about Z and the right one by the opposite."""
+def _arms(angle: float) -> Array:
+    """Return R_TB0 (6, 3, 3) with the left forearm rotated by `angle` about Z, the right by the opposite."""
     bones = np.tile(np.eye(3), (len(PLACEMENTS), 1, 1))
-    for name, angle in (("left_forearm", turn), ("right_forearm", -turn)):
-        bones[PLACEMENTS.index(name)] = rot.rotation_about_axis("z", angle)
+    for name, signed in (("left_forearm", angle), ("right_forearm", -angle)):
+        bones[PLACEMENTS.index(name)] = rot.rotation_about_axis("z", signed)
     return bones
 
 
@@ -33,19 +33,19 @@ POSES: Mapping[str, Array] = {"straight": _arms(-math.pi / 2), "t-pose": _arms(0
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Everything between an oriented frame and bones in the body frame.
+    """Everything needed to turn an oriented frame into bones in the body frame.
 
     Attributes:
         body_from_inertial: (4,) quaternion of R_TI.
-        heading_offset: (6,) turn about Z of each sensor's inertial frame to the common one, rad.
-        bone_from_sensor: (6, 4) quaternions of R_BS, how each sensor is mounted on its bone.
+        heading_offset: (6,) rotation about Z from each sensor's inertial frame to the common one, rad.
+        bone_from_sensor: (6, 4) quaternions of R_BS, the mounting of each sensor on its bone.
         residual_deg: (6,) RMS angle of each sensor about its mean over the hold, degrees.
         pose: key of POSES that was held.
-        body_frame: how R_TI was found: `head`, `SENSOR:AXIS` or `heading:DEG`.
+        body_frame: method by which R_TI was found: `head`, `SENSOR:AXIS` or `heading:DEG`.
         created: ISO 8601 time.
-        metadata: what else is worth knowing (source, window, ...), JSON values.
-        filter: one of `edgepose.imu.FILTERS`, which made the orientations.
-        north: whether all headings count from one north; if not, they begin anew when a filter does.
+        metadata: further facts (source, window, ...), JSON values.
+        filter: filter that computed the orientations, one of `edgepose.imu.FILTERS`.
+        north: whether all headings count from one north; if not, they change whenever a filter restarts.
     """
 
     body_from_inertial: Array
@@ -61,7 +61,7 @@ class Calibration:
 
     @cached_property
     def _maps(self) -> tuple[Array, Array, Array]:
-        """Products q q^T to R_TB (6, 16, 9), force as a row from I to T (6, 3, 3), gravity in T (3,)."""
+        """Maps from q q^T to R_TB (6, 16, 9) and from force rows in I to T (6, 3, 3); gravity in T (3,)."""
         r_ti = rot.quat_to_matrix(self.body_from_inertial)
         left = r_ti @ rot.quat_to_matrix(rot.quat_about_z(self.heading_offset))
         right = rot.transpose(rot.quat_to_matrix(self.bone_from_sensor))
@@ -70,7 +70,7 @@ class Calibration:
 
 
 def _quadratic_form() -> Array:
-    """(4, 4, 3, 3) symmetric coefficients K with R(q) = sum of q_i q_j K_ij for unit q."""
+    """Return the symmetric coefficients K (4, 4, 3, 3) with R(q) = sum of q_i q_j K_ij for unit q."""
     unit = np.eye(4)
     squares = rot.quat_to_matrix(unit)
     form = rot.quat_to_matrix((unit[:, None] + unit) / math.sqrt(2.0)) - (squares[:, None] + squares) / 2.0
@@ -89,16 +89,16 @@ def calibrate(
     filter: str = "none",
     north: bool = True,
 ) -> Calibration:
-    """Calibration (DIP 4.2, eq. 6 and 7) from a checked hold of a known pose.
+    """Compute the calibration (DIP 4.2, eq. 6 and 7) from a checked hold of a known pose.
 
     Args:
-        summary: what `check_hold` returned.
+        summary: result of `check_hold`.
         pose: key of POSES that the wearer held.
         body_frame: see `body_from_inertial`.
-        created: ISO 8601 time to note.
-        heading_offset: (6,) of a `HeadingReset`, rad; None where all sensors share a north.
-        metadata: JSON values to note.
-        filter: one of `edgepose.imu.FILTERS`, which made the orientations.
+        created: ISO 8601 time to store.
+        heading_offset: (6,) of a `HeadingReset`, rad; None if all sensors share a north.
+        metadata: JSON values to store.
+        filter: filter that computed the orientations, one of `edgepose.imu.FILTERS`.
         north: whether all headings count from one north.
     """
     if pose not in POSES:
@@ -124,22 +124,22 @@ def calibrate(
 def apply_calibration(
     calibration: Calibration, orientation: ArrayLike, force: ArrayLike
 ) -> tuple[Array, Array]:
-    """Bones and accelerations in the body frame (DIP 4.2, SIP eq. 13); leading dimensions are free.
+    """Compute bones and accelerations in the body frame (DIP 4.2, SIP eq. 13), for any leading dimensions.
 
-    R_TB = R_TI R_IS inv(R_BS). DIP prints eq. 8 as R_BS R_TS, which would not give R_TB0 back at the
+    R_TB = R_TI R_IS inv(R_BS). DIP prints eq. 8 as R_BS R_TS, which would not reproduce R_TB0 at the
     calibration instant. a_T = R_TI (f_I + g_I), zero at rest.
 
     Args:
         calibration: of this rig.
         orientation: (..., 6, 4) unit quaternions, sensor to inertial, as measured: headings are reset here.
-        force: (..., 6, 3) specific force turned to the inertial frame by the same quaternions, m/s^2.
+        force: (..., 6, 3) specific force, rotated to the inertial frame by the same quaternions, m/s^2.
 
     Returns:
         (..., 6, 3, 3) R_TB and (..., 6, 3) a_T, m/s^2.
     """
     bones, to_body, gravity = calibration._maps
     q, f = np.asarray(orientation, float), np.asarray(force, float)
-    # A rotation matrix is quadratic in its quaternion, so all constant turns fold into one product, which
+    # A rotation matrix is quadratic in its quaternion, so all constant rotations fold into one product. That
     # takes a fifth of the time of a conversion followed by two products.
     squares = (q[..., :, None] * q[..., None, :]).reshape(*q.shape[:-1], 1, 16)
     r_tb = (squares @ bones).reshape(*q.shape[:-1], 3, 3)

@@ -1,4 +1,4 @@
-"""What sensors said while they were held still: collecting it, cutting it, finding it in a recording."""
+"""Samples of a held pose: collecting them, cutting them, finding them in a recording."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MIN_SAMPLES = 10
 
 
 class SensorHold(NamedTuple):
-    """What one sensor said while it was held still.
+    """Samples of one sensor while it was held still.
 
     Attributes:
         time_s: (n,) seconds on the source's clock.
@@ -33,28 +33,28 @@ class SensorHold(NamedTuple):
 
 
 Hold = Sequence[SensorHold]
-"""One `SensorHold` a placement, in the order of PLACEMENTS."""
+"""One `SensorHold` per placement, in the order of PLACEMENTS."""
 
 
 def hold_from_samples(samples: Iterable[ImuSample]) -> Hold:
-    """Samples of all sensors, in order of arrival, sorted by placement; see `_oriented`."""
+    """Sort samples of all sensors, in order of arrival, by placement; see `_oriented`."""
     missing = (math.nan,) * 4
     rows: list[list[ImuSample]] = [[] for _ in PLACEMENTS]
     for sample in samples:
         rows[sample.sensor].append(sample)
     return [
         _oriented(
-            np.array([s.time_s for s in own], float),
-            np.array([s.quat or missing for s in own], float).reshape(-1, 4),
-            np.array([s.acc or missing[:3] for s in own], float).reshape(-1, 3),
-            np.array([s.gyr or missing[:3] for s in own], float).reshape(-1, 3),
+            np.array([s.time_s for s in of_sensor], float),
+            np.array([s.quat or missing for s in of_sensor], float).reshape(-1, 4),
+            np.array([s.acc or missing[:3] for s in of_sensor], float).reshape(-1, 3),
+            np.array([s.gyr or missing[:3] for s in of_sensor], float).reshape(-1, 3),
         )
-        for own in rows
+        for of_sensor in rows
     ]
 
 
 def hold_from_recording(recording: Recording) -> Hold:
-    """All of a recording, sorted by placement; see `_oriented`."""
+    """Sort all samples of a recording by placement; see `_oriented`."""
 
     def filled(rows: Array | None, n: int, width: int) -> Array:
         return np.full((n, width), np.nan) if rows is None else rows
@@ -67,29 +67,29 @@ def hold_from_recording(recording: Recording) -> Hold:
 
 
 def _oriented(time_s: Array, quat: Array, acc: Array, gyr: Array) -> SensorHold:
-    """Rows with an orientation; all if there is none, so that a raw sensor differs from a silent one."""
+    """Keep the rows with an orientation; all if there is none, to tell a raw sensor from a silent one."""
     measured = ~np.isnan(quat).all(axis=-1)
     rows = measured if measured.any() else slice(None)
     return SensorHold(time_s[rows], quat[rows], acc[rows], gyr[rows])
 
 
 def trim(hold: Hold, start_s: float, end_s: float) -> Hold:
-    """The part of a hold from `start_s` up to but without `end_s`, on the source's clock."""
+    """Return the part of a hold from `start_s` up to but without `end_s`, on the source's clock."""
     return [SensorHold(*(column[(s.time_s >= start_s) & (s.time_s < end_s)] for column in s)) for s in hold]
 
 
 def stillest_start(hold: Hold, seconds: float) -> float:
-    """Start (s, source's clock) of the window in which the sensor that moves most moves least.
+    """Return the start (s, source's clock) of the window in which the sensor that moves most moves least.
 
-    Sitting is as still as standing, and the pose comes first (DIP 4.2), so the earliest window is taken that
-    is within half a degree of the best one.
+    Sitting is as still as standing, and the pose comes first (DIP 4.2), so this is the earliest window within
+    half a degree of the best one.
 
     Raises:
         CalibrationError: no window of that length has samples of all sensors.
     """
     check_reported(hold)
     first, last = max(s.time_s.min() for s in hold), min(s.time_s.max() for s in hold)
-    # Tenths of a second at which there is something; the clock may have leapt.
+    # Only tenths of a second with samples: the clock may have jumped.
     starts = first + 0.1 * np.unique(np.floor((hold[ROOT].time_s - first) / 0.1))
     starts = starts[(starts >= first) & (starts + seconds <= last + 0.1)]
     spread = np.zeros(len(starts))
@@ -113,12 +113,12 @@ def stillest_start(hold: Hold, seconds: float) -> float:
 
 
 def sensor_names(hold: Hold) -> Iterable[tuple[str, SensorHold]]:
-    """The sensors with their placements."""
+    """Pair the sensors with their placements."""
     return zip(PLACEMENTS, hold, strict=True)
 
 
 def check_reported(hold: Hold) -> None:
-    """Raises EdgeposeError unless every sensor sent orientations."""
+    """Raise CalibrationError unless every sensor sent orientations."""
     silent = [name for name, s in sensor_names(hold) if not len(s.quat)]
     if silent:
         raise CalibrationError(f"nothing from {', '.join(silent)}: check power, link and placement of each")
@@ -126,11 +126,11 @@ def check_reported(hold: Hold) -> None:
     if raw:
         raise CalibrationError(
             f"no orientation from {', '.join(raw)}: set each to send quaternions, "
-            "or make it here of gyroscope and accelerometer: --filter kalman"
+            "or compute them here from gyroscope and accelerometer with --filter kalman"
         )
 
 
 def unit_or_zero(quat: Array) -> Array:
-    """Quaternions (n, 4) brought to length 1; zero where that cannot be."""
+    """Normalise quaternions (n, 4); zero where that is impossible."""
     norm = np.linalg.norm(quat, axis=-1, keepdims=True)
     return np.divide(quat, norm, out=np.zeros_like(quat), where=np.isfinite(norm) & (norm > 0))

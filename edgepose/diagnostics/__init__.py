@@ -1,1 +1,1 @@
-"""What is wrong with a sensor, from its samples."""
+"""Diagnosis of sensor faults from samples."""

@@ -1,4 +1,4 @@
-"""What is wrong with a sensor, and what to do about it, from what `sensor_health` measured."""
+"""Rules that turn the measurements of `sensor_health` into a diagnosis of a sensor, with advice."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from edgepose.sources.clock_sync import FOLLOWED_PPM
 
 SILENT_S = 1.0
 LOWEST_RATE_HZ = 50.0
-LOSS_LEAST = 20  # where devices send no time, the first ones are guessed
+LOSS_LEAST = 20  # without device times, the first losses are guesses
 INVALID_LIMIT_PERCENT = LOSS_LIMIT_PERCENT = 2.0
 INCOMPLETE_LIMIT_PERCENT = 5.0
 JITTER_LIMIT_PERIODS = 0.3
-LATE_LIMIT_MS, LATE_LIMIT_PERIODS = 10.0, 1.5  # what a frame waits for
+LATE_LIMIT_MS, LATE_LIMIT_PERIODS = 10.0, 1.5  # delay that a frame waits for
 REPEATED_LIMIT_PERCENT = 25.0
 GYR_NOISE_LIMIT_DEG_S, BIAS_LIMIT_DEG_S = 5.0, 3.0
 TABLE_HEADING_LIMIT_DEG, BODY_HEADING_LIMIT_DEG, FOREARM_HEADING_LIMIT_DEG = 10.0, 30.0, 60.0
@@ -27,12 +27,12 @@ DEGREES_IN_RADIAN = 57.3
 
 
 class Diagnosis(NamedTuple):
-    """The most important thing about a sensor.
+    """The most important finding about a sensor.
 
     Attributes:
         name: "ok" or one of the names in docs/guide/check.md.
-        advice: what it is and what to do, one line; empty where there is nothing to do.
-        problem: whether poses suffer; without, the advice only says how more can be found out.
+        advice: the finding and what to do, one line; empty if there is nothing to do.
+        problem: whether poses suffer; if not, the advice only says how to find out more.
     """
 
     name: str
@@ -41,14 +41,14 @@ class Diagnosis(NamedTuple):
 
 
 def diagnose(sensor: SensorHealth) -> Diagnosis:
-    """The most important problem of a sensor; "ok" if there is none."""
+    """Return the most important problem of a sensor; "ok" if there is none."""
     for name, rule in _PROBLEMS.items():
         if (advice := rule(sensor)) is not None:
             return Diagnosis(name, advice, True)
     if not sensor.rests:
         return Diagnosis(
             "ok, moving",
-            f"hold it still for {2 * REST_S:g} s: gravity, noise and bias are only seen at rest",
+            f"hold it still for {2 * REST_S:g} s: gravity, noise and bias only show at rest",
         )
     if not sensor.orientation:
         return Diagnosis("ok, raw", "it sends no orientation: calibrate and run with --filter kalman or vqf")
@@ -58,7 +58,7 @@ def diagnose(sensor: SensorHealth) -> Diagnosis:
 def _no_packets(s: SensorHealth) -> str | None:
     if s.samples:
         return None
-    return "nothing came: switch it on, check its link, and that its id is right and no other sensor's"
+    return "nothing came: switch it on, check its link, and check that its id is right and not used twice"
 
 
 def _silent(s: SensorHealth) -> str | None:
@@ -70,8 +70,8 @@ def _silent(s: SensorHealth) -> str | None:
 def _nothing_to_fuse(s: SensorHealth) -> str | None:
     if math.isnan(s.rate_hz) or (s.acceleration and (s.orientation or s.gyroscope)):
         return None
-    missing = "acceleration" if not s.acceleration else "orientation and no rate of turn"
-    return f"it sends no {missing}: switch it on in the device's settings"
+    missing = "acceleration" if not s.acceleration else "orientation and no angular rate"
+    return f"it sends no {missing}: enable it in the device's settings"
 
 
 def _incomplete(s: SensorHealth) -> str | None:
@@ -86,8 +86,8 @@ def _incomplete(s: SensorHealth) -> str | None:
 def _invalid(s: SensorHealth) -> str | None:
     if s.samples and 100.0 * s.invalid / s.samples > INVALID_LIMIT_PERCENT:
         return (
-            f"{s.invalid} of {s.samples} samples are no measurement (not a number, or no rotation): "
-            "check --protocol, and the sensor"
+            f"{s.invalid} of {s.samples} samples are not measurements (not a number, or not a rotation): "
+            "check --protocol and the sensor"
         )
     return None
 
@@ -101,20 +101,20 @@ def _two_devices(s: SensorHealth) -> str | None:
 def _same(s: SensorHealth) -> str | None:
     if s.same_as is None:
         return None
-    return f"it sends the same values as {s.same_as}: one device is read twice, check ids and --sensors"
+    return f"it sends the same values as {s.same_as}: one device is read twice; check ids and --sensors"
 
 
 def _frozen(s: SensorHealth) -> str | None:
     if s.frozen is None:
         return None
-    what = "all its values stand" if s.frozen == "everything" else f"its {s.frozen} stands"
-    return f"{what} still while it sends: restart the sensor; if it comes again, its firmware or chip hangs"
+    frozen = "none of its values changes" if s.frozen == "everything" else f"its {s.frozen} does not change"
+    return f"{frozen} while it sends: restart the sensor; if it happens again, its firmware or chip hangs"
 
 
 def _no_gravity(s: SensorHealth) -> str | None:
     if s.norm_m_s2 < 0.5:
         return (
-            f"it reads {s.norm_m_s2:.2f} m/s² at rest, so gravity is taken out: "
+            f"it reads {s.norm_m_s2:.2f} m/s² at rest, so gravity is already removed: "
             "send the acceleration as measured (specific force)"
         )
     return None
@@ -131,7 +131,7 @@ def _scale(s: SensorHealth) -> str | None:
     if abs(s.norm_m_s2 / GRAVITY - 1.0) > GRAVITY_SCALE_LIMIT:
         return (
             f"it reads {s.norm_m_s2:.2f} m/s² at rest, not {GRAVITY}: "
-            "check the range that the accelerometer is set to, and calibrate it"
+            "check the accelerometer's range setting, and calibrate it"
         )
     return None
 
@@ -151,8 +151,8 @@ def _gyro_unit(s: SensorHealth) -> str | None:
     ):
         if 0.7 < s.gyro_ratio / ratio < 1.4:
             return (
-                f"its rate is {s.gyro_ratio:.3g} times what the orientation turns: "
-                f"{sent} is sent where {expected} is expected"
+                f"its rate is {s.gyro_ratio:.3g} times that of its orientation: "
+                f"it sends {sent} instead of {expected}"
             )
     return None
 
@@ -162,19 +162,19 @@ def _gyro_axes(s: SensorHealth) -> str | None:
         return None
     if s.gyro_exchanged >= AGREEMENT_LIMIT:
         return (
-            "axes or signs of the gyroscope are not those of the orientation: bring both to the case's axes"
+            "gyroscope and orientation differ in axes or signs: output both in the axes of the sensor's case"
         )
     return (
-        "gyroscope and orientation do not turn together: is the quaternion sensor to inertial, w, x, y, z, "
-        "and are both of the same time?"
+        "gyroscope and orientation disagree: is the quaternion sensor to inertial, w, x, y, z, "
+        "and were both measured at the same time?"
     )
 
 
 def _gyro_scale(s: SensorHealth) -> str | None:
     if abs(s.gyro_ratio - 1.0) > GYRO_SCALE_LIMIT:
         return (
-            f"its rate is {s.gyro_ratio:.2f} times what the orientation turns: "
-            "check the range that the gyroscope is set to"
+            f"its rate is {s.gyro_ratio:.2f} times that of its orientation: "
+            "check the gyroscope's range setting"
         )
     return None
 
@@ -183,7 +183,7 @@ def _slow(s: SensorHealth) -> str | None:
     if math.isnan(s.rate_hz):
         return f"only {s.samples} samples came: check its settings and its link"
     if s.rate_hz < 0.96 * LOWEST_RATE_HZ:
-        return f"{s.rate_hz:.0f} samples a second: set 100, at least {LOWEST_RATE_HZ:g}, and the baud for it"
+        return f"{s.rate_hz:.0f} samples a second: set 100, or at least {LOWEST_RATE_HZ:g}, with enough baud"
     return None
 
 
@@ -198,7 +198,7 @@ def _loss(s: SensorHealth) -> str | None:
 
 def _irregular(s: SensorHealth) -> str | None:
     if 1e-3 * s.jitter_ms * s.rate_hz > JITTER_LIMIT_PERIODS:
-        return f"its intervals vary by {s.jitter_ms:.0f} ms: let a timer start its measurements"
+        return f"its intervals vary by {s.jitter_ms:.0f} ms: trigger its measurements by a timer"
     return None
 
 
@@ -206,7 +206,7 @@ def _late(s: SensorHealth) -> str | None:
     if s.late_ms > LATE_LIMIT_MS + LATE_LIMIT_PERIODS * 1e3 / s.rate_hz:
         return (
             f"packets come up to {s.late_ms:.0f} ms late, in bursts: "
-            "shorten the USB adapter's latency timer, relieve radio or line, or end other programs here"
+            "shorten the USB adapter's latency timer, reduce the load on radio or line, or end other programs"
         )
     return None
 
@@ -214,7 +214,7 @@ def _late(s: SensorHealth) -> str | None:
 def _drift(s: SensorHealth) -> str | None:
     if abs(s.clock_ppm) - 3.0 * s.clock_ppm_error > FOLLOWED_PPM:
         return (
-            f"its clock is {abs(s.clock_ppm):.0f} ppm {'slow' if s.clock_ppm > 0.0 else 'fast'}, and "
+            f"its clock is {abs(s.clock_ppm):.0f} ppm {'slow' if s.clock_ppm > 0.0 else 'fast'}, but at most "
             f"{FOLLOWED_PPM:g} can be followed: run it on a crystal, or send no time"
         )
     return None
@@ -223,8 +223,8 @@ def _drift(s: SensorHealth) -> str | None:
 def _restarts(s: SensorHealth) -> str | None:
     if s.clock_restarts:
         return (
-            f"its clock began anew {s.clock_restarts} times: check its power; "
-            "after a restart its heading may be another"
+            f"its clock restarted {s.clock_restarts} times: check its power; "
+            "its heading may differ after a restart"
         )
     return None
 
@@ -238,7 +238,7 @@ def _range(s: SensorHealth) -> str | None:
 def _repeats(s: SensorHealth) -> str | None:
     if s.repeated_percent > REPEATED_LIMIT_PERCENT:
         return (
-            f"{s.repeated_percent:.0f} % of its samples are the one before again: "
+            f"{s.repeated_percent:.0f} % of its samples repeat the one before: "
             "it measures more slowly than it sends"
         )
     return None
@@ -247,42 +247,40 @@ def _repeats(s: SensorHealth) -> str | None:
 def _noise(s: SensorHealth) -> str | None:
     if s.gyr_noise_deg_s > GYR_NOISE_LIMIT_DEG_S or s.acc_noise_m_s2 > REST_ACC:
         return (
-            f"at rest it shakes by {s.acc_noise_m_s2:.2f} m/s² and {s.gyr_noise_deg_s:.1f} deg/s: "
-            "lay it down; if it stays so, switch its low-pass filter on"
+            f"at rest its noise is {s.acc_noise_m_s2:.2f} m/s² and {s.gyr_noise_deg_s:.1f} deg/s: "
+            "lay it down; if that does not help, enable its low-pass filter"
         )
     return None
 
 
 def _bias(s: SensorHealth) -> str | None:
     if s.bias_deg_s > BIAS_LIMIT_DEG_S:
-        return (
-            f"it turns by {s.bias_deg_s:.1f} deg/s at rest: let it lie still while it starts, or calibrate it"
-        )
+        return f"its rate is {s.bias_deg_s:.1f} deg/s at rest: keep it still while it starts, or calibrate it"
     return None
 
 
 def _heading(s: SensorHealth) -> str | None:
     if s.heading_on == "table" and abs(s.heading_deg) > TABLE_HEADING_LIMIT_DEG:
         return (
-            f"lying as the others, its heading is {s.heading_deg:+.0f} deg off: "
+            f"lying like the others, its heading is {s.heading_deg:+.0f} deg off: "
             "calibrate with --heading-reset live"
         )
     limit = FOREARM_HEADING_LIMIT_DEG if "forearm" in s.placement else BODY_HEADING_LIMIT_DEG
     if s.heading_on == "body" and abs(s.heading_deg) > limit:
         return (
-            f"its heading is {s.heading_deg:+.0f} deg off the others' since the calibration: "
-            "stand as then, or calibrate again with a heading reset"
+            f"its heading has moved by {s.heading_deg:+.0f} deg against the others since the calibration: "
+            "stand as you did then, or calibrate again with a heading reset"
         )
     return None
 
 
-def _place(s: SensorHealth) -> str | None:
+def _placement(s: SensorHealth) -> str | None:
     if s.swapped_with is not None:
-        return f"it sits where {s.swapped_with} was calibrated: exchange the two"
+        return f"it is where {s.swapped_with} was calibrated: swap the two"
     if s.pose_tilt_deg > POSE_TILT_DEG:
         return (
             f"it is tilted by {s.pose_tilt_deg:.0f} deg against the calibration: "
-            "stand as then; if it has slipped, calibrate again"
+            "stand as you did then; if it has slipped, calibrate again"
         )
     return None
 
@@ -290,13 +288,16 @@ def _place(s: SensorHealth) -> str | None:
 def _field(s: SensorHealth) -> str | None:
     if s.field_change_percent > FIELD_CHANGE_LIMIT_PERCENT:
         return (
-            f"its magnetic field changes by {s.field_change_percent:.0f} %: keep it from magnets and iron, "
-            "and calibrate the magnetometer"
+            f"its magnetic field changes by {s.field_change_percent:.0f} %: keep it away from magnets and "
+            "iron, and calibrate the magnetometer"
         )
     low, high = FIELD_RANGE_UT
-    # Some devices send a field of about 1 where they were calibrated.
+    # Some calibrated devices scale the field to about 1.
     if s.field_ut > 5.0 and not low < s.field_ut < high:
-        return f"its magnetic field is {s.field_ut:.0f} uT, the Earth's is 25 to 65: a magnet or iron is near"
+        return (
+            f"its magnetic field is {s.field_ut:.0f} uT, but the Earth's is 25 to 65: "
+            "move it away from magnets and iron"
+        )
     return None
 
 
@@ -326,8 +327,8 @@ _PROBLEMS: dict[str, Callable[[SensorHealth], str | None]] = {
     "repeats": _repeats,
     "noise": _noise,
     "bias": _bias,
-    "placement": _place,
+    "placement": _placement,
     "heading": _heading,
     "field": _field,
 }
-"""Rules by name, the most important first."""
+"""Rules by name, most important first."""

@@ -1,1 +1,1 @@
-"""File formats of motion capture and of recordings."""
+"""File formats: motion capture, poses, recordings, body models."""

@@ -1,4 +1,4 @@
-"""What a motion-capture file holds before its skeleton is known: a tree of joints and their local poses."""
+"""Content of a motion-capture file with any skeleton: a tree of joints and their local poses."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ Array = NDArray[np.float64]
 
 
 LARGEST = 1e6
-"""Numbers of a file beyond this are taken for damage: no angle and no length in any unit comes near."""
+"""Larger numbers in a file count as damage: no angle or length in any unit comes near."""
 
 
 class JointTree(NamedTuple):
-    """Poses of one skeleton over time. Lengths are in the unit of the file that was read (see the reader)."""
+    """Poses of one skeleton over time; lengths are in the unit of the file (see the reader)."""
 
     names: tuple[str, ...]
     """Joint names (J); each joint comes after its parent."""
     parents: tuple[int, ...]
     """Index of each joint's parent; -1 for the root, which is joint 0."""
     offsets: Array
-    """(J, 3) joint position in its parent's frame when all angles are zero."""
+    """(J, 3) joint position in its parent's frame if all angles are zero."""
     rotations: Array
     """(T, J, 3, 3) rotation of each joint's frame against its parent's; the root's against the world."""
     positions: Array
@@ -35,7 +35,7 @@ class JointTree(NamedTuple):
 
 
 def forward(tree: JointTree) -> tuple[Array, Array]:
-    """Global joint rotations (T, J, 3, 3) and positions (T, J, 3) in the file's world and unit."""
+    """Compute global joint rotations (T, J, 3, 3) and positions (T, J, 3) in the file's world and unit."""
     rotations = np.empty_like(tree.rotations)
     positions = np.empty_like(tree.positions)
     for j, parent in enumerate(tree.parents):
@@ -50,15 +50,15 @@ def forward(tree: JointTree) -> tuple[Array, Array]:
 
 
 def fail(path: Path, line: int, problem: str) -> NoReturn:
-    """Raise the error for a problem in a line, counted from 1."""
+    """Raise a FileFormatError for a problem in a line, counted from 1."""
     raise FileFormatError(f"{path}, line {line}: {problem}")
 
 
 def numbers(path: Path, line: int, words: list[str], count: int) -> list[float]:
-    """The numbers of a line, counted from 1.
+    """Parse the `count` numbers of a line, counted from 1.
 
     Raises:
-        FileFormatError: a word is no number, is not finite or beyond `LARGEST`, or there are more or fewer.
+        FileFormatError: a word is not a number, is not finite or beyond `LARGEST`, or the count differs.
     """
     try:
         values = [float(word) for word in words]

@@ -1,6 +1,6 @@
-"""File formats one after the other: those of edgepose, then those of other packages.
+"""Registered file formats: those of edgepose, then those of plug-in packages.
 
-Other packages announce theirs by entry points of the group `edgepose.formats`.
+Plug-ins register their formats as entry points of the group `edgepose.formats`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class FileFormat:
-    """What every kind of format has.
+    """Base of all kinds of formats.
 
     Attributes:
         suffixes: endings of its files, in lower case, with the dot.
@@ -33,34 +33,34 @@ class FileFormat:
 Format = TypeVar("Format", bound=FileFormat)
 
 
-def built_in_format(kind: type[Format], place: str) -> Format:
-    """The format at a place, "module:constant", whose module is imported now."""
-    known = resolve_name(place)
-    assert isinstance(known, kind)
-    return known
+def built_in_format(kind: type[Format], name: str) -> Format:
+    """Import the format that is named as "module:constant"."""
+    format = resolve_name(name)
+    assert isinstance(format, kind)
+    return format
 
 
-def all_formats(kind: type[Format], places: Iterable[str]) -> Iterator[Format]:
-    """The formats of a kind: those at the places, imported one after the other, then those of plug-ins."""
-    for place in places:
-        yield built_in_format(kind, place)
-    yield from (known for known in plugin_formats() if isinstance(known, kind))
+def all_formats(kind: type[Format], names: Iterable[str]) -> Iterator[Format]:
+    """Yield the formats of a kind: the named ones, imported one after the other, then those of plug-ins."""
+    for name in names:
+        yield built_in_format(kind, name)
+    yield from (format for format in plugin_formats() if isinstance(format, kind))
 
 
 @cache
 def plugin_formats() -> tuple[FileFormat, ...]:
-    """Formats of installed packages; one that cannot be loaded costs a warning and nothing else."""
+    """Load the formats of installed packages; warn of those that cannot be loaded."""
     found = []
     for point in entry_points(group=GROUP):
         try:
             loaded = point.load()
-        except (Exception, SystemExit) as error:  # foreign code raises anything
+        except (Exception, SystemExit) as error:  # plug-ins can raise anything
             _log.warning("cannot load the file format %s (%s): %r", point.name, point.value, error)
             continue
         if isinstance(loaded, FileFormat):
             found.append(loaded)
         else:
             _log.warning(
-                "the file format %s (%s) is no RecordingFormat or PoseFormat", point.name, point.value
+                "the file format %s (%s) is not a RecordingFormat or PoseFormat", point.name, point.value
             )
     return tuple(found)

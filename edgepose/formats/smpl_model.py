@@ -1,4 +1,4 @@
-"""A user's own SMPL model file as a body: joint offsets and sensor points, nothing else of it."""
+"""Reader of a user's own SMPL model file; only joint offsets and sensor points are taken from it."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ MIN_BONE = 0.005
 
 
 def _is_known(module: str, name: str) -> bool:
-    """Whether SMPL's pickles hold objects of a class, which the arrays are taken out of."""
+    """Return whether SMPL's pickles contain objects of a class, from which arrays can be taken."""
     chumpy = module.partition(".")[0] == "chumpy"
     return chumpy or (module.startswith("scipy.sparse") and name in SPARSE)
 
 
 def _regressor(value: Any, n_vertices: int, path: Path) -> Array:
-    """The dense (24, V) joint regressor of a dense or sparse one."""
+    """Return a dense (24, V) joint regressor from a dense or sparse one."""
     name, shape = "J_regressor", (len(PARENTS), n_vertices)
     if not (isinstance(value, InertObject) and type(value).__name__ in SPARSE):
         dense = numbers(value, name, path).astype(float)
@@ -43,7 +43,7 @@ def _regressor(value: Any, n_vertices: int, path: Path) -> Array:
     data, indices, indptr = (
         numbers(state.get(key), f"{name}.{key}", path) for key in ("data", "indices", "indptr")
     )
-    # scipy has kept the shape under both names.
+    # The name of the shape depends on the version of scipy.
     found = numbers(state.get("_shape", state.get("shape")), f"{name}.shape", path)
     _check_shape(tuple(found.tolist()), shape, name, path)
     by_column = type(value).__name__.startswith("csc")
@@ -73,7 +73,7 @@ def _check_shape(found: tuple[Any, ...], wanted: tuple[int, ...], name: str, pat
 
 
 def _joints(model: Mapping[Any, Any], vertices: Array | None, path: Path) -> Array:
-    """Joint positions (24, 3) of the zero pose, metres."""
+    """Return the joint positions (24, 3) of the zero pose, metres."""
     if "J" in model:
         joints = numbers(model["J"], "J", path).astype(float)
     elif "J_regressor" in model and vertices is not None:
@@ -88,15 +88,15 @@ def _joints(model: Mapping[Any, Any], vertices: Array | None, path: Path) -> Arr
 
 
 def _sensors(offsets: Array) -> tuple[Array, float]:
-    """Sensor points (6, 3) and stature of a body of which the bones are known, from the default body's."""
+    """Estimate the sensor points (6, 3) and stature of a body from its bones and the default body."""
     default = default_body()
 
     def ratio(*joints: int) -> float:
         rows = list(joints)
-        mine, its = offsets[rows].sum(axis=0), default.offsets[rows].sum(axis=0)
-        return float(np.linalg.norm(mine) / np.linalg.norm(its))
+        length, default_length = (np.linalg.norm(o[rows].sum(axis=0)) for o in (offsets, default.offsets))
+        return float(length / default_length)
 
-    # The bone under each sensor; the head has no joint beyond it and goes with the trunk.
+    # The bone under each sensor; the head has no joint beyond it and is scaled like the trunk.
     trunk = (3, 6, 9, 12)
     scales = dict(
         zip(PLACEMENTS, (ratio(20), ratio(21), ratio(7), ratio(8), ratio(*trunk), ratio(*trunk)), strict=True)
@@ -107,14 +107,14 @@ def _sensors(offsets: Array) -> tuple[Array, float]:
 
 
 def read_smpl(path: str | Path) -> Body:
-    """The body of an SMPL model file, .npz or .pkl, that the user has a licence for.
+    """Read the body from an SMPL model file, .npz or .pkl, for which the user has a licence.
 
     Joints are the file's `J`, or `J_regressor @ v_template`. Stature is the height of `v_template`, or
     follows from the bones. Sensor points are the default body's, scaled with the bones. No code in the file
     is run.
 
     Raises:
-        FileFormatError: the file cannot be read, asks for code, or is not a 24-joint SMPL model in metres.
+        FileFormatError: the file cannot be read, contains code, or is not a 24-joint SMPL model in metres.
     """
     path = Path(path)
     try:
@@ -162,6 +162,6 @@ def _read_npz(path: Path) -> dict[Any, Any]:
             return {name: file[name] for name in names}
     except OSError:
         raise
-    except Exception as error:  # a broken archive can fail in any way
+    except Exception as error:  # a broken archive can raise any exception
         reason = str(error).partition("\n")[0]
         raise FileFormatError(f"{path}: not a readable {_WHAT}: {reason}") from error

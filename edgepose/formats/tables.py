@@ -95,7 +95,7 @@ def open_table(path: Path, fits: Callable[[Sequence[str]], bool], wanted: str) -
             if len(head) == HEAD_LINES:
                 break
         first = next((line for line in head if line), "")
-        raise FileFormatError(f"{path}: starts with {first[:40]!r} and not with {wanted!r}")
+        raise FileFormatError(f"{path}: starts with {first[:40]!r}, not with {wanted!r}")
 
 
 class _Lines:

@@ -1,6 +1,6 @@
-"""Raw samples to oriented ones, sensor by sensor, at the sensor's own rate.
+"""Orientation filters: raw samples to oriented ones, sensor by sensor, at the sensor's own rate.
 
-Filters import filterpy and scipy, so the names below are imported when they are first used.
+Filters import filterpy and scipy, so the names below are imported on first use.
 """
 
 from typing import TYPE_CHECKING

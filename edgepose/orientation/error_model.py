@@ -1,8 +1,8 @@
-"""How small errors of the filter's state grow over a block of samples, and what measurements say of them.
+"""Error model of the filter: growth of small errors of its state over a block of samples.
 
-The error is 15 numbers: orientation (a rotation vector in the inertial frame, R_true = exp(error) R), bias of
-the gyroscope, velocity in the inertial frame, bias of the accelerometer, relative scale of the gyroscope.
-Errors are true minus estimated values; the rate is (1 - scale) gyr - bias, the force acc - its bias.
+The error has 15 components: orientation (a rotation vector in the inertial frame, R_true = exp(error) R),
+gyroscope bias, velocity in the inertial frame, accelerometer bias, relative gyroscope scale. Errors are true
+minus estimated values; the rate is (1 - scale) gyr - bias, the force acc - its bias.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from firmware_protocols.sample import STANDARD_G
 Array = NDArray[np.float64]
 
 TURN, BIAS, VEL, ACC_BIAS, SCALE = (slice(i, i + 3) for i in range(0, 15, 3))
-"""Where the parts of the error are."""
+"""Components of the error vector."""
 
 HEADING = 2
-"""Where the error about the vertical is."""
+"""Index of the error about the vertical."""
 
 SIZE = 15
 
@@ -30,10 +30,10 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 
 class Transition(NamedTuple):
-    """Over a block.
+    """Propagation over a block.
 
     Attributes:
-        matrix: (15, 15) what becomes of an error.
+        matrix: (15, 15) maps the error before the block to the error after it.
         velocity: (3,) change of velocity, m/s.
     """
 
@@ -42,11 +42,11 @@ class Transition(NamedTuple):
 
 
 def transition(dt: Array, rotation: Array, gyr: Array, force: Array) -> Transition:
-    """How errors grow over a block.
+    """Propagate errors and velocity over a block.
 
     Args:
         dt: (N,) duration of each sample, s.
-        rotation: (N, 3, 3) sensor to inertial in the middle of each.
+        rotation: (N, 3, 3) sensor to inertial, in the middle of each sample.
         gyr: (N, 3) rates as measured, rad/s.
         force: (N, 3) specific force without the known bias, sensor frame, m/s^2.
     """
@@ -54,7 +54,7 @@ def transition(dt: Array, rotation: Array, gyr: Array, force: Array) -> Transiti
     passed = np.cumsum(dt) - 0.5 * dt
     pushes = np.einsum("nij,nj->ni", turned, force)
     push = pushes.sum(axis=0)
-    # Of each force, the part of the block that lies before it: that is how far a bias has turned it by then.
+    # Each force is weighted with the share of the block before it, in which a bias has rotated it.
     late_push = passed / dt.sum() @ pushes
     bias, scale = turned.sum(axis=0), np.einsum("nij,nj->ij", turned, gyr)
     matrix = np.eye(SIZE)
@@ -71,14 +71,14 @@ def transition(dt: Array, rotation: Array, gyr: Array, force: Array) -> Transiti
 def process_noise(
     settings: FilterSettings, duration_s: float, rate: float, lost_angle: float, lost_speed: float
 ) -> Array:
-    """Covariance (15, 15) that a block adds.
+    """Return the covariance (15, 15) that a block adds.
 
     Args:
         settings: of the filter.
         duration_s: of the block.
         rate: mean magnitude of the rotation, rad/s.
         lost_angle: rotation that may have gone unseen (gaps, ends of ranges), rad.
-        lost_speed: change of velocity that may have, m/s.
+        lost_speed: change of velocity that may have gone unseen, m/s.
     """
     growth = np.repeat(
         [
@@ -97,7 +97,7 @@ def process_noise(
 
 
 def start_covariance(settings: FilterSettings, heading: float) -> Array:
-    """Covariance (15, 15) of the error at the first sample; heading is its standard deviation, rad."""
+    """Return the error covariance (15, 15) at the first sample; `heading` is a standard deviation, rad."""
     sigma = np.repeat(
         [
             settings.tilt_start,

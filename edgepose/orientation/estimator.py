@@ -1,4 +1,4 @@
-"""The step of the walk that orients samples of all sensors."""
+"""Orientation of the samples of all sensors, the filter step of the pipeline."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ class SensorFilter(Protocol):
 
 
 KINDS: dict[str, type[OrientationFilter] | type[VqfFilter]] = {"kalman": OrientationFilter, "vqf": VqfFilter}
-"""Filters by the names they have on the command line."""
+"""Filters by their names on the command line."""
 
 
 class SensorStatus(NamedTuple):
-    """What a sensor's filter says of itself.
+    """State of a sensor's filter.
 
     Attributes:
         rest: the sensor is at rest.
         disturbed: the magnetic field is not the usual one.
         bias: of the gyroscope, sensor frame, deg/s.
-        events: samples with each event since the start; events that never were are missing.
+        events: number of samples with each event since the start; events that never occurred are missing.
     """
 
     rest: bool
@@ -47,63 +47,63 @@ class SensorStatus(NamedTuple):
 
 
 class OrientationEstimator:
-    """Gives samples orientations, each sensor by a filter of its own."""
+    """Adds orientations to samples, with one filter per sensor."""
 
     def __init__(
         self, kind: str = "kalman", magnetometer: bool = True, settings: FilterSettings | None = None
     ) -> None:
-        """Start with no sample seen.
+        """Create the estimator.
 
         Args:
             kind: one of KINDS.
-            magnetometer: use fields, where there are any.
+            magnetometer: use magnetic fields, where available.
             settings: of the filters.
 
         Raises:
             EdgeposeError: a package that the kind needs is not installed.
         """
         self._class, self._settings = KINDS[kind], settings
-        # The first one is made now: what is missing is told, and what has to be imported is.
+        # The first filter is made now, so that imports and their errors happen before the first sample.
         self._spare: list[SensorFilter] = [self._class(settings)]
         self._magnetometer = magnetometer
         self._filters: dict[int, SensorFilter] = {}
         self._last: dict[int, OrientationResult] = {}
         self._events: defaultdict[int, Counter[int]] = defaultdict(Counter)
-        self._fields: dict[int, Vector3] = {}  # that came in samples of their own
+        self._fields: dict[int, Vector3] = {}  # from samples without rate and force
 
     def orient(self, samples: list[ImuSample]) -> list[ImuSample]:
-        """The samples in the same order, those with rate and force with the filter's orientation.
+        """Return the samples in the same order; those with rate and force get the filter's orientation.
 
-        It replaces a device's own, which samples without a rate keep. A field that comes in a sample without
-        a rate counts for the sensor's next one.
+        It replaces the device's own orientation, which samples without a rate keep. A field in a sample
+        without a rate counts for the sensor's next one.
         """
-        places: defaultdict[int, list[int]] = defaultdict(list)
+        indices: defaultdict[int, list[int]] = defaultdict(list)
         fields: list[Vector3 | None] = [sample.mag for sample in samples]
-        for place, sample in enumerate(samples):
+        for index, sample in enumerate(samples):
             if sample.gyr is None or sample.acc is None:
                 if sample.mag is not None:
                     self._fields[sample.sensor] = sample.mag
                 continue
             waiting = self._fields.pop(sample.sensor, None)
-            fields[place] = sample.mag or waiting
-            places[sample.sensor].append(place)
+            fields[index] = sample.mag or waiting
+            indices[sample.sensor].append(index)
         result = list(samples)
-        for sensor, own in places.items():
+        for sensor, rows in indices.items():
             quats = self._orient_sensor(
-                sensor, [samples[place] for place in own], [fields[place] for place in own]
+                sensor, [samples[index] for index in rows], [fields[index] for index in rows]
             )
-            for place, (w, x, y, z) in zip(own, quats, strict=True):
-                result[place] = samples[place]._replace(quat=(w, x, y, z))
+            for index, (w, x, y, z) in zip(rows, quats, strict=True):
+                result[index] = samples[index]._replace(quat=(w, x, y, z))
         return result
 
     def _orient_sensor(
         self, sensor: int, samples: Sequence[ImuSample], fields: Sequence[Vector3 | None]
     ) -> list[list[float]]:
-        own = self._filters.get(sensor)
-        if own is None:
-            own = self._filters[sensor] = self._spare.pop() if self._spare else self._class(self._settings)
+        filter = self._filters.get(sensor)
+        if filter is None:
+            filter = self._filters[sensor] = self._spare.pop() if self._spare else self._class(self._settings)
         with_field = self._magnetometer and any(field is not None for field in fields)
-        oriented = own.update(
+        oriented = filter.update(
             [sample.time_s for sample in samples],
             np.array([sample.gyr for sample in samples], float),
             np.array([sample.acc for sample in samples], float),
@@ -115,7 +115,7 @@ class OrientationEstimator:
         return quats
 
     def status(self) -> dict[int, SensorStatus]:
-        """State of each sensor that has been oriented."""
+        """Return the state of each sensor that has been oriented."""
         return {
             sensor: SensorStatus(
                 bool(last.rest[-1]),
@@ -128,7 +128,7 @@ class OrientationEstimator:
 
 
 def _by_event(counts: Iterable[tuple[int, int]]) -> dict[Event, int]:
-    """Counts by event of counts by combination of events."""
+    """Convert counts by combination of events to counts by event."""
     result: Counter[Event] = Counter()
     for flags, count in counts:
         result.update({event: count for event in Event if event & flags})

@@ -1,4 +1,4 @@
-"""Which magnetic fields to take a heading from."""
+"""Choice of the magnetic fields that are good enough to take a heading from."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from edgepose.orientation.settings import FilterSettings
 
 
 class _Field:
-    """Strength and dip of a field, averaged."""
+    """Averaged strength and dip of a field."""
 
     def __init__(self, norm: float, dip: float) -> None:
         self.norm, self.dip = norm, dip
@@ -23,7 +23,7 @@ class _Field:
 
 
 class MagneticReference:
-    """Knows the usual field, tells others from it, and takes a new one for the usual one in time.
+    """Learns the usual field, detects disturbances, and adopts a new field as the usual one if it lasts.
 
     Attributes:
         disturbed: whether the field of the last block is not the usual one.
@@ -42,20 +42,20 @@ class MagneticReference:
     def heading(
         self, field: Sequence[float], duration_s: float, rate: float, tilt_var: float
     ) -> tuple[float, float] | None:
-        """Heading error, rad, that the mean field of a block shows, and its variance; None if not to be used.
+        """Return the heading error, rad, shown by a block's mean field, and its variance; None if not usable.
 
         Args:
-            field: as the present orientation turns it to the inertial frame.
+            field: rotated to the inertial frame by the current orientation.
             duration_s: since the last field.
             rate: mean magnitude of the rotation, rad/s.
-            tilt_var: variance of the present tilt about one axis, rad^2.
+            tilt_var: variance of the current tilt about one axis, rad^2.
         """
         s = self._settings
         x, y, z = field
         level = hypot(x, y)
         norm, dip = hypot(level, z), atan2(-z, level)
         usual = self._usual
-        # At first the tilt, and with it the dip, may be so wrong that no field can be told from another.
+        # At first the tilt, and with it the dip, may be too wrong to tell one field from another.
         self._settled |= usual is not None and usual.time_s >= s.mag_first_s
         if usual is None or not (self._settled or self._is_like(usual, norm, dip)):
             usual = self._usual = _Field(norm, dip)
@@ -77,17 +77,17 @@ class MagneticReference:
         if self._settled:
             percent = 100.0 * (norm / usual.norm - 1.0)
             soft += s.mag_soft * (percent**2 + degrees(dip - usual.dip) ** 2)
-        # Errors of fields are alike for a long time: many fields say little more than one.
+        # Field errors are correlated for a long time, so many fields tell little more than one.
         repeats = max(1.0, s.mag_time / duration_s)
         return atan2(x, y), s.mag_heading**2 * repeats * soft + tilt_var * tan(dip) ** 2
 
     def _follow_other(self, usual: _Field, norm: float, dip: float, duration_s: float, rate: float) -> _Field:
-        """Watch the present field; it becomes the usual one if it lasts. Returns the usual one."""
+        """Follow the current field, which becomes the usual one if it lasts; return the usual one."""
         s = self._settings
         if not self._is_like(self._other, norm, dip):
             self._other = _Field(norm, dip)
         elif rate >= s.mag_new_rate:
-            # A sensor that lies beside a magnet would see the same field for ever.
+            # Only while turning: a sensor that lies beside a magnet sees the same field for ever.
             self._other.follow(norm, dip, duration_s, s.mag_reference_s)
         if self.disturbed and self._other.time_s >= s.mag_new_s:
             usual, self._other = self._other, _Field(norm, dip)

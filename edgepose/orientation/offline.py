@@ -1,4 +1,4 @@
-"""Orientations for whole recordings."""
+"""Orientation of whole recordings."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _FILTERS: dict[str, Callable[..., OrientationResult]] = {
 
 
 def orient_recording(recording: Recording, filter: str, name: str = "recording") -> Recording:
-    """The recording with orientations by "kalman", "smoother" or "vqf".
+    """Return the recording with orientations by "kalman", "smoother" or "vqf".
 
-    They take the place of those of the devices in all samples with a rate and a force.
+    They replace the devices' own orientations in all samples with a rate and a force.
 
     Args:
         recording: of any number of sensors.

@@ -1,4 +1,4 @@
-"""Whether a sensor is at rest."""
+"""Detection of rest of one sensor."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class RestDetector:
     Attributes:
         rest: whether the sensor is at rest.
         rate: (3,) mean rate of the last block, rad/s.
-        rate_sigma: what of it may be motion, rad/s: of a person who stands still more than of a table.
+        rate_sigma: part of it that may be motion, rad/s; larger on a person who stands still than on a table.
     """
 
     def __init__(self, settings: FilterSettings) -> None:
@@ -36,32 +36,32 @@ class RestDetector:
         self._rested = False
 
     def restart(self) -> None:
-        """Nothing is known of the time before the next block."""
+        """Forget everything before the next block."""
         self.rest = False
         self._mean = None
         self._still_s = 0.0
 
     def update(self, duration_s: float, gyr: Array, acc: Array, bias: Array, bias_sigma: float) -> None:
-        """Take a block of rates (N, 3) and forces (N, 3) as measured; bias (3,) and its sigma are known."""
+        """Take a block of measured rates (N, 3) and forces (N, 3), the current bias (3,) and its sigma."""
         s = self._settings
-        now = np.hstack([gyr, acc])
-        mean = now.mean(axis=0)
+        measured = np.hstack([gyr, acc])
+        mean = measured.mean(axis=0)
         if self._mean is None:
             self._mean = mean
-        change = (now - self._mean) ** 2
+        change = (measured - self._mean) ** 2
         self.rate = mean[:3]
         sway = float(((mean - self._mean)[:3] ** 2).sum()) / 3.0
         self._mean = self._mean + (1.0 - exp(-duration_s / _MEAN_S)) * (mean - self._mean)
         excess = float(np.linalg.norm(self.rate - bias))
-        longest = s.rest_bias + 3.0 * bias_sigma if self._rested else s.rest_bias_first
+        largest = s.rest_bias + 3.0 * bias_sigma if self._rested else s.rest_bias_first
         still = (
             change[:, :3].sum(axis=1).max() < s.rest_gyr**2
             and change[:, 3:].sum(axis=1).max() < s.rest_acc**2
-            and excess < longest
+            and excess < largest
         )
         self._still_s = self._still_s + duration_s if still else 0.0
         self._sway = sway if not still else self._sway + min(1.0, duration_s / _SWAY_S) * (sway - self._sway)
-        # A sway's rates are alike for about as long as they are averaged.
+        # The rates of swaying are correlated for about as long as they are averaged.
         self.rate_sigma = sqrt(self._sway * max(1.0, _MEAN_S / duration_s))
         self.rest = self._still_s >= s.rest_time
         self._rested |= self.rest

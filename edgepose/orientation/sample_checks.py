@@ -1,4 +1,4 @@
-"""Checks of one sensor's samples before a filter takes them: numbers, stamps, gaps, ends of ranges."""
+"""Checks of one sensor's samples before filtering: numbers, time stamps, gaps, saturation."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ _GAP, _BAD, _STAMP, _SATURATED = (int(e) for e in (Event.GAP, Event.BAD, Event.S
 
 
 class SampleChecker:
-    """What came before the next sample, as far as it says whether that one is good.
+    """Judges each sample of a sensor by the ones before it.
 
     Attributes:
         period_s: usual time between samples.
     """
 
     def __init__(self, settings: FilterSettings) -> None:
-        """Start with no sample seen."""
+        """Create the checker; the first sample starts it."""
         self.period_s = _LONGEST_PERIOD_S
         self._settings = settings
         self._time_s: float | None = None
         self._rate_peak, self._force_peak = _LEAST_PEAK_RATE, _LEAST_PEAK_FORCE
-        self._rate = self._force = 0.0  # largest component of the sample before
+        self._rate = self._force = 0.0  # largest components of the last good sample
 
     def check(self, time_s: float, gyr: Sequence[float], acc: Sequence[float]) -> tuple[int, float]:
-        """Events of a sample, and the time since the last good one, s.
+        """Return the events of a sample, and the time since the last good one, s.
 
-        The time is 0 where the sample is to be left out, inf where there is nothing to go on from: at the
-        first one, after a long gap, and when the clock has begun anew.
+        The time is 0 if the sample is to be skipped, and inf if the filter has to restart: at the first
+        sample, after a long gap, and when the device's clock has restarted.
         """
         rate = max(abs(gyr[0]), abs(gyr[1]), abs(gyr[2]))
         force = max(abs(acc[0]), abs(acc[1]), abs(acc[2]))
-        # Sums, because max() passes over a NaN that is not the first.
+        # Sums, because max() ignores a NaN unless it comes first.
         if not (
             abs(gyr[0]) + abs(gyr[1]) + abs(gyr[2]) < _MAX_RATE
             and abs(acc[0]) + abs(acc[1]) + abs(acc[2]) < _MAX_FORCE
@@ -63,12 +63,12 @@ class SampleChecker:
         self._time_s = time_s
         if step_s > self._settings.gap_periods * self.period_s:
             events |= _GAP
-        # A longer period is learnt slowly: it may be a gap.
+        # The limit keeps gaps from raising the period fast.
         self.period_s += _FOLLOW * (min(step_s, 2.0 * self.period_s, _LONGEST_PERIOD_S) - self.period_s)
         return events, inf if step_s > self._settings.restart_s else step_s
 
     def _saturation(self, rate: float, force: float) -> int:
-        """Whether the largest value so far has come twice running: noise does not do that below the end."""
+        """Check whether the largest value so far came twice in a row: within the range, noise prevents it."""
         end = (rate >= self._rate_peak and rate == self._rate) or (
             force >= self._force_peak and force == self._force
         )
@@ -78,11 +78,11 @@ class SampleChecker:
 
 
 class MagnetometerMonitor:
-    """Whether one sensor's magnetometer speaks.
+    """Detects whether one sensor's magnetometer is present, and when it drops out.
 
     Attributes:
         seen: there was a field.
-        lost: there was one, and it has been too long since.
+        lost: there was a field, but none for too long.
     """
 
     def __init__(self, settings: FilterSettings) -> None:
@@ -92,8 +92,8 @@ class MagnetometerMonitor:
         self._since_s = 0.0
 
     def check(self, dt: float, mag: Sequence[float]) -> bool:
-        """Whether numbers are a field; dt is the time since the sample before, s."""
-        # A sum, for NaN is smaller than nothing.
+        """Return whether `mag` is a valid field; `dt` is the time since the sample before, s."""
+        # Sum, because NaN compares false to everything.
         if 0.0 < abs(mag[0]) + abs(mag[1]) + abs(mag[2]) < _MAX_FIELD:
             self._since_s = 0.0
             self.seen, self.lost = True, False

@@ -1,4 +1,4 @@
-"""Constants of the orientation filter, in physical units: none depends on a sensor's rate."""
+"""Constants of the orientation filter, in physical units; none depends on a sensor's rate."""
 
 from __future__ import annotations
 
@@ -8,50 +8,50 @@ from math import radians
 
 @dataclass(frozen=True)
 class FilterSettings:
-    """What the filter assumes of a sensor that nobody tuned it for; SI units.
+    """Assumptions that suit sensors the filter was not tuned for; SI units.
 
     Attributes:
         block_s: time between corrections, s. Orientations are integrated at every sample.
-        gyr_noise: growth of the orientation's error, rad / sqrt(s).
-        gyr_noise_per_rate: the same in addition for each rad/s of rotation, 1 / sqrt(s).
-        vel_noise: growth of the velocity's error, m/s / sqrt(s).
-        bias_start: what the gyroscope's bias may be at first, one sigma, rad/s.
-        bias_walk: how it changes, rad/s / sqrt(s).
+        gyr_noise: growth of the orientation error, rad / sqrt(s).
+        gyr_noise_per_rate: additional growth for each rad/s of rotation, 1 / sqrt(s).
+        vel_noise: growth of the velocity error, m/s / sqrt(s).
+        bias_start: initial gyroscope bias, one sigma, rad/s.
+        bias_walk: random walk of that bias, rad/s / sqrt(s).
         scale_start: relative error of the gyroscope's scale, one sigma, per axis.
-        scale_walk: how it changes, 1 / sqrt(s).
-        acc_bias_start: what the accelerometer's bias may be, one sigma per axis, m/s^2.
-        acc_bias_walk: how it changes, m/s^2 / sqrt(s).
+        scale_walk: random walk of that error, 1 / sqrt(s).
+        acc_bias_start: initial accelerometer bias, one sigma per axis, m/s^2.
+        acc_bias_walk: random walk of that bias, m/s^2 / sqrt(s).
         tilt_start: error of the tilt taken from the first sample's force, one sigma, rad.
         heading_start: error of the heading taken from the first field, one sigma, rad.
-        vel: how fast the sensor is, one sigma, m/s: a body does not go far in a room.
-        vel_time: how long a velocity lasts, s.
-        rest_gyr: greatest change of the rate at rest, rad/s.
-        rest_acc: greatest change of the force at rest, m/s^2.
-        rest_time: how long both hold before it is rest, s.
-        rest_bias: greatest rate at rest beyond what the known bias explains, rad/s.
-        rest_bias_first: greatest rate at the first rest, when the bias is not known yet, rad/s.
+        vel: speed of the sensor, one sigma, m/s: a body does not go far in a room.
+        vel_time: correlation time of the velocity, s.
+        rest_gyr: largest change of the rate at rest, rad/s.
+        rest_acc: largest change of the force at rest, m/s^2.
+        rest_time: time for which both must hold before the sensor counts as at rest, s.
+        rest_bias: largest rate at rest beyond the known bias, rad/s.
+        rest_bias_first: largest rate at the first rest, when the bias is not yet known, rad/s.
         rest_rate: error of the bias measured in a block at rest, one sigma, rad/s.
         rest_vel: error of a velocity of zero in a block at rest, one sigma, m/s.
-        mag_heading: error of the heading of a good field, one sigma, rad.
-        mag_time: how long such an error lasts, s.
-        mag_norm: relative change of the field's strength that makes it a disturbed one.
-        mag_dip: change of its dip that does, rad.
+        mag_heading: heading error of an undisturbed field, one sigma, rad.
+        mag_time: correlation time of that error, s.
+        mag_norm: relative change of the field's strength above which it counts as disturbed.
+        mag_dip: change of the field's dip above which it counts as disturbed, rad.
         mag_soft: growth of the heading's variance with the square of the change, per percent of strength and
             per degree of dip.
         mag_good_s: time without a disturbance before a field is trusted again, s.
         mag_reference_s: time constant of the undisturbed field's strength and dip, s.
-        mag_first_s: time that a field must have stayed what it is to be the first reference, s.
-        mag_new_s: time after which a field that stays what it is while the sensor turns is the new
+        mag_first_s: time for which a field must have been constant to be the first reference, s.
+        mag_new_s: time after which a field that is constant while the sensor turns becomes the new
             reference, s.
-        mag_new_rate: how fast a sensor must turn for that, rad/s.
-        mag_reject_s: longest time that a disturbed field is not used, s.
+        mag_new_rate: slowest rotation for which that time counts, rad/s.
+        mag_reject_s: longest time for which a disturbed field is ignored, s.
         mag_lost_s: time without a reading after which the magnetometer counts as lost, s.
-        gap_periods: interval between samples, in usual periods, from which on samples are missing.
-        gap_turn: how fast rotation changes unseen in a gap, rad/s^2.
-        gap_acc: acceleration not seen in a gap, m/s^2.
-        restart_s: gap after which the tilt is taken anew from the force, s.
-        lost_share: what is not seen of a rate or a force at the end of its range, as a share of it.
-        shock: force from which on the accelerometer is not believed, m/s^2.
+        gap_periods: interval, in usual sample periods, above which samples count as missing.
+        gap_turn: unseen change of the rate of rotation in a gap, rad/s^2.
+        gap_acc: unseen acceleration in a gap, m/s^2.
+        restart_s: gap after which the tilt is taken from the force again, s.
+        lost_share: unseen part of a rate or a force at the end of its range, as a share of it.
+        shock: force above which the accelerometer is not trusted, m/s^2.
     """
 
     block_s: float = 0.14

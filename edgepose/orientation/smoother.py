@@ -1,4 +1,4 @@
-"""Orientation with the whole recording known: what is found out later corrects what was before."""
+"""Offline orientation: a smoother in which later measurements correct earlier orientations."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def smooth(
     mag: ArrayLike | None = None,
     settings: FilterSettings | None = None,
 ) -> OrientationResult:
-    """Orientations of a whole recording of one sensor, in the frame in which `OrientationFilter` ends.
+    """Estimate all orientations of one sensor's recording, in the final frame of `OrientationFilter`.
 
-    The filter runs once; then errors that were left go back from each correction to the one before
-    (Rauch, Tung and Striebel 1965, on the error state), and in between in proportion. It takes 40 MB for
+    The filter runs once; then the remaining errors are propagated back from each correction to the one before
+    (Rauch, Tung and Striebel 1965, on the error state) and interpolated in between. Memory use is 40 MB for
     each quarter of an hour.
 
     Args:
@@ -35,7 +35,7 @@ def smooth(
         settings: of the filter.
 
     Raises:
-        ValueError: the shapes do not go together.
+        ValueError: the shapes do not match.
     """
     steps: list[Step] = []
     forward = OrientationFilter(settings)
@@ -45,8 +45,8 @@ def smooth(
         return result
     left, sigma = _errors_left(steps)
     quat = rot.quat_multiply(rot.rotvec_to_quat(_by_row(steps, left, len(result.quat))), result.quat)
-    quat = rot.quat_multiply(rot.quat_about_z(_turned_later(steps, len(result.quat))), quat)
-    # What holds at a step holds for the block before it; the rows after the last step have its values.
+    quat = rot.quat_multiply(rot.quat_about_z(_later_frame_rotation(steps, len(result.quat))), quat)
+    # A step's values hold for the block before it; the rows after the last step have that step's values.
     of_row = np.searchsorted([step.row for step in steps], np.arange(len(quat)))
     of_row = np.minimum(of_row, len(steps) - 1)
     bias = np.array([step.bias for step in steps]) + left[:, model.BIAS]
@@ -56,7 +56,7 @@ def smooth(
 
 
 def _errors_left(steps: list[Step]) -> tuple[Array, Array]:
-    """Errors (K, 15) that each step had left, and what the bias's sigma (K, 3) is without them."""
+    """Return the errors (K, 15) that each step left, and the bias's sigma (K, 3) without them."""
     left = np.zeros((len(steps), model.SIZE))
     covariance = steps[-1].covariance
     sigma = np.empty((len(steps), 3))
@@ -74,7 +74,7 @@ def _errors_left(steps: list[Step]) -> tuple[Array, Array]:
 
 
 def _by_row(steps: list[Step], left: Array, count: int) -> Array:
-    """Rotation errors (N, 3) of the filter's orientations, which change within blocks and jump at steps."""
+    """Return rotation errors (N, 3) of the filter's orientations: linear within blocks, jumps at steps."""
     result = np.zeros((count, 3))
     for i, step in enumerate(steps):
         end = left[i, model.TURN]
@@ -87,8 +87,8 @@ def _by_row(steps: list[Step], left: Array, count: int) -> Array:
     return result
 
 
-def _turned_later(steps: list[Step], count: int) -> Array:
-    """Angles (N,) by which the inertial frame of each row was turned after it, rad."""
+def _later_frame_rotation(steps: list[Step], count: int) -> Array:
+    """Return the angles (N,) by which the inertial frame was rotated after each row, rad."""
     turned = np.zeros(count)
     for step in steps:
         turned[: step.row] += step.turned

@@ -1,4 +1,4 @@
-"""Orients samples by a filter, or lets them pass: a station of the walk from samples to frames."""
+"""Pipeline stage that orients samples by a filter, or passes them on unchanged."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ if TYPE_CHECKING:
 
 
 class OrientationStage:
-    """Turns samples into oriented ones as --filter and --no-mag ask for."""
+    """Orients samples as --filter and --no-mag ask for."""
 
     def __init__(self, filter: str, magnetometer: bool) -> None:
-        """No sample has come.
+        """Create the stage.
 
         Args:
             filter: one of FILTERS.
-            magnetometer: use magnetometers, where there are any.
+            magnetometer: use magnetometers, where available.
         """
         self._filter, self._magnetometer = filter, magnetometer
         self._with_north: set[int] = set()
-        self._made: set[int] = set()  # sensors that have been oriented
+        self._oriented: set[int] = set()
         self._orienter: OrientationEstimator | None = None
         if filter != "none":
             from edgepose.orientation.estimator import OrientationEstimator
@@ -32,49 +32,50 @@ class OrientationStage:
 
     @property
     def passes(self) -> bool:
-        """Whether samples pass as they are."""
+        """Whether samples pass unchanged."""
         return self._orienter is None
 
     def fresh(self) -> OrientationStage:
-        """The same, with no sample seen, for another recording."""
+        """Return a new stage with the same settings, for another recording."""
         return OrientationStage(self._filter, self._magnetometer)
 
     @property
     def north(self) -> bool:
-        """Whether all sensors have a heading that counts from north, as far as the samples have shown.
+        """Whether all sensors' headings count from north, as far as the samples have shown.
 
-        What devices with a filter of their own do is not known here: it is taken for granted.
+        For devices with a filter of their own that is unknown and assumed.
         """
         return self._orienter is None or (self._magnetometer and len(self._with_north) == len(PLACEMENTS))
 
     @property
     def mixed(self) -> bool:
-        """Whether some sensors have sent a magnetic field and others none, all being wanted."""
+        """Whether magnetometers are used and only some sensors have sent a magnetic field."""
         return self._magnetometer and 0 < len(self._with_north) < len(PLACEMENTS)
 
     def summary_lines(self) -> list[str]:
-        """What happened to the samples of each sensor, for the end of a run."""
+        """Return one line per sensor with its events, for the end of a run."""
         status = {} if self._orienter is None else self._orienter.status()
         return [
             f"filter   {PLACEMENTS[sensor]}: "
             + ", ".join(
-                f"{count} {str(event.name).lower().replace('_', ' ')}" for event, count in own.events.items()
+                f"{count} {str(event.name).lower().replace('_', ' ')}"
+                for event, count in sensor_status.events.items()
             )
-            for sensor, own in status.items()
-            if own.events
+            for sensor, sensor_status in status.items()
+            if sensor_status.events
         ]
 
     def __call__(self, samples: list[ImuSample]) -> list[ImuSample]:
-        """The samples, oriented; without those of oriented sensors that cannot be."""
+        """Return the samples, oriented; leave out those without orientation from oriented sensors."""
         if self._orienter is None:
             return samples
         if len(self._with_north) < len(PLACEMENTS):
             self._with_north.update(sample.sensor for sample in samples if sample.mag is not None)
         oriented = self._orienter.orient(samples)
-        self._made.update(sample.sensor for sample in oriented if sample.quat is not None)
-        # What only brought a field, or lost its rate on the way, has no orientation to give.
+        self._oriented.update(sample.sensor for sample in oriented if sample.quat is not None)
+        # Samples with only a field, or without a rate, get no orientation.
         return [
             sample
             for sample in oriented
-            if sample.quat is not None or (sample.acc is not None and sample.sensor not in self._made)
+            if sample.quat is not None or (sample.acc is not None and sample.sensor not in self._oriented)
         ]

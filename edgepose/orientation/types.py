@@ -1,4 +1,4 @@
-"""What an orientation filter says of each sample."""
+"""Results of an orientation filter: orientations, and events per sample."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ Array = NDArray[np.float64]
 
 
 class Event(IntFlag):
-    """What was wrong with a sample, as bits of `OrientationResult.flagged`."""
+    """Anomalies of a sample, as bits of `OrientationResult.flagged`."""
 
     GAP = 1
     """Samples are missing before this one."""
     BAD = 2
-    """A number that no sensor measures: NaN, infinite or absurd. The sample is left out."""
+    """A number that no sensor measures: NaN, infinite or absurd. The sample is skipped."""
     STAMP = 4
-    """Not later than the sample before it. Left out, unless the clock has begun anew."""
+    """Not later than the sample before it. Skipped, unless the clock has restarted."""
     SATURATED = 8
     """A rate or a force at the end of its range, or a shock."""
     MAG_LOST = 16
-    """The magnetometer has gone silent: the heading drifts until it is back."""
+    """The magnetometer has dropped out; the heading drifts until it is back."""
     RESTART = 32
-    """The tilt was taken anew from this sample's force, after a long gap."""
+    """The tilt was taken from this sample's force again, after a long gap."""
 
 
 class OrientationResult(NamedTuple):
-    """A row for each sample.
+    """Result of a filter, with one row per sample.
 
     Attributes:
         quat: (N, 4) unit quaternions w, x, y, z, sensor to inertial, Z up. With a magnetometer X is east and
             Y (magnetic) north; without one the heading is 0 at the first sample (`rotations.heading`) and
             drifts. The identity before the first good sample.
         bias: (N, 3) bias of the gyroscope, sensor frame, rad/s.
-        bias_sigma: (N, 3) its standard deviation, rad/s.
+        bias_sigma: (N, 3) standard deviation of the bias, rad/s.
         rest: (N,) bool, the sensor is at rest.
         disturbed: (N,) bool, the magnetic field is not the usual one.
         flagged: (N,) uint8, bits of `Event`.

@@ -1,8 +1,8 @@
-"""VQF (Laidig and Seel, Information Fusion 91, 2023) in the place of the Kalman filter.
+"""VQF (Laidig and Seel, Information Fusion 91, 2023) as an alternative to the Kalman filter.
 
 The `vqf` package has one fixed sampling time. It is measured over the first samples; after that a sample
-counts for as many steps as fit into its interval, its rate scaled so that the angle is that of the real
-interval. VQF's own time constants are as far off as the rate changes after the first samples.
+counts for as many steps as fit into its interval, with its rate scaled so that the angle is that of the real
+interval. If the sample rate changes after the first samples, VQF's time constants are off by the same factor.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from edgepose.orientation.types import Event, OrientationResult
 
 Array = NDArray[np.float64]
 
-_LEARNT = 20  # samples
+_PERIOD_SAMPLES = 20  # over which the sampling time is measured
 _FIRST_PERIOD_S = 0.01
 _MAG_LOST, _RESTART = int(Event.MAG_LOST), int(Event.RESTART)
 
@@ -31,10 +31,10 @@ _Timed = tuple[float, Sequence[float], Sequence[float], Sequence[float] | None] 
 
 
 class VqfFilter:
-    """One sensor; takes and gives what `OrientationFilter` does, with VQF's default parameters."""
+    """VQF for one sensor, with its default parameters and the interface of `OrientationFilter`."""
 
     def __init__(self, settings: FilterSettings | None = None) -> None:
-        """Start with nothing known; of the settings those of gaps, stamps and losses count.
+        """Create the filter; of the settings, only those of gaps, time stamps and dropouts are used.
 
         Raises:
             EdgeposeError: the vqf package is not installed.
@@ -47,11 +47,11 @@ class VqfFilter:
             ) from None
         self._class: Any = VQF
         settings = settings or FilterSettings()
-        self._intake = SampleChecker(settings)
-        self._watch = MagnetometerMonitor(settings)
+        self._checker = SampleChecker(settings)
+        self._magnetometer = MagnetometerMonitor(settings)
         self._period_s = self._mag_period_s = _FIRST_PERIOD_S
-        self._vqf = self._new()
-        self._learning: list[_Timed] | None = []
+        self._vqf = self._new_vqf()
+        self._first_samples: list[_Timed] | None = []
         self._started = False
         self._heading = 0.0  # of VQF's frame without a magnetometer in that of the first sample
         self._quat = np.array([1.0, 0.0, 0.0, 0.0])
@@ -59,10 +59,10 @@ class VqfFilter:
     def update(
         self, time_s: ArrayLike, gyr: ArrayLike, acc: ArrayLike, mag: ArrayLike | None = None
     ) -> OrientationResult:
-        """Orientations of the next samples; arguments as in `OrientationFilter.update`.
+        """Return the orientations of the next samples; arguments as in `OrientationFilter.update`.
 
         Raises:
-            ValueError: the shapes do not go together.
+            ValueError: the shapes do not match.
         """
         rows = [self._take(*sample) for sample in zip(*columns(time_s, gyr, acc, mag), strict=True)]
         count = len(rows)
@@ -79,37 +79,38 @@ class VqfFilter:
     def _take(
         self, time_s: float, gyr: Sequence[float], acc: Sequence[float], mag: Sequence[float]
     ) -> tuple[Array, Array, float, bool, bool, int]:
-        events, dt = self._intake.check(time_s, gyr, acc)
+        events, dt = self._checker.check(time_s, gyr, acc)
         if dt > 0.0:
-            is_field = self._watch.check(0.0 if dt == inf else dt, mag)
+            is_field = self._magnetometer.check(0.0 if dt == inf else dt, mag)
             if dt == inf:
                 events |= _RESTART if self._started else 0
-                self._begin()
+                self._restart()
                 dt = self._period_s
             sample = (dt, gyr, acc, mag if is_field else None)
             self._feed(sample)
-            self._learn(sample)
-            if self._watch.seen:
+            self._measure_period(sample)
+            if self._magnetometer.seen:
                 self._quat = self._vqf.getQuat9D()
             else:
                 self._quat = rot.quat_multiply(rot.quat_about_z(self._heading), self._vqf.getQuat6D())
         bias, sigma = self._vqf.getBiasEstimate()
-        disturbed = self._watch.seen and not self._watch.lost and self._vqf.getMagDistDetected()
-        events |= _MAG_LOST if self._watch.lost else 0
+        has_field = self._magnetometer.seen and not self._magnetometer.lost
+        disturbed = has_field and self._vqf.getMagDistDetected()
+        events |= _MAG_LOST if self._magnetometer.lost else 0
         return self._quat, bias, sigma, self._vqf.getRestDetected(), disturbed, events
 
-    def _begin(self) -> None:
-        """A new VQF, which takes the tilt from the next force, but keeps the bias and the heading."""
+    def _restart(self) -> None:
+        """Start a new VQF, which takes the tilt from the next force but keeps the bias and the heading."""
         if self._started:
-            known = self._vqf.getBiasEstimate()
-            self._vqf = self._new()
-            self._vqf.setBiasEstimate(*known)
+            bias = self._vqf.getBiasEstimate()
+            self._vqf = self._new_vqf()
+            self._vqf.setBiasEstimate(*bias)
             self._heading = float(rot.yaw_of_quat(self._quat))
-            if self._learning is not None:
-                self._learning = []  # what came before is in the heading already
+            if self._first_samples is not None:
+                self._first_samples = []  # the heading includes the earlier samples already
         self._started = True
 
-    def _new(self) -> Any:
+    def _new_vqf(self) -> Any:
         return self._class(self._period_s, magTs=self._mag_period_s)
 
     def _feed(self, sample: _Timed) -> None:
@@ -122,17 +123,17 @@ class VqfFilter:
         if mag is not None:
             self._vqf.updateMag(np.array(mag))
 
-    def _learn(self, sample: _Timed) -> None:
+    def _measure_period(self, sample: _Timed) -> None:
         """Measure the sampling time over the first samples, then run these again with it."""
-        if self._learning is None:
+        if self._first_samples is None:
             return
-        self._learning.append(sample)
-        if len(self._learning) > _LEARNT:
-            first, *others = self._learning
-            self._learning = None
+        self._first_samples.append(sample)
+        if len(self._first_samples) > _PERIOD_SAMPLES:
+            first, *others = self._first_samples
+            self._first_samples = None
             self._period_s = float(np.median([dt for dt, *_ in others]))
             fields = sum(mag is not None for *_, mag in others)
             self._mag_period_s = self._period_s * len(others) / max(fields, 1)
-            self._vqf = self._new()
-            for again in ((self._period_s, *first[1:]), *others):
-                self._feed(again)
+            self._vqf = self._new_vqf()
+            for repeated in ((self._period_s, *first[1:]), *others):
+                self._feed(repeated)

@@ -1,4 +1,4 @@
-"""Whose body moves the sensors: of a height, weight and shape in words, and where sensors sit on it."""
+"""Bodies from height, weight and shape words, and the positions of sensors on them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ WORDS = {
 """Words for a body's shape: the change in `shapes.json` and its sign."""
 
 BMI_RANGE = (14.0, 50.0)
-"""kg/m^2 of wearers; others are slips, mostly pounds given for kilograms."""
+"""Plausible body mass indices, kg/m^2; values outside are mistakes, mostly pounds instead of kilograms."""
 
 
 @cache
@@ -42,16 +42,16 @@ def shaped_body(
     weight_kg: float | None = None,
     words: Sequence[str] = (),
 ) -> Body:
-    """An average body changed by weight and words (SIP-BW, SIP 5.1).
+    """Return an average body changed by weight and words (SIP-BW, SIP 5.1).
 
     Args:
-        height_m: stature, metres, which weight and words leave as it is.
+        height_m: stature, metres; weight and words do not change it.
         sex: "neutral", "male" or "female".
-        weight_kg: the average for the stature when None.
-        words: of WORDS; one given twice counts twice.
+        weight_kg: None means the average for the stature.
+        words: of WORDS; a repeated word counts twice.
 
     Raises:
-        EdgeposeError: a stature or weight that no wearer has, or an unknown sex or word.
+        EdgeposeError: an implausible stature or weight, or an unknown sex or word.
     """
     body, shapes = default_body(height_m, sex), _shapes()
     changes: list[tuple[dict[str, Any], float]] = []
@@ -59,10 +59,10 @@ def shaped_body(
         bmi = weight_kg / height_m**2
         if not BMI_RANGE[0] <= bmi <= BMI_RANGE[1]:  # also true of NaN
             raise EdgeposeError(
-                f"{weight_kg:g} kg at {height_m:g} m: give the wearer's weight in kilograms without sensors"
+                f"{weight_kg:g} kg at {height_m:g} m: give the wearer's weight in kilograms, without sensors"
             )
-        known = shapes["weights"][sex]
-        changes.append((known, bmi - known["bmi"]))
+        average = shapes["weights"][sex]
+        changes.append((average, bmi - average["bmi"]))
     for word in words:
         if word not in WORDS:
             raise EdgeposeError(f"unknown word {word!r} for a shape: use some of {', '.join(WORDS)}")
@@ -77,14 +77,14 @@ def shaped_body(
 
 
 def scaled(body: Body, scale: float) -> Body:
-    """A body with all lengths times `scale` (1.1 makes SIP-110)."""
+    """Scale all lengths of a body (by 1.1 for SIP-110)."""
     return Body(scale * body.offsets, scale * body.sensors, scale * body.height_m)
 
 
 def sensor_points(body: Body, names: Sequence[str]) -> SensorPoints:
-    """Sensors on a body, by bone.
+    """Return the sensors' points on a body, by bone.
 
-    The six placements have points on the skin; others are taken to sit in the middle of their bone.
+    The six placements have points on the skin; other sensors are assumed in the middle of their bone.
     """
     offsets = body.offsets.copy()
     offsets[0] = 0.0
@@ -96,5 +96,5 @@ def sensor_points(body: Body, names: Sequence[str]) -> SensorPoints:
 
 
 def _next(joint: int) -> int:
-    """The joint at the far end of a bone; of the chest, towards the neck."""
+    """Return the joint at the far end of a bone; for the chest, the one towards the neck."""
     return PARENTS.index(joint)

@@ -1,4 +1,4 @@
-"""The terms of SIP's energy (eq. 9) and their derivatives, all frames of a sequence at once."""
+"""Terms of SIP's energy (eq. 9) and their derivatives, for all frames of a sequence at once."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ class Weights(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """What poses are to explain, and how they are described.
+    """Measurements that poses have to explain, and the parameterisation of the poses.
 
     Attributes:
         rig: parameters of a pose and their prior.
-        body: where the sensors sit.
+        body: positions of the sensors on it.
         orientation: (T, N, 3, 3) measured R_TB.
         acceleration: (T, N, 3) measured in T without gravity, m/s^2.
-        valid: (T, N) float, 1 where the acceleration counts; the first and last frame never do.
+        valid: (T, N) float, 1 where the acceleration counts; in the first and last frame it never does.
         rate: frames a second.
         weights: of the terms.
     """
@@ -67,15 +67,15 @@ class Costs(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """Residuals at some parameters, and what their derivatives are made of.
+    """Residuals and costs at some parameters.
 
     Attributes:
-        posed: sensors of the posed body.
-        turn: (T, N, 3) orientation residuals, rad (SIP eq. 11).
-        pull: (T, N, 3) acceleration residuals, m/s^2 (SIP eq. 16), see `project`.
-        apart: (T, P - 3) L (x - mean), the residual of the prior (SIP eq. 30).
-        beyond: (T, P - 3) how far each parameter is out of its limits, rad (SIP eq. 19).
-        costs: of all of these.
+        states: sensors of the posed body, from which derivatives are computed.
+        orientation_residual: (T, N, 3) rad (SIP eq. 11).
+        acceleration_residual: (T, N, 3) m/s^2 (SIP eq. 16), see `project`.
+        prior_residual: (T, P - 3) L (x - mean) (SIP eq. 30).
+        limit_residual: (T, P - 3) excess of each parameter over its limits, rad (SIP eq. 19).
+        costs: of all residuals.
     """
 
     states: SensorStates
@@ -87,10 +87,10 @@ class Evaluation(NamedTuple):
 
 
 def project(values: Array, valid: Array) -> Array:
-    """Values (T, N, ...) without their mean over the sensors that count in each frame; zero for the others.
+    """Subtract from values (T, N, ...) their mean over each frame's valid sensors; zero for the others.
 
-    The body's translation accelerates all sensors alike, is free, and so takes any common part of their
-    residuals away. Leaving that part out is minimising over the translation in closed form.
+    The body's translation is free and accelerates all sensors alike, so it absorbs any common part of their
+    residuals. Subtracting that part minimises over the translation in closed form.
     """
     shape = (*valid.shape, *(1,) * (values.ndim - 2))
     weights = valid.reshape(shape)
@@ -99,43 +99,45 @@ def project(values: Array, valid: Array) -> Array:
 
 
 def second_difference(positions: Array, rate: float) -> Array:
-    """Accelerations (T, ...) of positions (T, ...) by SIP eq. 14; zero in the first and last frame."""
+    """Return accelerations (T, ...) of positions (T, ...) by SIP eq. 14; zero in the first and last frame."""
     result = np.zeros_like(positions)
     result[1:-1] = (positions[2:] - 2.0 * positions[1:-1] + positions[:-2]) * rate**2
     return result
 
 
 def evaluate(problem: Problem, parameters: Array) -> Evaluation:
-    """Residuals and costs at parameters (T, P)."""
+    """Compute residuals and costs at parameters (T, P)."""
     rig, weights = problem.rig, problem.weights
-    posed = pose_sensors(coordinates(rig, parameters), problem.body)
-    turn = rot.matrix_to_rotvec(posed.orientation @ rot.transpose(problem.orientation))
-    pull = project(second_difference(posed.position, problem.rate) - problem.acceleration, problem.valid)
-    inner = parameters[:, 3:]
-    apart = (inner - rig.mean) @ rig.root.T
-    beyond = np.minimum(inner - rig.lower, 0.0) + np.maximum(inner - rig.upper, 0.0)
-    sensors = turn.shape[1]
-    costs = Costs(
-        weights.ori / sensors * np.sum(turn**2, axis=(1, 2)),
-        weights.acc / sensors * np.sum(pull**2, axis=(1, 2)),
-        weights.anthro * weights.mahal * np.sum(apart**2, axis=1),
-        weights.anthro * weights.limits * np.sum(beyond**2, axis=1),
+    states = pose_sensors(coordinates(rig, parameters), problem.body)
+    orientation = rot.matrix_to_rotvec(states.orientation @ rot.transpose(problem.orientation))
+    acceleration = project(
+        second_difference(states.position, problem.rate) - problem.acceleration, problem.valid
     )
-    return Evaluation(posed, turn, pull, apart, beyond, costs)
+    inner = parameters[:, 3:]
+    prior = (inner - rig.mean) @ rig.root.T
+    limits = np.minimum(inner - rig.lower, 0.0) + np.maximum(inner - rig.upper, 0.0)
+    sensors = orientation.shape[1]
+    costs = Costs(
+        weights.ori / sensors * np.sum(orientation**2, axis=(1, 2)),
+        weights.acc / sensors * np.sum(acceleration**2, axis=(1, 2)),
+        weights.anthro * weights.mahal * np.sum(prior**2, axis=1),
+        weights.anthro * weights.limits * np.sum(limits**2, axis=1),
+    )
+    return Evaluation(states, orientation, acceleration, prior, limits, costs)
 
 
 def frame_system(problem: Problem, evaluation: Evaluation) -> tuple[Array, Array]:
-    """Normal equations of the terms that know one frame each: (T, P, P) matrices, (T, P) gradients.
+    """Return the normal equations of the single-frame terms: (T, P, P) matrices, (T, P) gradients.
 
     Gauss-Newton's approximation; half the second and first derivatives of the costs.
     """
     rig, weights = problem.rig, problem.weights
-    # e(x + d) = log(exp(J d) R_est R^-1): exact, where SIP eq. 24 takes the inverse Jacobian for one.
-    turns = rot.inverse_left_jacobian(evaluation.orientation_residual) @ _rows(
+    # e(x + d) = log(exp(J d) R_est R^-1), exactly; SIP eq. 24 approximates the inverse Jacobian by identity.
+    rotations = rot.inverse_left_jacobian(evaluation.orientation_residual) @ _rows(
         orientation_jacobian(evaluation.states, problem.body)
     )
-    jacobian = _on_rig(rig, turns)
-    scaled = weights.ori / turns.shape[1] * np.swapaxes(jacobian, 1, 2)
+    jacobian = _on_rig(rig, rotations)
+    scaled = weights.ori / rotations.shape[1] * np.swapaxes(jacobian, 1, 2)
     matrix = scaled @ jacobian
     gradient = (scaled @ evaluation.orientation_residual.reshape(len(jacobian), -1, 1))[..., 0]
     mahal, limits = weights.anthro * weights.mahal, weights.anthro * weights.limits
@@ -147,7 +149,7 @@ def frame_system(problem: Problem, evaluation: Evaluation) -> tuple[Array, Array
 
 
 def sensor_movement(problem: Problem, evaluation: Evaluation) -> Array:
-    """Jacobian (T, 3 N, P) of the sensors' positions from the pelvis, metres."""
+    """Return the Jacobian (T, 3 N, P) of the sensors' positions relative to the pelvis, metres."""
     return _on_rig(problem.rig, _rows(position_jacobian(evaluation.states, problem.body)))
 
 
@@ -156,6 +158,6 @@ def _rows(jacobian: Array) -> Array:
 
 
 def _on_rig(rig: PoseParameterisation, jacobian: Array) -> Array:
-    """(T, 3 N, P) of a Jacobian (T, N, 3, 72) by exponential coordinates."""
+    """Convert a Jacobian (T, N, 3, 72) by exponential coordinates to one (T, 3 N, P) by parameters."""
     frames, sensors = jacobian.shape[:2]
     return (jacobian.reshape(-1, jacobian.shape[-1]) @ rig.basis).reshape(frames, 3 * sensors, -1)

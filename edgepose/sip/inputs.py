@@ -1,4 +1,4 @@
-"""What `edgepose solve` reads: a recording of any sensors, with orientations, and how they are mounted."""
+"""Inputs of `edgepose solve`: a recording of any sensors with orientations, and the sensors' mounting."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ DEFAULT_HOLD_S = 4.0
 
 
 def read(path: Path, calibration: Calibration) -> Recording:
-    """A recording of any sensors of SITES, its orientations made as the calibration says.
+    """Read a recording of any sensors of SITES, with orientations from the calibration's filter.
 
     Raises:
-        EdgeposeError: no such recording, or one of which no orientations can be made.
+        EdgeposeError: no such recording, or it allows no orientations.
     """
     recording = read_sensors(path, tuple(SITES))
     if not recording.sensors:
@@ -29,8 +29,8 @@ def read(path: Path, calibration: Calibration) -> Recording:
     others = [name for name in recording.sensors if name not in PLACEMENTS]
     if others:
         raise EdgeposeError(
-            f"{path}: the calibration was made with --filter {calibration.filter}, which takes the six "
-            f"placements only, and there is {', '.join(others)}; use orientations that the sensors send"
+            f"{path}: the calibration was made with --filter {calibration.filter}, which takes only the six "
+            f"placements, but the recording has {', '.join(others)}; use orientations that the sensors send"
         )
     from edgepose.orientation import OrientationEstimator
 
@@ -44,14 +44,14 @@ def read(path: Path, calibration: Calibration) -> Recording:
 def mounted(
     path: Path, recording: Recording, calibration: Calibration, hold_from_s: float | None
 ) -> dict[str, SensorMount]:
-    """How each sensor of a recording is mounted, by name.
+    """Return the mounting of each sensor of a recording, by name.
 
-    The calibration knows the six placements. Others are taken from the calibration's pose, which the wearer
-    holds in this recording: at `hold_from_s` on its clock, or, if the calibration was made from this very
-    file, where that was.
+    The calibration knows the six placements. Mountings of other sensors come from the calibration's pose,
+    which the wearer holds in this recording: at `hold_from_s` on its clock, or, if the calibration was made
+    from this very file, at the time of its hold.
 
     Raises:
-        EdgeposeError: it is not known when the pose was held, or a sensor said too little then.
+        EdgeposeError: the time of the hold is unknown, or a sensor has too few samples in it.
     """
     known = {name: mount for name, mount in mounts(calibration).items() if name in recording.sensors}
     others = [name for name in recording.sensors if name not in known]
@@ -64,8 +64,8 @@ def mounted(
         start = _number(about.get("from_s"))
     if start is None:
         raise EdgeposeError(
-            f"{path}: the calibration does not know {', '.join(others)}; say with --hold-from from when the "
-            f"wearer holds its {calibration.pose} pose in this recording"
+            f"{path}: the calibration does not know {', '.join(others)}; say with --hold-from when the "
+            f"wearer starts to hold its {calibration.pose} pose in this recording"
         )
     return known | mounts_from_hold(recording, calibration, others, start, start + seconds)
 

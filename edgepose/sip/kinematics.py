@@ -1,7 +1,7 @@
-"""Where sensors are and how they are turned on a posed body, and how that changes with the pose.
+"""Positions and orientations of sensors on a posed body, and their derivatives by the pose.
 
 A pose is 24 x 3 exponential coordinates, each joint against its parent, joint 0 against the body frame T. The
-pelvis stays at the origin: translation is found afterwards, see `edgepose.sip.translation`.
+pelvis stays at the origin; `edgepose.sip.translation` estimates the translation afterwards.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ JOINT_COUNT = len(PARENTS)
 
 
 def _ancestors() -> NDArray[np.bool_]:
-    """(24, 24) bool: whether joint j turns bone b, at [b, j]."""
+    """Return (24, 24) bool: whether joint j rotates bone b, at [b, j]."""
     mask = np.eye(JOINT_COUNT, dtype=bool)
     for joint, parent in enumerate(PARENTS[1:], start=1):
         mask[joint] |= mask[parent]
@@ -28,15 +28,15 @@ def _ancestors() -> NDArray[np.bool_]:
 
 
 TURNS = _ancestors()
-"""Whether joint j turns bone b, at [b, j]: j is b or lies between b and the pelvis."""
+"""Whether joint j rotates bone b, at [b, j]: j is b or lies between b and the pelvis."""
 
 
 class SensorPoints(NamedTuple):
-    """Where sensors sit on a body.
+    """Positions of sensors on a body.
 
     Attributes:
         offsets: (24, 3) joint position minus its parent's in the zero pose, metres; row 0 is zero.
-        bones: (N,) SMPL joint whose bone carries each sensor.
+        bones: (N,) SMPL joint of each sensor's bone.
         points: (N, 3) sensor position minus that joint's, in the bone's frame, metres.
     """
 
@@ -52,7 +52,7 @@ class SensorStates(NamedTuple):
         orientation: (T, N, 3, 3) R_TB of the bones that carry sensors.
         position: (T, N, 3) sensors, from the pelvis, metres.
         joints: (T, 24, 3) positions of joints from the pelvis, metres.
-        axes: (T, 24, 3, 3) turn of T's vectors, rad, for a change of each joint's exponential coordinates.
+        axes: (T, 24, 3, 3) rotation in T, rad, per change of each joint's exponential coordinates.
     """
 
     orientation: Array
@@ -62,25 +62,25 @@ class SensorStates(NamedTuple):
 
 
 def pose_sensors(angles: Array, body: SensorPoints) -> SensorStates:
-    """Sensors of a body in poses (T, 24, 3) of exponential coordinates (SIP eq. 5, 15)."""
+    """Compute the sensors of a body in poses (T, 24, 3) of exponential coordinates (SIP eq. 5, 15)."""
     rotations, joints = forward_kinematics(rot.rotvec_to_matrix(angles), body.offsets)
     axes = rot.left_jacobian(angles)
-    # A joint's axes turn with its parent; the pelvis has none.
+    # A joint's axes rotate with its parent; the pelvis has none.
     axes[:, 1:] = rotations[:, list(PARENTS[1:])] @ axes[:, 1:]
     bones = rotations[:, body.bones]
     return SensorStates(bones, joints[:, body.bones] + (bones @ body.points[..., None])[..., 0], joints, axes)
 
 
 def orientation_jacobian(posed: SensorStates, body: SensorPoints) -> Array:
-    """Turn of each sensor in T for a change of the pose: (T, N, 3, 24, 3), rad (SIP eq. 24)."""
+    """Return the rotation of each sensor in T per change of the pose: (T, N, 3, 24, 3), rad (SIP eq. 24)."""
     mask = TURNS[body.bones].astype(float)
     return np.moveaxis(posed.axes, 1, 2)[:, None] * mask[:, None, :, None]
 
 
 def position_jacobian(posed: SensorStates, body: SensorPoints) -> Array:
-    """Movement of each sensor from the pelvis for a change of the pose: (T, N, 3, 24, 3), m (SIP eq. 27)."""
+    """Return each sensor's motion against the pelvis per change of the pose: (T, N, 3, 24, 3), m (eq. 27)."""
     mask = TURNS[body.bones].astype(float)
     levers = (posed.position[:, :, None] - posed.joints[:, None]) * mask[..., None]
     x, y, z = np.moveaxis(levers, -1, 0)[..., None]  # (T, N, 24, 1) each
-    ax, ay, az = np.moveaxis(posed.axes, 2, 0)[:, :, None]  # (T, 1, 24, 3): component of all three axes
+    ax, ay, az = np.moveaxis(posed.axes, 2, 0)[:, :, None]  # (T, 1, 24, 3): components of all three axes
     return np.stack([ay * z - az * y, az * x - ax * z, ax * y - ay * x], axis=2)

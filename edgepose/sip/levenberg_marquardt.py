@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt for SOP, frame by frame, and for SIP, all frames of a sequence at once (SIP 4.4)."""
+"""Levenberg-Marquardt solvers: SOP for each frame, SIP for all frames of a sequence at once (SIP 4.4)."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ from edgepose.skeleton import forward_kinematics
 Array = NDArray[np.float64]
 
 SOP_EVALUATIONS = 15
-"""Cost evaluations of SOP, each of all frames."""
+"""Largest number of cost evaluations of SOP, each of all frames."""
 
 SIP_EVALUATIONS = 30
-"""Cost evaluations of SIP at most; the paper's timing is of 20."""
+"""Largest number of cost evaluations of SIP; the paper's timing is of 20."""
 
 ENOUGH = 1e-4
-"""A smaller relative decrease of the cost ends the search."""
+"""Relative decrease of the cost below which the search ends."""
 
 _START, _LEAST, _MOST = 1e-3, 1e-6, 1e3  # damping
 _DOWN, _UP = 0.2, 5.0
 
 OnStep = Callable[[int, float], None]
-"""Told the number of cost evaluations so far and the mean cost a frame."""
+"""Called with the number of cost evaluations so far and the mean cost per frame."""
 
 
 class Minimum(NamedTuple):
-    """Where a search ended.
+    """Result of a search.
 
     Attributes:
         parameters: (T, P) of the problem's rig.
-        evaluation: residuals there.
-        evaluations: of the cost.
+        evaluation: residuals at these parameters.
+        evaluations: number of cost evaluations.
     """
 
     parameters: Array
@@ -55,26 +55,26 @@ class Minimum(NamedTuple):
 
 
 def orientation_poser(problem: Problem, on_step: OnStep = lambda count, cost: None) -> Minimum:
-    """SOP: the poses that explain orientations and are human, each frame for itself."""
+    """Run SOP: find human poses that explain the orientations, each frame on its own."""
     problem = problem._replace(weights=problem.weights._replace(acc=0.0))
     parameters = _start(problem)
-    here = evaluate(problem, parameters)
-    cost = _by_frame(here)
+    current = evaluate(problem, parameters)
+    cost = _by_frame(current)
     damping = np.full(len(parameters), _START)
     for count in range(1, SOP_EVALUATIONS + 1):
-        matrix, gradient = frame_system(problem, here)
+        matrix, gradient = frame_system(problem, current)
         step = np.linalg.solve(_damped(matrix, damping), -gradient[..., None])[..., 0]
         trial = _wrapped(parameters + step)
-        there = evaluate(problem, trial)
-        better = _by_frame(there) < cost
+        at_trial = evaluate(problem, trial)
+        better = _by_frame(at_trial) < cost
         parameters, before = np.where(better[:, None], trial, parameters), cost
-        here = there if better.all() else evaluate(problem, parameters)
-        cost = _by_frame(here)
+        current = at_trial if better.all() else evaluate(problem, parameters)
+        cost = _by_frame(current)
         damping = np.clip(damping * np.where(better, _DOWN, _UP), _LEAST, _MOST)
         on_step(count, float(cost.mean()))
         if before.sum() - cost.sum() <= 1e-2 * ENOUGH * before.sum() and better.any():
             break
-    return Minimum(parameters, here, count)
+    return Minimum(parameters, current, count)
 
 
 def inertial_poser(
@@ -83,37 +83,37 @@ def inertial_poser(
     evaluations: int = SIP_EVALUATIONS,
     on_step: OnStep = lambda count, cost: None,
 ) -> Minimum:
-    """SIP: the poses of all frames that explain orientations and accelerations and are human.
+    """Run SIP: find human poses of all frames that explain the orientations and accelerations.
 
     Args:
         problem: to solve.
         start: (T, P) parameters, those of `orientation_poser`.
-        evaluations: of the cost at most.
-        on_step: told of every evaluation.
+        evaluations: largest number of cost evaluations.
+        on_step: called after every evaluation.
     """
-    parameters, here = start, evaluate(problem, start)
-    cost, damping = here.costs.total, _START
+    parameters, current = start, evaluate(problem, start)
+    cost, damping = current.costs.total, _START
     system = None
     count = 1
     while count < evaluations and damping < _MOST:
-        system = system or (*frame_system(problem, here), sensor_movement(problem, here))
-        trial = _wrapped(parameters + _joint_step(problem, here, *system, damping))
-        there = evaluate(problem, trial)
+        system = system or (*frame_system(problem, current), sensor_movement(problem, current))
+        trial = _wrapped(parameters + _joint_step(problem, current, *system, damping))
+        at_trial = evaluate(problem, trial)
         count += 1
-        gain = cost - there.costs.total
-        if gain > 0.0:  # not so for NaN either
-            parameters, here, cost, system = trial, there, there.costs.total, None
+        gain = cost - at_trial.costs.total
+        if gain > 0.0:  # false for NaN
+            parameters, current, cost, system = trial, at_trial, at_trial.costs.total, None
             damping = max(damping * _DOWN, _LEAST)
         else:
             damping *= _UP
         on_step(count, cost / len(parameters))
         if 0.0 <= gain <= ENOUGH * cost:
             break
-    return Minimum(parameters, here, count)
+    return Minimum(parameters, current, count)
 
 
 def _start(problem: Problem) -> Array:
-    """The mean pose, turned so that the sensor nearest to the pelvis is as measured; (T, P)."""
+    """Return the mean pose (T, P), rotated so that the sensor nearest to the pelvis is as measured."""
     rig, bones = problem.rig, problem.body.bones
     parameters = np.zeros((len(problem.orientation), rig.basis.shape[1]))
     parameters[:, 3:] = rig.mean
@@ -133,7 +133,7 @@ def _damped(matrix: Array, damping: Array | float) -> Array:
 
 
 def _wrapped(parameters: Array) -> Array:
-    """The same poses with the pelvis' turn at most pi; its coordinates are singular at twice that."""
+    """Limit the pelvis rotation to pi without changing the pose: its coordinates are singular at 2 pi."""
     angle = np.linalg.norm(parameters[:, :3], axis=1, keepdims=True)
     over = angle > np.pi
     parameters[:, :3] *= np.where(over, 1.0 - 2.0 * np.pi / np.where(over, angle, 1.0), 1.0)
@@ -141,14 +141,14 @@ def _wrapped(parameters: Array) -> Array:
 
 
 def _joint_step(
-    problem: Problem, here: Evaluation, matrix: Array, gradient: Array, movement: Array, damping: float
+    problem: Problem, current: Evaluation, matrix: Array, gradient: Array, movement: Array, damping: float
 ) -> Array:
-    """Change of all parameters (T, P) that solves the damped normal equations (SIP eq. 31, 32).
+    """Return the change of all parameters (T, P) that solves the damped normal equations (SIP eq. 31, 32).
 
-    Accelerations join frames through the 3 N positions of the sensors only. With D the block-diagonal
+    Accelerations couple frames only through the 3 N positions of the sensors. With D the block-diagonal
     matrix of the other terms, G the Jacobian of the acceleration residuals r and w their weight,
     (D + w G^T G) d = -(g + w G^T r) is d = -D^-1 (g + G^T m) with (1 / w + G D^-1 G^T) m = r - G D^-1 g, a
-    band of 3 N numbers a frame instead of P.
+    banded system with 3 N unknowns per frame instead of P.
     """
     frames, rows, _ = movement.shape
     sensors = rows // 3
@@ -157,41 +157,41 @@ def _joint_step(
     spread, moved = movement @ solved[..., :-1], movement @ solved[..., -1:]
 
     def residual(values: Array) -> Array:
-        """Acceleration residuals that movements (T, 3 N, K) of the sensors make."""
+        """Return the acceleration residuals caused by movements (T, 3 N, K) of the sensors."""
         shaped = second_difference(values, problem.rate).reshape(frames, sensors, -1)
         return project(shaped, problem.valid).reshape(values.shape)
 
-    right = here.acceleration_residual.reshape(frames, rows, 1) - residual(moved)
+    right = current.acceleration_residual.reshape(frames, rows, 1) - residual(moved)
     band = _band(spread, problem.valid, problem.rate, problem.weights.acc / sensors)
     from scipy.linalg import solveh_banded
 
-    pushed = solveh_banded(band, right.ravel(), overwrite_ab=True, lower=True, check_finite=False)
-    pushed = project(pushed.reshape(frames, sensors, 3), problem.valid).reshape(frames, rows)
+    dual = solveh_banded(band, right.ravel(), overwrite_ab=True, lower=True, check_finite=False)
+    dual = project(dual.reshape(frames, sensors, 3), problem.valid).reshape(frames, rows)
     # The transpose of a second difference that is zero at both ends.
-    pushed[[0, -1]] = 0.0
-    padded = np.pad(pushed, ((1, 1), (0, 0)))
+    dual[[0, -1]] = 0.0
+    padded = np.pad(dual, ((1, 1), (0, 0)))
     force = (padded[2:] - 2.0 * padded[1:-1] + padded[:-2]) * problem.rate**2
     return -(solved[..., -1] + (solved[..., :-1] @ force[..., None])[..., 0])
 
 
 def _band(spread: Array, valid: Array, rate: float, weight: float) -> Array:
-    """1 / weight + G D^-1 G^T in lower banded storage (9 N, 3 N T), of J D^-1 J^T (T, 3 N, 3 N)."""
+    """Return 1 / weight + G D^-1 G^T in lower banded storage (9 N, 3 N T) from J D^-1 J^T (T, 3 N, 3 N)."""
     frames, rows, _ = spread.shape
     sensors = rows // 3
     counts = np.maximum(valid.sum(axis=1), 1.0)
-    # The matrix of `project`, symmetric.
-    keep = valid[:, :, None] * (np.eye(sensors) - valid[:, None] / counts[:, None, None])
-    keep = np.einsum("tmn,ij->tminj", keep, np.eye(3)).reshape(frames, rows, rows)
-    keep[[0, -1]] = 0.0
+    # The symmetric matrix of `project`.
+    projection = valid[:, :, None] * (np.eye(sensors) - valid[:, None] / counts[:, None, None])
+    projection = np.einsum("tmn,ij->tminj", projection, np.eye(3)).reshape(frames, rows, rows)
+    projection[[0, -1]] = 0.0
     spread = spread * rate**4
     diagonal = 4.0 * spread
     diagonal[1:] += spread[:-1]
     diagonal[:-1] += spread[1:]
-    next_one = -2.0 * (spread[1:] + spread[:-1])
+    next_frame = -2.0 * (spread[1:] + spread[:-1])
     columns = np.zeros((frames, 3 * rows, rows))
-    columns[:, :rows] = keep @ diagonal @ keep + np.eye(rows) / weight
-    columns[:-1, rows : 2 * rows] = keep[1:] @ next_one @ keep[:-1]
-    columns[:-2, 2 * rows :] = keep[2:] @ spread[1:-1] @ keep[:-2]
+    columns[:, :rows] = projection @ diagonal @ projection + np.eye(rows) / weight
+    columns[:-1, rows : 2 * rows] = projection[1:] @ next_frame @ projection[:-1]
+    columns[:-2, 2 * rows :] = projection[2:] @ spread[1:-1] @ projection[:-2]
     band = np.zeros((3 * rows, frames, rows))
     for column in range(rows):
         band[: 3 * rows - column, :, column] = columns[:, column:, column].T

@@ -1,8 +1,7 @@
-"""From a recording of any 3 to 17 sensors to bones and accelerations at a fixed rate, in the body frame.
+"""Bones and accelerations in the body frame at a fixed rate, from a recording of any 3 to 17 sensors.
 
-Unlike the frames of a live run, which know nothing of the future, acceleration here is taken about a frame's
-instant: what the second difference of a sensor's positions at frames (SIP eq. 14) sees of it, neither sooner
-nor later.
+Unlike in a live run, where the future is unknown, acceleration is averaged symmetrically about each frame: it
+is what the second difference of a sensor's positions at frames (SIP eq. 14) measures, without delay.
 """
 
 from __future__ import annotations
@@ -23,23 +22,23 @@ from edgepose.skeleton import JOINTS
 Array = NDArray[np.float64]
 
 FEWEST, MOST = 3, len(SITES)
-"""Numbers of sensors that a pose can be found from."""
+"""Smallest and largest number of sensors."""
 
-_HOLD_PERIODS = 2.5  # as frames do, see `pipeline.frame_synchronizer`
+_HOLD_PERIODS = 2.5  # as in `pipeline.frame_synchronizer`
 _LEAST_HOLD = 10  # samples
 
 
 class Measurements(NamedTuple):
-    """What N sensors say of T frames.
+    """Measurements of N sensors at T frames.
 
     Attributes:
         names: of the sensors.
         time_s: (T,) on the recording's clock, seconds.
         rate: frames a second.
-        orientation: (T, N, 3, 3) R_TB, between samples along the shorter arc.
+        orientation: (T, N, 3, 3) R_TB, interpolated between samples along the shorter arc.
         acceleration: (T, N, 3) in T without gravity, m/s^2.
-        valid: (T, N) bool: the acceleration was measured and not bridged.
-        held: (T, N) bool: no sample is near, the orientation is bridged.
+        valid: (T, N) bool: the acceleration was measured, not interpolated over a gap.
+        held: (T, N) bool: no sample is near; the orientation is interpolated over a gap.
     """
 
     names: tuple[str, ...]
@@ -52,12 +51,12 @@ class Measurements(NamedTuple):
 
     @property
     def bones(self) -> NDArray[np.int_]:
-        """(N,) SMPL joints whose bones carry the sensors."""
+        """SMPL joints (N,) of the sensors' bones."""
         return np.array([SITES[name] for name in self.names])
 
 
 class SensorMount(NamedTuple):
-    """How one sensor's readings become a bone's: R_TB = body_from_inertial R_IS inverse(bone_from_sensor).
+    """Mapping from one sensor's readings to a bone: R_TB = body_from_inertial R_IS inverse(bone_from_sensor).
 
     Attributes:
         body_from_inertial: (3, 3) R_TI of this sensor's inertial frame, its heading reset.
@@ -69,7 +68,7 @@ class SensorMount(NamedTuple):
 
 
 def mounts(calibration: Calibration) -> dict[str, SensorMount]:
-    """Mounts of the six sensors that a calibration knows, by placement."""
+    """Return the mounts of the six sensors that a calibration knows, by placement."""
     r_ti = rot.quat_to_matrix(calibration.body_from_inertial)
     left = r_ti @ rot.quat_to_matrix(rot.quat_about_z(calibration.heading_offset))
     right = rot.quat_to_matrix(calibration.bone_from_sensor)
@@ -79,11 +78,11 @@ def mounts(calibration: Calibration) -> dict[str, SensorMount]:
 def mounts_from_hold(
     recording: Recording, calibration: Calibration, names: Sequence[str], start_s: float, end_s: float
 ) -> dict[str, SensorMount]:
-    """Mounts of further sensors, which share the others' north, from the calibration's pose held once more.
+    """Find the mounts of further sensors, which share the others' north, from another hold of the pose.
 
     Args:
-        recording: in which the wearer holds the pose.
-        calibration: says which pose, and R_TI.
+        recording: in which the wearer holds the calibration's pose.
+        calibration: defines the pose and R_TI.
         names: of sensors that the calibration does not know.
         start_s: of the hold on the recording's clock, seconds.
         end_s: of the hold, seconds.
@@ -99,8 +98,8 @@ def mounts_from_hold(
         inside = quats[(times >= start_s) & (times < end_s)]
         if len(inside) < _LEAST_HOLD:
             raise EdgeposeError(
-                f"{name}: {len(inside)} orientations from {start_s:g} to {end_s:g} s; the wearer has to hold "
-                "the calibration's pose there, say with --hold-from when"
+                f"{name}: {len(inside)} orientations from {start_s:g} to {end_s:g} s; say with --hold-from "
+                "when the wearer holds the calibration's pose"
             )
         r_is = rot.quat_to_matrix(rot.mean_rotation(inside))
         found[name] = SensorMount(r_ti, rot.transpose(_held_bone(calibration.pose, name)) @ r_ti @ r_is)
@@ -108,25 +107,25 @@ def mounts_from_hold(
 
 
 def _held_bone(pose: str, name: str) -> Array:
-    """R_TB0 (3, 3) of any bone in a calibration pose: arms turn as their forearms do."""
+    """Return R_TB0 (3, 3) of any bone in a calibration pose: arms are rotated like their forearms."""
     joint = JOINTS[SITES[name]]
     side = joint.partition("_")[0]
     arm = joint.endswith(("shoulder", "elbow", "wrist", "hand"))
-    known = f"{side}_forearm" if arm else "pelvis"
-    return POSES[pose][PLACEMENTS.index(known)]
+    placement = f"{side}_forearm" if arm else "pelvis"
+    return POSES[pose][PLACEMENTS.index(placement)]
 
 
 def measure(recording: Recording, mounted: dict[str, SensorMount], rate: float) -> Measurements:
-    """Frames of the sensors that are mounted, from where all of them have begun to where the last one ends.
+    """Compute the frames of the mounted sensors, from the time all have started to the end of the last one.
 
     Args:
-        recording: has samples of all of these sensors.
-        mounted: by name.
+        recording: has samples of all these sensors.
+        mounted: mounts by name.
         rate: frames a second.
 
     Raises:
         EdgeposeError: too few sensors, a sensor without orientation, sensors that never ran at the same
-            time, or a pause of all.
+            time, or a pause of all sensors.
     """
     names = tuple(name for name in SITES if name in mounted)
     if len(names) < FEWEST:
@@ -140,7 +139,7 @@ def measure(recording: Recording, mounted: dict[str, SensorMount], rate: float) 
     late = [name for name, track in zip(names, tracks, strict=True) if track.times[-1] < start_s]
     if late:
         raise EdgeposeError(
-            f"{', '.join(late)}: no sample after all sensors had begun, at {start_s:.2f} s; cut the "
+            f"{', '.join(late)}: no sample after all sensors had started, at {start_s:.2f} s; cut the "
             "recording or leave the sensor out"
         )
     _check_pause(np.concatenate([track.times for track in tracks]), start_s)
@@ -171,7 +170,7 @@ class _Track(NamedTuple):
 
 
 def _oriented(name: str, data: SensorData) -> tuple[Array, Array]:
-    """Times (n,), increasing, and quaternions (n, 4) of a sensor's oriented samples."""
+    """Return times (n,), increasing, and quaternions (n, 4) of a sensor's oriented samples."""
     if data.quat is None:
         raise EdgeposeError(
             f"{name}: the recording has no orientations; set the device to send quaternions, or leave the "
@@ -181,7 +180,7 @@ def _oriented(name: str, data: SensorData) -> tuple[Array, Array]:
 
 
 def _distinct(times: Array, values: Array) -> tuple[Array, Array]:
-    """The measured rows, one at a time where several have the same time."""
+    """Return the measured rows, the first one where several have the same time."""
     rows = np.flatnonzero(~np.isnan(values).any(axis=1))
     unique, first = np.unique(times[rows], return_index=True)
     return unique, values[rows[first]]
@@ -196,7 +195,7 @@ def _track(name: str, data: SensorData, mount: SensorMount) -> _Track:
 
 
 def _orientation_at(times: Array, quats: Array, wanted: Array) -> Array:
-    """Quaternions (T, 4) at wanted times, between samples along the shorter arc, beyond them the nearest."""
+    """Interpolate quaternions (T, 4) along the shorter arc; beyond the samples take the nearest."""
     if len(times) == 1:
         return np.repeat(quats, len(wanted), axis=0)
     before = np.clip(np.searchsorted(times, wanted, side="right") - 1, 0, len(times) - 2)
@@ -207,7 +206,7 @@ def _orientation_at(times: Array, quats: Array, wanted: Array) -> Array:
 def _frames(
     track: _Track, ticks: Array, rate: float
 ) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
-    """R_TB (T, 3, 3), accelerations (T, 3), whether they are measured (T,), whether R_TB is bridged (T,)."""
+    """Return R_TB (T, 3, 3), accelerations (T, 3), their validity (T,), and whether R_TB is held (T,)."""
     r_tb = rot.quat_to_matrix(_orientation_at(track.times, track.quats, ticks))
     held = _silence(track.times, ticks, rate) > 0.0
     edges = (ticks[0] - 1.0 / rate, *ticks, ticks[-1] + 1.0 / rate)
@@ -217,13 +216,13 @@ def _frames(
 
 
 def _longest_interval(times: Array, rate: float) -> float:
-    """Interval (s) between samples above which something is missing."""
+    """Return the interval between samples above which some are missing, s."""
     usual = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     return max(_HOLD_PERIODS * usual, 1.0 / rate) + 1e-6
 
 
 def _silence(times: Array, wanted: Array, rate: float) -> Array:
-    """(T,) length of the gap in the samples in which each wanted time lies, 0 where there is none, s."""
+    """Return the length (T,) of the gap in which each wanted time lies, 0 where there is none, s."""
     index = np.searchsorted(times, wanted, side="right")
     ends = np.concatenate([[-np.inf], times, [np.inf]])
     length = ends[index + 1] - ends[index]
@@ -232,7 +231,7 @@ def _silence(times: Array, wanted: Array, rate: float) -> Array:
 
 
 def _silence_before(times: Array, wanted: Array, rate: float) -> Array:
-    """(T,) seconds in gaps between samples, and outside of them, up to each wanted time."""
+    """Return the seconds (T,) in gaps between samples, and outside the samples, up to each wanted time."""
     if len(times) < 2:
         return wanted - wanted[0]
     intervals = np.diff(times)
@@ -242,13 +241,13 @@ def _silence_before(times: Array, wanted: Array, rate: float) -> Array:
 
 
 def _mean_acceleration(times: Array, acc: Array, ticks: Array, rate: float) -> Array:
-    """(T, 3) second difference over frames of the path that accelerations, linear between samples, make.
+    """Return the mean acceleration (T, 3) over two frames about each tick, weighted with a triangle.
 
-    That is their mean over two frames about each tick, weighted with a triangle.
+    It is the second difference over frames of the path of accelerations that are linear between samples.
     """
     if len(times) < 2:
         return np.zeros((len(ticks), 3))
-    common = acc.mean(axis=0)  # taken out, so that the path stays short and keeps its digits
+    common = acc.mean(axis=0)  # subtracted to keep the path short and its digits significant
     acc = acc - common
     steps = np.diff(times)[:, None]
     slopes = np.diff(acc, axis=0) / steps

@@ -1,7 +1,7 @@
-"""Which numbers describe a pose: all that sensors can see of SMPL's, or a hand-rigged skeleton with hinges.
+"""Parameterisations of a pose: SMPL's joints as far as sensors observe them, or a hand-rigged skeleton.
 
-A rig says how its parameters give exponential coordinates, `coordinates = rest + basis @ parameters`, and
-carries the prior in those parameters. The first three are the pelvis.
+A rig maps its parameters to exponential coordinates, `coordinates = rest + basis @ parameters`, and carries
+the prior in these parameters. The first three are the pelvis.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from edgepose.skeleton import JOINTS
 Array = NDArray[np.float64]
 
 WIDTH = 3 * JOINT_COUNT
-"""Exponential coordinates of a pose."""
+"""Number of exponential coordinates of a pose."""
 
 
 class PoseParameterisation(NamedTuple):
@@ -27,13 +27,13 @@ class PoseParameterisation(NamedTuple):
 
     Attributes:
         basis: (72, P) change of the exponential coordinates with the parameters.
-        mean: (P - 3,) prior mean of the parameters behind the pelvis, rad.
+        mean: (P - 3,) prior mean of the parameters after the pelvis, rad.
         root: (P - 3, P - 3) L of SIP eq. 29: squares of L (x - mean) sum up to the Mahalanobis distance.
         lower: (P - 3,) lower limits, rad.
         upper: (P - 3,) upper limits, rad.
-        regression: (72, P - 3) of coordinates that no parameter moves on the parameters: what the prior
-            expects of them; other rows are zero.
-        rest: (72,) what the prior expects of them at the mean; other rows are zero.
+        regression: (72, P - 3) regression, by the prior, of coordinates that no parameter moves on the
+            parameters; other rows are zero.
+        rest: (72,) prior expectation of these coordinates at the mean; other rows are zero.
     """
 
     basis: Array
@@ -46,15 +46,15 @@ class PoseParameterisation(NamedTuple):
 
 
 def smpl_rig(prior: Prior, bones: ArrayLike) -> PoseParameterisation:
-    """SMPL's joints with three degrees of freedom each, for sensors on some bones.
+    """Return a rig of SMPL's joints with three degrees of freedom each, for sensors on some bones.
 
-    A joint that turns none of these bones moves no residual but the prior's, which is Gaussian: its best
-    value follows from the other joints and it need not be searched for.
+    A joint that moves none of these bones affects only the residual of the prior, which is Gaussian: its best
+    value follows from the other joints, without a search.
     """
-    seen = np.asarray(TURNS[np.asarray(bones)].any(axis=0))
-    seen[0] = True
-    chosen = np.flatnonzero(np.repeat(seen, 3))
-    inner, others = chosen[3:] - 3, np.flatnonzero(np.repeat(~seen, 3)) - 3
+    observed = np.asarray(TURNS[np.asarray(bones)].any(axis=0))
+    observed[0] = True
+    chosen = np.flatnonzero(np.repeat(observed, 3))
+    inner, others = chosen[3:] - 3, np.flatnonzero(np.repeat(~observed, 3)) - 3
     covariance = prior.covariance[np.ix_(inner, inner)]
     gain = np.linalg.solve(covariance, prior.covariance[np.ix_(inner, others)]).T
     regression, rest = np.zeros((WIDTH, len(inner))), np.zeros(WIDTH)
@@ -78,14 +78,14 @@ _HINGES: Sequence[tuple[str, str]] = (
     ("left_shoulder", "xyz"), ("left_elbow", "xy"),
     ("right_shoulder", "xyz"), ("right_elbow", "xy"),
 )  # fmt: skip
-"""Joints of the hand-rigged skeleton and the axes they turn about: one waist, a head that nods and shakes,
+"""Joints of the hand-rigged skeleton and their axes of rotation: one waist, a head that nods and shakes,
 hinges at knees and ankles, elbows that bend and twist."""
 
 
 def hinge_rig(prior: Prior) -> PoseParameterisation:
-    """SIP-M: 28 angles (31 parameters with the translation) of a skeleton as one rigs by hand (SIP 5.2).
+    """Return the rig of SIP-M (SIP 5.2): a hand-rigged skeleton, 28 angles (31 with the translation).
 
-    The prior of an angle is that of the same coordinate of SMPL; the other joints are stiff.
+    The prior of an angle is that of the same coordinate of SMPL; the other joints are rigid.
     """
     rows = [0, 1, 2] + [3 * JOINTS.index(name) + "xyz".index(axis) for name, axes in _HINGES for axis in axes]
     inner = np.array(rows[3:]) - 3
@@ -102,13 +102,11 @@ def hinge_rig(prior: Prior) -> PoseParameterisation:
 
 
 def _root(covariance: Array) -> Array:
-    """L with inverse(covariance) = L^T L."""
+    """Return L with inverse(covariance) = L^T L."""
     return np.linalg.inv(np.linalg.cholesky(covariance))
 
 
 def coordinates(rig: PoseParameterisation, parameters: Array) -> Array:
-    """Exponential coordinates (T, 24, 3) of parameters (T, P); those that nothing moves as the prior has
-    them.
-    """
+    """Return exponential coordinates (T, 24, 3) for parameters (T, P); the rest as the prior expects."""
     expected = rig.rest + (parameters[:, 3:] - rig.mean) @ rig.regression.T
     return (parameters @ rig.basis.T + expected).reshape(-1, JOINT_COUNT, 3)

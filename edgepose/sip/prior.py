@@ -1,4 +1,4 @@
-"""What poses people take: mean, covariance and limits of exponential coordinates (SIP 4.3)."""
+"""Pose prior: mean, covariance and limits of the exponential coordinates of human poses (SIP 4.3)."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from edgepose.utils.safe_npz import BROKEN, open_npz
 Array = NDArray[np.float64]
 
 SIZE = 3 * (JOINT_COUNT - 1)
-"""Numbers that the prior is about: all joints but the pelvis, whose turn is the wearer's heading and tilt."""
+"""Coordinates in the prior: all joints but the pelvis, whose rotation is the wearer's heading and tilt."""
 
 LIMIT_PERCENTILES = (0.1, 99.9)
-"""Coordinates beyond these are left to the limits: motion capture has faults of single frames."""
+"""Percentiles of the coordinates that set the limits: motion capture has faults in single frames."""
 
-_SPREAD = np.deg2rad(4.0)  # of joints that motion capture leaves at rest and people do not, rad
+_SPREAD = np.deg2rad(4.0)  # people move joints that motion capture leaves at rest, rad
 _SLACK = np.deg2rad(5.0)  # beyond the percentiles, rad
 _LARGEST = 100.0  # rad and rad^2
 
 
 class Prior(NamedTuple):
-    """Poses that people take, without the pelvis; SMPL's joints 1 to 23 in order, three coordinates each.
+    """Distribution of human poses without the pelvis; SMPL's joints 1 to 23, three coordinates each.
 
     Attributes:
         mean: (69,) rad.
         covariance: (69, 69) rad^2, positive definite.
         lower: (69,) lower limits of the coordinates, rad.
         upper: (69,) upper limits, rad.
-        about: the data it was learnt from, and their licence.
+        about: the data it was learned from, and their licence.
     """
 
     mean: Array
@@ -46,10 +46,10 @@ class Prior(NamedTuple):
 
 
 def learn_prior(poses: Array, about: str) -> Prior:
-    """The prior of poses (N, 72), exponential coordinates in SMPL order.
+    """Learn a prior from poses (N, 72), exponential coordinates in SMPL order.
 
     Raises:
-        EdgeposeError: too few poses to tell.
+        EdgeposeError: too few poses.
     """
     coordinates = np.asarray(poses, float)[:, 3:]
     if len(coordinates) < 10 * SIZE:
@@ -75,10 +75,10 @@ def save_prior(path: str | Path, prior: Prior, overwrite: bool = True) -> None:
 
 
 def load_prior(path: str | Path | None = None) -> Prior:
-    """The prior in a file that `save_prior` wrote; the shipped one when None.
+    """Load a prior that `save_prior` wrote; None means the shipped one.
 
     Raises:
-        EdgeposeError: not such a file, or numbers in it that are no prior.
+        EdgeposeError: not such a file, or its numbers are not a prior.
     """
     source = resources.files("edgepose.sip").joinpath("prior.npz") if path is None else Path(path)
     try:
@@ -94,9 +94,9 @@ def load_prior(path: str | Path | None = None) -> Prior:
     for name, shape in zip(Prior._fields, ((SIZE,), (SIZE, SIZE), (SIZE,), (SIZE,)), strict=False):
         values = getattr(prior, name)
         if values.shape != shape or not (np.abs(values) < _LARGEST).all():
-            raise EdgeposeError(f"{path}: {name!r} is not {shape} finite angles; make the prior anew")
+            raise EdgeposeError(f"{path}: {name!r} is not {shape} finite angles; make the prior again")
     if (prior.lower > prior.upper).any() or not np.allclose(prior.covariance, prior.covariance.T):
-        raise EdgeposeError(f"{path}: limits or covariance contradict themselves; make the prior anew")
+        raise EdgeposeError(f"{path}: limits or covariance contradict themselves; make the prior again")
     if np.linalg.eigvalsh(prior.covariance)[0] <= 0.0:
-        raise EdgeposeError(f"{path}: the covariance is not positive definite; make the prior anew")
+        raise EdgeposeError(f"{path}: the covariance is not positive definite; make the prior again")
     return prior

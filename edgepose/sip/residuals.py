@@ -1,4 +1,4 @@
-"""How well poses explain the sensors: a table, advice about sensors that do not fit, and a picture."""
+"""Residuals of poses against the sensors: a table, advice about sensors that do not fit, and a plot."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from edgepose.sip.energy import Costs
 from edgepose.sip.measurements import Measurements
 from edgepose.sip.solve import Solution
 
-TURN_LIMIT_DEG = 12.0
-"""RMS of an orientation residual above which a sensor does not fit; 3 to 7 are usual."""
+ORIENTATION_LIMIT_DEG = 12.0
+"""RMS of the orientation residual above which a sensor does not fit; 3 to 7 is usual."""
 
-PULL_LIMIT = 2.5
-"""RMS of an acceleration residual above which a sensor does not fit, m/s^2; 0.2 to 1 are usual."""
+ACCELERATION_LIMIT = 2.5
+"""RMS of the acceleration residual above which a sensor does not fit, m/s^2; 0.2 to 1 is usual."""
 
 
 def concatenate(solutions: Sequence[Solution]) -> Solution:
-    """Consecutive solutions as one."""
+    """Join consecutive solutions."""
     arrays = {
         name: np.concatenate([getattr(s, name) for s in solutions])
         for name in Solution._fields
@@ -30,7 +30,7 @@ def concatenate(solutions: Sequence[Solution]) -> Solution:
 
 
 def table(solution: Solution, measurements: Measurements) -> str:
-    """Cost a frame by term, and residuals by sensor."""
+    """Format the cost per frame by term, and the residuals by sensor."""
     costs = dict(zip(Costs._fields, solution.costs.mean(axis=0), strict=True))
     lines = [
         "cost a frame  "
@@ -39,32 +39,34 @@ def table(solution: Solution, measurements: Measurements) -> str:
         "sensor            orientation deg  acceleration m/s^2  held",
     ]
     frames = len(solution.rotations)
-    for i, (name, turn, pull) in enumerate(_residuals(solution, measurements)):
+    for i, (name, angle, acceleration) in enumerate(_residuals(solution, measurements)):
         held = int(measurements.held[:frames, i].sum())
-        lines.append(f"{name:18}{turn:15.2f}{pull:20.2f}{held:6d}")
+        lines.append(f"{name:18}{angle:15.2f}{acceleration:20.2f}{held:6d}")
     return "\n".join(lines)
 
 
 def misfits(solution: Solution, measurements: Measurements) -> list[str]:
-    """One line for each sensor that does not fit, with advice."""
+    """Return one line with advice for each sensor that does not fit."""
     return [
-        f"{name} does not fit the others ({turn:.0f} deg, {pull:.1f} m/s^2 off): is it worn where its name "
-        "says, and was it calibrated since it was put on?"
-        for name, turn, pull in _residuals(solution, measurements)
-        if turn > TURN_LIMIT_DEG or pull > PULL_LIMIT
+        f"{name} does not fit the others ({angle:.0f} deg, {acceleration:.1f} m/s^2 off): "
+        "check that it is worn where its name says, and that it has been calibrated since it was put on"
+        for name, angle, acceleration in _residuals(solution, measurements)
+        if angle > ORIENTATION_LIMIT_DEG or acceleration > ACCELERATION_LIMIT
     ]
 
 
 def _residuals(solution: Solution, measurements: Measurements) -> list[tuple[str, float, float]]:
-    """Name and RMS residuals of each sensor: orientation in degrees, acceleration in m/s^2."""
-    turns = np.degrees(np.sqrt(np.mean(solution.turn_rad**2, axis=0)))
-    valid = measurements.valid[: len(solution.pull)]
-    pulls = np.sqrt(np.sum(solution.pull**2, axis=0) / np.maximum(valid.sum(axis=0), 1))
-    return list(zip(measurements.names, turns.tolist(), pulls.tolist(), strict=True))
+    """Return name and RMS residuals of each sensor: orientation in degrees, acceleration in m/s^2."""
+    angles = np.degrees(np.sqrt(np.mean(solution.orientation_residual**2, axis=0)))
+    valid = measurements.valid[: len(solution.acceleration_residual)]
+    accelerations = np.sqrt(
+        np.sum(solution.acceleration_residual**2, axis=0) / np.maximum(valid.sum(axis=0), 1)
+    )
+    return list(zip(measurements.names, angles.tolist(), accelerations.tolist(), strict=True))
 
 
 def plot(path: str | Path, solution: Solution, measurements: Measurements, overwrite: bool = True) -> None:
-    """Draw cost by term, and residuals by sensor, over time.
+    """Plot the cost by term and the residuals by sensor over time.
 
     Raises:
         EdgeposeError: matplotlib is not installed, or the file cannot be written.
@@ -74,16 +76,16 @@ def plot(path: str | Path, solution: Solution, measurements: Measurements, overw
 
     times = measurements.time_s[: len(solution.rotations)]
     figure = Figure(figsize=(9.0, 7.0), dpi=130, layout="constrained")
-    costs, turns, pulls = figure.subplots(3, 1, sharex=True)
+    costs, angles, accelerations = figure.subplots(3, 1, sharex=True)
     for name, cost in zip(Costs._fields, solution.costs.T, strict=True):
         costs.semilogy(times, np.maximum(cost, 1e-8), linewidth=0.8, label=name)
     for i, name in enumerate(measurements.names):
-        turns.plot(times, np.degrees(solution.turn_rad[:, i]), linewidth=0.8, label=name)
-        pulls.plot(times, solution.pull[:, i], linewidth=0.8)
+        angles.plot(times, np.degrees(solution.orientation_residual[:, i]), linewidth=0.8, label=name)
+        accelerations.plot(times, solution.acceleration_residual[:, i], linewidth=0.8)
     costs.set_ylabel("cost of a frame")
-    turns.set_ylabel("orientation residual, deg")
-    pulls.set_ylabel("acceleration residual, m/s²")
-    pulls.set_xlabel("time, s")
-    for axes in (costs, turns):
+    angles.set_ylabel("orientation residual, deg")
+    accelerations.set_ylabel("acceleration residual, m/s²")
+    accelerations.set_xlabel("time, s")
+    for axes in (costs, angles):
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7, frameon=False)
     save_picture(figure, path, overwrite=overwrite)

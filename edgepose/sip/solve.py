@@ -1,4 +1,4 @@
-"""A whole recording to poses: in chunks that overlap, one after the other or several at a time."""
+"""Solver for whole recordings: in overlapping chunks, one after the other or several in parallel."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ CHUNK = 900
 """Frames solved at once: 15 s at 60 Hz."""
 
 OVERLAP = 60
-"""Frames that neighbouring chunks share. In the outer half of them each chunk knows too little of what lies
-beyond its end, which is why the poses pass over from one to the other."""
+"""Frames that neighbouring chunks share. Near its ends a chunk lacks the frames beyond, so the poses are
+blended from one chunk to the next over this length."""
 
 Method = Literal["sip", "sop"]
 
 
 class Settings(NamedTuple):
-    """How to solve.
+    """Settings of the solver.
 
     Attributes:
         method: "sip" or "sop".
         rig: parameters of a pose, and their prior.
-        body: where the sensors sit.
+        body: positions of the sensors on it.
         weights: of the energy's terms.
-        evaluations: of SIP's cost at most.
+        evaluations: largest number of evaluations of SIP's cost.
     """
 
     method: Method
@@ -50,31 +50,31 @@ class Settings(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Poses of consecutive frames, and how well they explain the sensors.
+    """Poses of consecutive frames, and their residuals.
 
     Attributes:
         rotations: (T, 24, 3, 3) local rotations, joint 0 against the body frame T.
         costs: (T, 4) weighted cost of the terms, as in `edgepose.sip.energy.Costs`.
-        turn_rad: (T, N) angle between estimated and measured orientation of each sensor, rad.
-        pull: (T, N) length of each sensor's acceleration residual, m/s^2; 0 where none was measured.
+        orientation_residual: (T, N) angle between each sensor's estimated and measured orientation, rad.
+        acceleration_residual: (T, N) length of each residual, m/s^2; 0 where none was measured.
         acceleration: (T, 3) of the pelvis in T, m/s^2; NaN where no sensor measured any.
-        evaluations: of the cost.
+        evaluations: number of cost evaluations.
     """
 
     rotations: Array
     costs: Array
-    turn_rad: Array
-    pull: Array
+    orientation_residual: Array
+    acceleration_residual: Array
     acceleration: Array
     evaluations: int
 
 
 OnProgress = Callable[[int, int, int, float], None]
-"""Told the chunk (from 1), the number of chunks, cost evaluations in it so far and the cost a frame."""
+"""Called with chunk (from 1), number of chunks, cost evaluations in it so far and cost per frame."""
 
 
 def chunks(frames: int) -> list[slice]:
-    """Chunks of a recording, of equal length save for rounding."""
+    """Return the chunks of a recording, of equal length except for rounding."""
     count = max(1, -(-(frames - OVERLAP) // (CHUNK - OVERLAP)))
     edges = np.linspace(0, max(frames - OVERLAP, 0), count + 1).astype(int)
     return [slice(a, min(b + OVERLAP, frames)) for a, b in pairwise(edges.tolist())]
@@ -86,35 +86,35 @@ def solve(
     jobs: int = 1,
     on_progress: OnProgress = lambda chunk, count, evaluations, cost: None,
 ) -> Iterator[Solution]:
-    """Solves a recording; each solution goes on where the one before it ends.
+    """Solve a recording and yield solutions of consecutive frames.
 
     Args:
         measurements: of all frames.
-        settings: how to solve.
-        jobs: chunks solved at a time, each by a process of its own.
-        on_progress: told how far it is; with more than one job, of whole chunks only.
+        settings: of the solver.
+        jobs: number of chunks solved in parallel, each in its own process.
+        on_progress: called after each evaluation; with more than one job, only after each chunk.
 
     Raises:
-        EdgeposeError: there is no frame, or a process was ended.
+        EdgeposeError: there is no frame, or a worker process died.
     """
     if not len(measurements.time_s):
         raise EdgeposeError("the recording has no frame in which all sensors report")
     parts = chunks(len(measurements.time_s))
     problems = [_problem(measurements, part, settings) for part in parts]
-    held: Solution | None = None  # what the next chunk passes over
+    overlap: Solution | None = None  # end of a chunk, blended with the start of the next one
     for number, solution in enumerate(_solutions(problems, settings, jobs, on_progress), start=1):
-        if held is not None:
-            solution = _crossfade(held, solution)
+        if overlap is not None:
+            solution = _crossfade(overlap, solution)
         last = number == len(parts)
         stop = None if last else parts[number].start - parts[number - 1].start
         yield _rows(solution, slice(0, stop))
-        held = None if last else _rows(solution, slice(stop, None))
+        overlap = None if last else _rows(solution, slice(stop, None))
 
 
 def _solutions(
     problems: list[Problem], settings: Settings, jobs: int, on_progress: OnProgress
 ) -> Iterator[Solution]:
-    """Solutions of whole chunks, in order."""
+    """Yield the solutions of whole chunks, in order."""
     count = len(problems)
     work = partial(solve_chunk, method=settings.method, evaluations=settings.evaluations)
     if jobs == 1 or count == 1:
@@ -139,14 +139,14 @@ def _solutions(
                 yield solution
         except BrokenProcessPool as error:
             raise EdgeposeError(
-                "a process was ended, perhaps for want of memory; use fewer --jobs"
+                "a worker process died, perhaps for lack of memory; use fewer --jobs"
             ) from error
         finally:
             pool.shutdown(cancel_futures=True)
 
 
 def _ignore_interrupts() -> None:
-    """Ctrl-C goes to all processes of a terminal; the one that started the others handles it for them."""
+    """Ignore Ctrl-C, which reaches all processes of a terminal; the parent process handles it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
@@ -156,7 +156,7 @@ def solve_chunk(
     evaluations: int = SIP_EVALUATIONS,
     on_step: Callable[[int, float], None] = lambda count, cost: None,
 ) -> Solution:
-    """All frames of a problem: SOP, and from there SIP."""
+    """Solve all frames of a problem: SOP, then SIP from its result."""
     minimum = orientation_poser(problem, on_step)
     done = minimum.evaluations
     if method == "sip":
@@ -182,15 +182,15 @@ def _problem(measurements: Measurements, part: slice, settings: Settings) -> Pro
 
 
 def _solution(problem: Problem, minimum: Minimum, evaluations: int) -> Solution:
-    here, valid = minimum.evaluation, problem.valid[..., None]
-    left = problem.acceleration - second_difference(here.states.position, problem.rate)
+    evaluation, valid = minimum.evaluation, problem.valid[..., None]
+    unexplained = problem.acceleration - second_difference(evaluation.states.position, problem.rate)
     with np.errstate(invalid="ignore"):
-        acceleration = (valid * left).sum(axis=1) / valid.sum(axis=1)
+        acceleration = (valid * unexplained).sum(axis=1) / valid.sum(axis=1)
     return Solution(
         rot.rotvec_to_matrix(coordinates(problem.rig, minimum.parameters)),
-        np.stack(here.costs, axis=1),
-        np.linalg.norm(here.orientation_residual, axis=-1),
-        np.linalg.norm(here.acceleration_residual, axis=-1),
+        np.stack(evaluation.costs, axis=1),
+        np.linalg.norm(evaluation.orientation_residual, axis=-1),
+        np.linalg.norm(evaluation.acceleration_residual, axis=-1),
         acceleration,
         evaluations,
     )
@@ -202,17 +202,17 @@ def _rows(solution: Solution, rows: slice) -> Solution:
 
 
 def _crossfade(before: Solution, after: Solution) -> Solution:
-    """`after`, its first frames turned gradually from those of `before`, which are the same instants."""
+    """Return `after` with its first frames blended with those of `before`, which are of the same instants."""
     frames = len(before.rotations)
     share = (np.arange(frames) + 0.5) / frames
     share = share * share * (3.0 - 2.0 * share)
     first, last = (rot.matrix_to_quat(s.rotations[:frames]) for s in (before, after))
     between = rot.quat_to_matrix(rot.slerp(first, last, share[:, None]))
-    # Of all else the nearer chunk's: the ends of a chunk have no acceleration.
+    # Everything else comes from the nearer chunk: the ends of a chunk have no acceleration.
     middle = frames // 2
     columns: dict[str, Any] = {
         name: np.concatenate([getattr(before, name)[:middle], getattr(after, name)[middle:]])
-        for name in ("costs", "turn_rad", "pull", "acceleration")
+        for name in ("costs", "orientation_residual", "acceleration_residual", "acceleration")
     }
     rotations = np.concatenate([between, after.rotations[frames:]])
     return after._replace(rotations=rotations, **columns)

@@ -1,1 +1,1 @@
-"""Poses as a figure in the browser."""
+"""Viewer of poses in the browser."""

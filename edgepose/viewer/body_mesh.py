@@ -1,4 +1,4 @@
-"""A body of simple solids for 3-D views: cylinders along bones, balls at joints, a head with a nose."""
+"""Body of simple solids for 3-D views: cylinders along bones, balls at joints, a head with a nose."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ RADII = {
     "neck": 0.055, "collar": 0.075, "head": 0.05, "shoulder": 0.06, "elbow": 0.047, "wrist": 0.038,
     "hand": 0.035,
 }  # fmt: skip
-"""Of the bone that ends at a joint, metres, on the left and right alike."""
+"""Radius of the bone that ends at a joint, metres, the same on the left and right."""
 
 TIPS = {10: (0.0, 0.0, 0.06), 11: (0.0, 0.0, 0.06), 22: (0.07, 0.0, 0.0), 23: (-0.07, 0.0, 0.0)}
-"""Ends of feet and hands: joint, and place in its frame, metres."""
+"""Ends of feet and hands: joint, and position in its frame, metres."""
 
 HEAD, HEAD_SIZE = (0.0, 0.09, 0.02), (0.08, 0.115, 0.095)
 NOSE, NOSE_SIZE = (0.0, 0.075, 0.12), (0.016, 0.022, 0.016)
@@ -31,23 +31,23 @@ class BodyMesh(NamedTuple):
 
     Attributes:
         joints: (N,) joint in whose frame each is fixed.
-        turns: (N, 3, 3) their axes in that frame.
-        places: (N, 3) their centres in that frame, metres.
-        sizes: (N, 3) by which each is stretched along its axes.
+        rotations: (N, 3, 3) their axes in that frame.
+        centres: (N, 3) their centres in that frame, metres.
+        sizes: (N, 3) scale factors along their axes.
         sides: N names "left", "trunk", "right".
     """
 
     joints: NDArray[np.int64]
-    turns: Array
-    places: Array
+    rotations: Array
+    centres: Array
     sizes: Array
     sides: list[str]
 
-    def placed(self, rotations: Array, positions: Array) -> tuple[Array, Array]:
-        """Unit quaternions (N, 4) and centres (N, 3) on global joints (24, 3, 3), (24, 3)."""
+    def posed(self, rotations: Array, positions: Array) -> tuple[Array, Array]:
+        """Return unit quaternions (N, 4) and centres (N, 3) for global joints (24, 3, 3), (24, 3)."""
         frames = rotations[self.joints]
-        centres = positions[self.joints] + (frames @ self.places[:, :, None])[..., 0]
-        return matrix_to_quat(frames @ self.turns), centres
+        centres = positions[self.joints] + (frames @ self.centres[:, :, None])[..., 0]
+        return matrix_to_quat(frames @ self.rotations), centres
 
 
 def _side(joint: int) -> str:
@@ -60,13 +60,14 @@ def _radius(joint: int) -> float:
 
 
 def build(offsets: ArrayLike) -> tuple[BodyMesh, BodyMesh]:
-    """Cylinders and balls of a body; offsets (24, 3), metres."""
+    """Return the cylinders and balls of a body with `offsets` (24, 3), metres."""
     offsets = np.asarray(offsets, float)
     bones = [(PARENTS[j], np.zeros(3), offsets[j], _radius(j), _side(j)) for j in range(1, len(JOINTS))]
     bones += [(j, np.zeros(3), np.array(tip), _radius(j), _side(j)) for j, tip in TIPS.items()]
     along = np.stack([end - start for _, start, end, _, _ in bones])
     lengths = np.linalg.norm(along, axis=1)
-    directions = along + np.array([1e-6, 0.0, 0.0])  # any, where a bone has no length or runs against Z
+    # The nudge gives bones without length, or against Z, some direction.
+    directions = along + np.array([1e-6, 0.0, 0.0])
     cylinders = BodyMesh(
         np.array([joint for joint, *_ in bones]),
         minimal_rotation([0.0, 0.0, 1.0], directions),
@@ -82,13 +83,13 @@ def build(offsets: ArrayLike) -> tuple[BodyMesh, BodyMesh]:
     return cylinders, BodyMesh(
         np.array([joint for joint, *_ in balls]),
         np.tile(np.eye(3), (len(balls), 1, 1)),
-        np.stack([place for _, place, _, _ in balls]),
+        np.stack([centre for _, centre, _, _ in balls]),
         np.array([size for _, _, size, _ in balls]),
         [side for *_, side in balls],
     )
 
 
 def ground(rotations: ArrayLike, offsets: ArrayLike, translation: ArrayLike | None = None) -> float:
-    """Height of the lowest sole or other end (over all poses (..., 24, 3, 3)), metres."""
+    """Return the height of the lowest point of the body over all poses (..., 24, 3, 3), metres."""
     _, joints = forward_kinematics(rotations, offsets, translation)
     return float(joints[..., 1].min()) - RADII["foot"]

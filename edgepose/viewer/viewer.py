@@ -1,6 +1,6 @@
-"""Poses as a figure in the browser: of a file, with a time line, or as they come over UDP.
+"""Viewer of poses in the browser: from a file, with a time line, or live over UDP.
 
-The scene and its controls are viser's, which serves a page of its own; nothing is loaded from elsewhere.
+The scene and its controls are viser's, which serves its own page; nothing is loaded from elsewhere.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 POSE = {"left": "#1F8FDB", "trunk": "#17588A", "right": "#082C47"}
 REFERENCE = {"left": "#B0B0B0", "trunk": "#808080", "right": "#585858"}
-"""Colours; sides differ in lightness, which every eye sees. The lamps of the scene brighten them."""
+"""Colours; sides differ in lightness, which every eye sees. The lights of the scene brighten them."""
 
 FRAME_S = 1.0 / 60.0
 """Time between two pictures, seconds."""
@@ -38,7 +38,7 @@ TABLE_S = 0.25
 """Time between two updates of the text beside the figure, seconds."""
 
 WINDOW_S = 5.0
-"""Rates and gaps are those of this time, seconds."""
+"""Time over which rates and gaps are computed, seconds."""
 
 SPEEDS = ("0.25", "0.5", "1", "2", "4")
 
@@ -74,13 +74,18 @@ class SkeletonView:
             )
             self._handles.append((solids, handle))
 
-    def show(self, rotations: Array, place: Array | None) -> None:
-        """Pose it: local rotations (24, 3, 3), place of the pelvis (3,) or the ground below it."""
-        turned, joints = forward_kinematics(rotations, self._offsets, place)
-        if place is None:
+    def show(self, rotations: Array, position: Array | None) -> None:
+        """Pose the body.
+
+        Args:
+            rotations: (24, 3, 3) local rotations.
+            position: (3,) of the pelvis, metres; None puts the body on the ground.
+        """
+        global_rotations, joints = forward_kinematics(rotations, self._offsets, position)
+        if position is None:
             joints = joints - [0.0, ground(rotations, self._offsets), 0.0]
         for solids, handle in self._handles:
-            handle.batched_wxyzs, handle.batched_positions = solids.placed(turned, joints)
+            handle.batched_wxyzs, handle.batched_positions = solids.posed(global_rotations, joints)
 
 
 def _rgb(colour: str) -> tuple[int, ...]:
@@ -88,9 +93,9 @@ def _rgb(colour: str) -> tuple[int, ...]:
 
 
 def sensor_table(held: NDArray[np.bool_], rate: float) -> str:
-    """Markdown about the sensors in the last poses: held (N, 6), oldest first, in the order of PLACEMENTS.
+    """Format a Markdown table of the sensors in the last poses: held (N, 6), oldest first.
 
-    A sensor that is held has sent nothing new for a pose, so its rate is told up to that of the poses.
+    A held sensor has sent nothing new for a pose, so the table shows rates up to that of the poses.
     """
     lines = ["| sensor | new/s | longest gap | now |", "|---|--:|--:|---|"]
     for name, column, longest in zip(PLACEMENTS, held.T, longest_holds(held), strict=True):
@@ -102,13 +107,13 @@ def sensor_table(held: NDArray[np.bool_], rate: float) -> str:
 
 
 class Viewer:
-    """A page with a scene, controls and a text, open from the construction until `close`."""
+    """A page with a scene, controls and a text, served from construction until `close`."""
 
     def __init__(self, host: str, port: int, body: Body) -> None:
         """Serve the page.
 
         Args:
-            host: address of this machine at which browsers find it.
+            host: address of this machine for browsers.
             port: TCP port.
             body: of the figures.
 
@@ -122,7 +127,7 @@ class Viewer:
                 "the viewer needs viser: install it with pip install 'edgepose[view]'"
             ) from error
         _check_free(host, port)
-        # It greets on standard output, which belongs to whom has started this.
+        # viser prints a greeting to standard output, which belongs to the caller.
         with redirect_stdout(io.StringIO()):
             self._server: Any = viser.ViserServer(host=host, port=port, label="edgepose", verbose=False)
         self._body = body
@@ -134,7 +139,7 @@ class Viewer:
         self._server.initial_camera.position = (0.8, 1.3, 2.1)
         self._server.initial_camera.look_at = (0.0, 0.9, 0.0)
         self.figure = SkeletonView(self._server, "pose", body, POSE, None)
-        self._told = 0.0
+        self._updated_s = 0.0  # when the text was updated
 
     def close(self) -> None:
         """Close the page."""
@@ -144,13 +149,13 @@ class Viewer:
     # --- poses of a file ------------------------------------------------------------------------------------
 
     def play(self, poses: PoseSequence, reference: PoseSequence | None, stopped: Callable[[], bool]) -> None:
-        """Show poses of a file, over and over, until `stopped`.
+        """Show poses of a file in a loop until `stopped`.
 
         Args:
             poses: at least one.
-            reference: drawn transparently besides, on the same clock, or from its start where the two clocks
-                have no time in common.
-            stopped: asked for every picture.
+            reference: also drawn, transparently, on the same clock, or from its start if the two have no time
+                in common.
+            stopped: called for every picture.
         """
         times, status = poses.time_s - poses.time_s[0], poses.status
         line = _TimeLine(self._server.gui, float(times[-1]))
@@ -170,11 +175,11 @@ class Viewer:
                 with self._server.atomic():
                     track.show(i)
                     if second is not None:
-                        second.show(_beside(second.poses, poses, i))
+                        second.show(_nearest_reference(second.poses, poses, i))
                 shown = i
-            if now - self._told >= TABLE_S:
-                self._told = now
-                line.tell()
+            if now - self._updated_s >= TABLE_S:
+                self._updated_s = now
+                line.update_slider()
                 table = sensor_table(held[max(0, i + 1 - window) : i + 1], poses.rate)
                 text.content = (
                     f"pose {i + 1} of {len(times)}, {poses.rate:g} poses/s\n\n"
@@ -188,22 +193,22 @@ class Viewer:
         """Show poses that come as datagrams, always the newest one, until `stopped`.
 
         Args:
-            receiver: bound socket; what comes is JSON or binary as `edgepose run --udp` sends it.
-            stopped: asked for every picture.
+            receiver: bound socket; datagrams are JSON or binary as `edgepose run --udp` sends them.
+            stopped: called for every picture.
         """
         text = self._server.gui.add_markdown("waiting for poses")
         stream = UdpPoseStream()
         receiver.setblocking(False)
         while not stopped():
-            # Awake as a pose comes, and not at a pace of its own that would skip some.
+            # Wake up when a pose comes; a fixed pace would skip some.
             select.select([receiver], [], [], TABLE_S)
             now = time.monotonic()
             newest = stream.take(receiver, now)
             if newest is not None:
                 with self._server.atomic():
                     self.figure.show(newest.rotations.astype(float), newest.translation)
-            if now - self._told >= TABLE_S:
-                self._told = now
+            if now - self._updated_s >= TABLE_S:
+                self._updated_s = now
                 text.content = stream.text(now)
             time.sleep(max(0.0, FRAME_S / 2 - (time.monotonic() - now)))
 
@@ -218,15 +223,15 @@ class _TimeLine:
         self._slider = gui.add_slider("time, s", 0.0, round(self._end_s + 0.005, 2), 0.01, 0.0)
         self._speed = gui.add_dropdown("speed", SPEEDS, initial_value="1")
         self._at_s, self._last_s = 0.0, time.monotonic()
-        self._wanted: deque[float] = deque(maxlen=1)  # where somebody has moved the slider to
+        self._wanted: deque[float] = deque(maxlen=1)  # time to which a user has moved the slider
         self._slider.on_update(self._note)
 
     def _note(self, event: Any) -> None:
-        if event.client is not None:  # and not `tell`
+        if event.client is not None:  # moved by a user, not by `update_slider`
             self._wanted.append(float(self._slider.value))
 
     def advance(self, now: float) -> float:
-        """The time to show; `now` on a monotonic clock."""
+        """Return the time to show; `now` is on a monotonic clock."""
         if self._wanted:
             self._at_s = self._wanted.pop()
         elif self._playing.value:
@@ -234,38 +239,39 @@ class _TimeLine:
         self._last_s = now
         return self._at_s
 
-    def tell(self) -> None:
-        """Let the slider follow."""
+    def update_slider(self) -> None:
+        """Move the slider to the time that is shown."""
         if self._playing.value:
             self._slider.value = round(self._at_s, 2)
 
 
 class _Track:
-    """A figure and the poses that it takes."""
+    """A figure and its poses."""
 
     def __init__(self, figure: SkeletonView, poses: PoseSequence, body: Body) -> None:
         self.poses = poses
         self._figure = figure
-        self._places = _on_the_ground(poses, body)
+        self._positions = _grounded_positions(poses, body)
 
     def show(self, i: int) -> None:
-        self._figure.show(self.poses.rotations[i], None if self._places is None else self._places[i])
+        position = None if self._positions is None else self._positions[i]
+        self._figure.show(self.poses.rotations[i], position)
 
 
 class UdpPoseStream:
-    """Poses that come as datagrams, and what there is to say of the last seconds of them."""
+    """Receives poses as datagrams, with statistics of the last seconds."""
 
     def __init__(self) -> None:
-        """Nothing has come yet."""
+        """Start with no poses."""
         self.poses, self.lost, self.bad = 0, 0, 0
         self._last: PoseFrame | None = None
         self._recent: deque[tuple[float, frozenset[str]]] = deque()
         self._newest_s = 0.0
 
     def take(self, receiver: socket.socket, now: float) -> PoseFrame | None:
-        """The newest pose of all that wait at a non-blocking socket; `now` on a monotonic clock, seconds."""
+        """Return the newest pose waiting at a non-blocking socket; `now` is on a monotonic clock, seconds."""
         newest = None
-        for _ in range(1000):  # A flood must not keep the picture from being drawn.
+        for _ in range(1000):  # limited, so that a flood of datagrams cannot stop the picture
             try:
                 datagram = receiver.recv(65536)
             except OSError:
@@ -281,7 +287,7 @@ class UdpPoseStream:
     def _add(self, pose: PoseFrame, now: float) -> PoseFrame | None:
         if self._last is not None:
             step = pose.index - self._last.index
-            if -60 < step <= 0:  # Late or doubled; further back is a new run.
+            if -60 < step <= 0:  # late or duplicated; further back is a new run
                 return None
             self.lost += max(0, step - 1)
         self.poses += 1
@@ -290,9 +296,9 @@ class UdpPoseStream:
         return pose
 
     def text(self, now: float) -> str:
-        """Markdown about what has come."""
+        """Return Markdown about the poses so far."""
         if self._last is None:
-            bad = f"; {self.bad} datagrams were no poses" if self.bad else ""
+            bad = f"; {self.bad} datagrams were not poses" if self.bad else ""
             return f"waiting for poses{bad}"
         span = min(WINDOW_S, max(1.0, now - self._recent[0][0])) if self._recent else WINDOW_S
         rate = len(self._recent) / span
@@ -305,19 +311,19 @@ class UdpPoseStream:
 
 
 def plain(status: str) -> str:
-    """A status, which anybody may have sent, without what a browser would act on."""
+    """Remove from a status, which anyone may have sent, everything that a browser could interpret."""
     return re.sub(r"[^A-Za-z0-9_ ;]", "?", status[:200])
 
 
-def _beside(reference: PoseSequence, poses: PoseSequence, i: int) -> int:
-    """Index of the reference pose that is nearest to pose i."""
+def _nearest_reference(reference: PoseSequence, poses: PoseSequence, i: int) -> int:
+    """Return the index of the reference pose nearest to pose i."""
     common = reference.time_s[0] <= poses.time_s[-1] and poses.time_s[0] <= reference.time_s[-1]
     start = 0.0 if common else poses.time_s[0] - reference.time_s[0]
     return int(np.abs(reference.time_s - (poses.time_s[i] - start)).argmin())
 
 
-def _on_the_ground(poses: PoseSequence, body: Body) -> Array | None:
-    """Places of the pelvis (T, 3), metres, the lowest point of all on the ground; None if unknown."""
+def _grounded_positions(poses: PoseSequence, body: Body) -> Array | None:
+    """Return pelvis positions (T, 3), metres, lowest point of all on the ground; None if unknown."""
     if poses.translation is None:
         return None
     some = slice(None, None, max(1, len(poses.frames) // 1000))
@@ -326,7 +332,7 @@ def _on_the_ground(poses: PoseSequence, body: Body) -> Array | None:
 
 
 def _check_free(host: str, port: int) -> None:
-    """Raise if nothing can be served there; viser would take the next free port and not tell."""
+    """Raise if the port cannot be used; viser would silently take the next free one."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         socket.create_server((host, port), family=family).close()

@@ -106,8 +106,11 @@ class Attack:
         (lambda c: c.pop("imu_acc"), r"neither DIP-IMU .* it has gt, imu_ori"),
         (lambda c: c.update(gt=np.zeros((FRAMES, 10))), r"'gt' is \(12, 10\)"),
         (lambda c: c.update(gt=np.full((FRAMES, 72), np.nan)), "gt contains NaN"),
-        (lambda c: c.update(imu_ori=np.zeros((5, 17, 3, 3))), r"'imu_ori' is \(5, 17, 3, 3\) and not \(12,"),
-        (lambda c: c.update(imu_ori=np.ones((FRAMES, 17, 3, 3))), "matrices that are no rotations"),
+        (
+            lambda c: c.update(imu_ori=np.zeros((5, 17, 3, 3))),
+            r"'imu_ori' is \(5, 17, 3, 3\), but .* needs \(12,",
+        ),
+        (lambda c: c.update(imu_ori=np.ones((FRAMES, 17, 3, 3))), "matrices that are not rotations"),
         (lambda c: c.update(imu_ori="words"), "not an array of numbers"),
         (lambda c: c.update(extra=Attack()), r"asks for \S+print, .*it was not run"),
     ],

@@ -1,7 +1,7 @@
-"""How each sensor of a rig does, measured on its samples while they come; `diagnostics.rules` judges it.
+"""Health measurements of a rig's sensors on their incoming samples; `diagnostics.rules` interprets them.
 
-Times at rest tell most: whatever its attitude, a sensor at rest measures nothing but gravity, which its
-orientation turns to (0, 0, 9.81) in the inertial frame.
+Times at rest show most: whatever its attitude, a sensor at rest measures nothing but gravity, which its
+orientation rotates to (0, 0, 9.81) in the inertial frame.
 
 Each measurement is a small class with `update`, which takes rows of numbers (see `columns`), and `result`.
 `Sensor` keeps the newest rows of one sensor and passes them on; `SensorHealthMonitor` compares the sensors of

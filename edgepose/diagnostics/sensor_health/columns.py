@@ -1,4 +1,4 @@
-"""Rows of numbers that samples become: time, quantities, time of arrival; NaN is not measured."""
+"""Samples as rows of numbers: time, quantities, time of arrival; NaN means not measured."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from edgepose.imu import ImuSample
 from edgepose.rotations import Array
 
 WINDOW_S = 10.0
-"""What is called present: the newest samples, seconds."""
+"""Length of the window of newest samples, seconds."""
 
 TIME, ARRIVAL, WIDTH = 0, 14, 15
 """Columns of the time of measurement and of the time of arrival, seconds, and number of columns."""
@@ -22,20 +22,20 @@ MOTION = slice(QUAT.start, GYR.stop)
 """Columns of orientation, acceleration and gyroscope together."""
 
 QUANTITIES = {"orientation": QUAT, "acceleration": ACC, "gyroscope": GYR}
-"""Columns of what a sensor should send."""
+"""Columns of the quantities that a sensor should send."""
 
 FEWEST = 20
-"""Rows that tell a period."""
+"""Smallest number of rows from which a period can be measured."""
 
 _NAN3, _NAN4 = (math.nan,) * 3, (math.nan,) * 4
 
 
 def row_of(sample: ImuSample, arrival_s: float) -> tuple[float, ...]:
-    """The row of a sample that came at that time, seconds."""
+    """Return the row of a sample that arrived at `arrival_s`, seconds."""
     _, time_s, quat, acc, gyr, mag = sample
     return (time_s, *(quat or _NAN4), *(acc or _NAN3), *(gyr or _NAN3), *(mag or _NAN3), arrival_s)
 
 
 def deviation(values: Array) -> float:
-    """Standard deviation of rows (n, k), over all columns together."""
+    """Return the standard deviation of rows (n, k), over all columns together."""
     return float(np.sqrt(values.var(axis=0).sum()))

@@ -1,4 +1,4 @@
-"""What only shows when the sensors of a rig are compared: headings, exchanged sensors, shared values."""
+"""Comparison of the sensors of a rig: headings, swapped sensors, shared values."""
 
 from __future__ import annotations
 
@@ -19,53 +19,52 @@ from edgepose.diagnostics.sensor_health.sensor import Sensor
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 
-_POSE_OFF_DEG = 30.0  # of six sensors together: how well somebody finds the pose again
+_POSE_OFF_DEG = 30.0  # sum over six sensors: accuracy with which a wearer takes the pose again
 
 
 class HeadingComparison:
-    """Headings of sensors that are all at rest, if they lie side by side or the wearer stands in the pose."""
+    """Headings of sensors that are all at rest, side by side or on a wearer who stands in the pose."""
 
     def __init__(self, calibration: Calibration | None) -> None:
-        """Nothing is known; without a calibration there is no pose."""
+        """Create the comparison; without a calibration only sensors that lie side by side are compared."""
         self._calibration = calibration
         self._headings: tuple[str | None, Array] = (None, np.full(len(PLACEMENTS), np.nan))
         self._pose: tuple[Array, list[str | None]] | None = None
         self._pose_off_deg = math.inf
 
     def update(self, sensors: Sequence[Sensor]) -> None:
-        """Compare the sensors, in the order of PLACEMENTS, as they are now."""
-        rests = [sensor.present_rest() for sensor in sensors]
-        there = [i for i, rest in enumerate(rests) if rest is not None]
-        present = [i for i, sensor in enumerate(sensors) if len(sensor.window)]
-        if len(there) < 2 or len(there) < len(present):
+        """Compare the sensors, in the order of PLACEMENTS, in their current state."""
+        resting = {i: rest for i, sensor in enumerate(sensors) if (rest := sensor.present_rest()) is not None}
+        reporting = sum(len(sensor.window) > 0 for sensor in sensors)
+        if len(resting) < 2 or len(resting) < reporting:
             return
-        own = [rest for rest in rests if rest is not None]
-        quats = np.stack([rest.quat for rest in own])
-        if is_table(own):
+        rests = list(resting.values())
+        quats = np.stack([rest.quat for rest in rests])
+        if is_table(rests):
             reset = turn_about_z(quats, quats[-1])
             if reset.error_deg.max() < RESET_TILT_LIMIT_DEG:
                 headings = np.full(len(PLACEMENTS), np.nan)
-                headings[there] = from_median(-reset.offset)
+                headings[list(resting)] = from_median(-reset.offset)
                 self._headings = "table", headings
-        elif self._calibration is not None and len(there) == len(PLACEMENTS):
+        elif self._calibration is not None and len(resting) == len(PLACEMENTS):
             self._compare_pose(self._calibration, quats)
 
     def result(self) -> list[dict[str, Any]]:
-        """Fields of the `SensorHealth` of each sensor."""
+        """Return fields for the `SensorHealth` of each sensor."""
         on, headings = self._headings
         fields: list[dict[str, Any]] = [
             {"heading_deg": heading, "heading_on": on} for heading in headings.tolist()
         ]
         if self._pose is not None:
-            for own, tilt, swap in zip(fields, self._pose[0].tolist(), self._pose[1], strict=True):
-                own |= {"pose_tilt_deg": tilt, "swapped_with": swap}
+            for sensor_fields, tilt, swap in zip(fields, self._pose[0].tolist(), self._pose[1], strict=True):
+                sensor_fields |= {"pose_tilt_deg": tilt, "swapped_with": swap}
         return fields
 
     def _compare_pose(self, calibration: Calibration, quats: Array) -> None:
-        """The sensors of a wearer who stands in the pose, or should."""
+        """Compare the sensors of a wearer who stands in the pose, or should."""
         fit = fit_pose(calibration, quats)
         if fit.off_deg > self._pose_off_deg + _POSE_OFF_DEG:
-            return  # they stood nearer to it before
+            return  # the wearer has been nearer to the pose before
         self._pose_off_deg = min(fit.off_deg, self._pose_off_deg)
         if fit.in_pose:
             self._headings = "body", fit.heading_deg
@@ -78,26 +77,26 @@ class HeadingComparison:
 
 
 def compare_values(sensors: Sequence[Sensor]) -> list[dict[str, Any]]:
-    """Fields of the `SensorHealth` of each sensor: values that are another's, or that stand still alone."""
+    """Return `SensorHealth` fields of each sensor: values equal to another's, or frozen alone."""
     fields: list[dict[str, Any]] = [{} for _ in sensors]
     values = [newest_values(sensor.window) for sensor in sensors]
-    for (i, own), (j, other) in combinations(enumerate(values), 2):
-        if FEWEST < len(own) * 0.8 <= len(own & other):
+    for (i, one), (j, other) in combinations(enumerate(values), 2):
+        if FEWEST < len(one) * 0.8 <= len(one & other):
             fields[i]["same_as"], fields[j]["same_as"] = PLACEMENTS[j], PLACEMENTS[i]
-    # A simulated rig at rest is constant as a whole, and not quite from the same time on.
+    # All sensors of a simulated rig at rest are constant, though not from exactly the same time.
     if sum(is_constant(sensor.window, FROZEN_S) is False for sensor in sensors) >= 2:
-        for own_fields, sensor in zip(fields, sensors, strict=True):
+        for sensor_fields, sensor in zip(fields, sensors, strict=True):
             if is_constant(sensor.window, 2.0 * FROZEN_S):
-                own_fields["frozen"] = "everything"
+                sensor_fields["frozen"] = "everything"
     return fields
 
 
 def _swaps(calibration: Calibration, quats: Array, tilt: Array) -> list[str | None]:
-    """For each sensor, the one with which exchanged both would stand in the pose."""
+    """Find for each sensor the one with which it must be swapped so that both fit the pose."""
     result: list[str | None] = [None] * len(PLACEMENTS)
     for i, j in combinations(np.flatnonzero(tilt > POSE_TILT_DEG), 2):
-        exchanged = quats.copy()
-        exchanged[[i, j]] = quats[[j, i]]
-        if headings_from_pose(calibration, exchanged).error_deg[[i, j]].max() < POSE_TILT_DEG:
+        swapped = quats.copy()
+        swapped[[i, j]] = quats[[j, i]]
+        if headings_from_pose(calibration, swapped).error_deg[[i, j]].max() < POSE_TILT_DEG:
             result[i], result[j] = PLACEMENTS[j], PLACEMENTS[i]
     return result

@@ -1,4 +1,4 @@
-"""What a sensor sends, and samples that lack a part of it or hold impossible numbers."""
+"""Quantities that a sensor sends, and samples that lack some of them or hold impossible numbers."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ class Completeness:
     """
 
     def __init__(self) -> None:
-        """Nothing is known."""
+        """Start with no sample counted."""
         self.has = dict.fromkeys(QUANTITIES, False)
         self._counted = self._incomplete = self._invalid = 0
 
     def update(self, window: Array, fresh: int) -> NDArray[np.bool_]:
-        """Which rows of the window (n, 15) have all that the sensor sends; so many at its end are new."""
+        """Return which rows of the window (n, 15) are complete; the last `fresh` rows are new."""
         measured = {name: ~np.isnan(window[:, columns]).any(axis=1) for name, columns in QUANTITIES.items()}
-        self.has = {name: bool(own.mean() > 0.2) for name, own in measured.items()}
+        self.has = {name: bool(rows.mean() > 0.2) for name, rows in measured.items()}
         needed = [measured[name] for name, has in self.has.items() if has]
         complete: NDArray[np.bool_] = np.all(needed, axis=0) if needed else np.zeros(len(window), bool)
         self._incomplete += int(np.count_nonzero(~complete[-fresh:]))
@@ -45,16 +45,16 @@ class Completeness:
         return complete
 
     def result(self) -> CompletenessResult:
-        """What is known."""
+        """Return the result so far."""
         percent = 100.0 * self._incomplete / max(1, self._counted)
         return CompletenessResult(self._invalid, **self.has, incomplete_percent=percent)
 
 
 def _invalid(rows: Array) -> int:
-    """Rows with a number that is NaN in part of a quantity, infinite, or a quaternion that is no rotation."""
+    """Count rows with an incomplete quantity, an infinite number, or a quaternion that is not a rotation."""
     bad = np.isinf(rows[:, :ARRIVAL]).any(axis=1)
     for columns in (*QUANTITIES.values(), MAG):
-        unknown = np.isnan(rows[:, columns])
-        bad |= unknown.any(axis=1) & ~unknown.all(axis=1)
+        missing = np.isnan(rows[:, columns])
+        bad |= missing.any(axis=1) & ~missing.all(axis=1)
     norm = np.linalg.norm(rows[:, QUAT], axis=1)
     return int(np.count_nonzero(bad | (np.abs(norm - 1.0) > 0.01)))

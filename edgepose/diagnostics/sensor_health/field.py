@@ -1,4 +1,4 @@
-"""The magnetic field about a sensor."""
+"""Strength of the magnetic field at a sensor."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class FieldResult(NamedTuple):
 
 
 def measure_field(window: Array) -> FieldResult:
-    """Length of the field and its changes in the newest rows (n, 15); nothing older counts."""
+    """Measure the field's strength and its changes in the newest rows (n, 15) only."""
     norms = np.linalg.norm(window[:, MAG], axis=1)
     norms = norms[np.isfinite(norms)]
     if not len(norms):

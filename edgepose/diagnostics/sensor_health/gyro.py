@@ -1,4 +1,4 @@
-"""Whether gyroscope and orientation tell of the same motion."""
+"""Agreement between gyroscope and orientation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from edgepose import rotations as rot
 from edgepose.diagnostics.sensor_health.columns import GYR, QUAT, TIME
 from edgepose.rotations import Array
 
-_STEP_S, _LEAST, _MOST = 0.1, math.radians(3.0), 1.0  # step, and rotations in a step, rad
+_STEP_S, _LEAST, _MOST = 0.1, math.radians(3.0), 1.0  # step, and range of rotations in a step, rad
 _FEWEST_STEPS = 10
 
 
@@ -25,10 +25,10 @@ class GyroResult(NamedTuple):
 
 
 class GyroAgreement:
-    """Sums over how far orientation and gyroscope turn in steps of a tenth of a second."""
+    """Sums over the rotations of orientation and gyroscope in steps of a tenth of a second."""
 
     def __init__(self) -> None:
-        """Nothing is known."""
+        """Start with no step."""
         self._products = np.zeros((3, 3))  # of orientation (row) and gyroscope
         self._squares = np.zeros(2)
         self._steps = 0
@@ -51,7 +51,7 @@ class GyroAgreement:
         self._steps += int(np.count_nonzero(use))
 
     def result(self) -> GyroResult:
-        """What is known."""
+        """Return the result so far."""
         if self._steps < _FEWEST_STEPS or not self._squares.all():
             return GyroResult()
         size = math.sqrt(self._squares.prod())

@@ -1,4 +1,4 @@
-"""All sensors of a rig."""
+"""Health monitor for all sensors of a rig."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
 from edgepose.sources.clock_sync import DeviceClock
 
-_FOLD_S = 2.0  # how often samples become numbers where nobody asks for them
+_FOLD_S = 2.0  # time between two measurements if no report is requested
 _MOST_PENDING = 5000
 
 
 class SensorHealthMonitor:
-    """Takes the samples of a rig and says at any time how its sensors do."""
+    """Takes the samples of a rig and reports the health of its sensors at any time."""
 
     def __init__(self, calibration: Calibration | None = None) -> None:
-        """Start with no sample seen; with a calibration, headings and placements are judged on the body."""
+        """Create the monitor; with a calibration, headings and placements are checked on the body."""
         self._sensors = [Sensor() for _ in PLACEMENTS]
         self._headings = HeadingComparison(calibration)
         self._next_fold_s = -math.inf
 
     def add(self, samples: Iterable[ImuSample], arrival_s: float = math.nan) -> None:
-        """Take samples in.
+        """Take samples.
 
         Args:
             samples: of any sensors, each sensor's in time order.
-            arrival_s: when they came, on their clock, seconds; NaN if nobody knows.
+            arrival_s: time of their arrival, on their clock, seconds; NaN if unknown.
         """
         for sample in samples:
             pending = self._sensors[sample.sensor].pending
@@ -43,10 +43,10 @@ class SensorHealthMonitor:
                 self._next_fold_s = sample.time_s + _FOLD_S
 
     def report(self, now_s: float, clocks: Mapping[int, DeviceClock] | None = None) -> list[SensorHealth]:
-        """What is known of the sensors, in the order of PLACEMENTS.
+        """Return the health of the sensors, in the order of PLACEMENTS.
 
         Args:
-            now_s: time up to which all samples have been taken in, on their clock, seconds.
+            now_s: time up to which all samples have been added, on their clock, seconds.
             clocks: of the sensors that send a time.
         """
         self._fold()

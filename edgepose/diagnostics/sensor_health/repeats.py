@@ -1,4 +1,4 @@
-"""Values that stand still or come again where they should change, and values at the end of a range."""
+"""Values that freeze or repeat where they should change, and values at the end of a range."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from edgepose.diagnostics.sensor_health.columns import (
 from edgepose.rotations import Array
 
 FROZEN_S = 1.0
-"""What is the same for so long, in motion, is frozen, seconds."""
+"""Time without change, in motion, after which a quantity counts as frozen, seconds."""
 
 _FULL_SCALES = {
     "acceleration": np.array([2, 4, 6, 8, 16, 32]) * GRAVITY,
@@ -40,21 +40,21 @@ class RepeatsResult(NamedTuple):
 
 
 class Repeats:
-    """Samples that are the same as the one before, in motion."""
+    """Counts samples that are the same as the one before, in motion."""
 
     def __init__(self) -> None:
-        """Nothing is known."""
+        """Start with no row counted."""
         self._moved = self._repeated = 0
         self._frozen: str | None = None
         self._saturated: set[str] = set()
 
     def update(self, rows: Array, still: NDArray[np.bool_], new: int, period_s: float) -> None:
-        """Take in rows.
+        """Take rows.
 
         Args:
-            rows: (n, 15) newest rows that have all that the sensor sends.
+            rows: (n, 15) newest complete rows.
             still: (n,) which of them are at rest.
-            new: how many at their end are new.
+            new: number of new rows, at the end.
             period_s: mean interval between them, seconds.
         """
         values = rows[:, MOTION]
@@ -70,7 +70,7 @@ class Repeats:
                 self._saturated.add(name)
 
     def result(self) -> RepeatsResult:
-        """What is known."""
+        """Return the result so far."""
         return RepeatsResult(
             100.0 * self._repeated / self._moved if self._moved >= FEWEST else math.nan,
             self._frozen,
@@ -79,12 +79,12 @@ class Repeats:
 
 
 def newest_values(window: Array) -> set[bytes]:
-    """The newest different samples of a window (n, 15)."""
+    """Return the distinct newest samples of a window (n, 15)."""
     return {row.tobytes() for row in window[-300:, MOTION]}
 
 
 def is_constant(window: Array, seconds: float) -> bool | None:
-    """Whether all rows of the last seconds of a window (n, 15) are the same; None if there are too few."""
+    """Return whether the last seconds of a window (n, 15) are constant; None if there are too few rows."""
     if not len(window):
         return None
     values = window[window[:, TIME] > window[-1, TIME] - seconds][:, MOTION]
@@ -94,7 +94,7 @@ def is_constant(window: Array, seconds: float) -> bool | None:
 
 
 def _frozen(rows: Array) -> str | None:
-    """A quantity that does not change in rows in which others say that the sensor moves."""
+    """Return a quantity that does not change in rows in which others show motion."""
     moving = {
         "orientation": 2.0 * math.degrees(deviation(rot.quat_continuous(rows[:, QUAT]))) > 5.0,
         "acceleration": deviation(rows[:, ACC]) > 1.0,
@@ -111,7 +111,7 @@ def _frozen(rows: Array) -> str | None:
 
 
 def _saturates(values: Array, full_scales: Array) -> bool:
-    """Whether a number stays the same for three rows, near the end of a usual range."""
+    """Return whether a number stays the same for three rows, near the end of a usual range."""
     size = np.abs(values)
     same = (size[2:] == size[1:-1]) & (size[1:-1] == size[:-2])
     stuck = size[2:][same]

@@ -1,4 +1,4 @@
-"""The result of all measurements of one sensor."""
+"""Result of all measurements of one sensor."""
 
 from __future__ import annotations
 
@@ -8,39 +8,40 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class SensorHealth:
-    """What is known of one sensor; NaN and None where it is not.
+    """Health of one sensor; NaN and None mean unknown.
 
     Attributes:
         placement: its name.
-        samples: that have come.
-        age_s: of the newest one.
-        rate_hz: samples a second, gaps left out.
-        jitter_ms: deviation of the intervals, gaps left out.
-        lost: samples missing in the times of the sensor, lost_percent of all.
+        samples: number of samples so far.
+        age_s: age of the newest sample.
+        rate_hz: samples a second, without gaps.
+        jitter_ms: deviation of the intervals, without gaps.
+        lost: number of samples missing in the sensor's times; lost_percent: their share of all.
         late_ms: 95 % of the packets come no later than this after the fastest ones.
-        invalid: samples with a NaN or with a quaternion that is no rotation.
-        orientation: whether it sends one; acceleration, gyroscope and magnetometer alike.
-        incomplete_percent: samples without something that others have.
-        rests: attitudes in which it has been at rest.
-        norm_m_s2: length of the acceleration at rest; 9.81.
-        gravity_error_m_s2: largest length of R f + g at rest; 0.
+        invalid: number of samples with a NaN or with a quaternion that is not a rotation.
+        orientation: whether it sends one; acceleration, gyroscope and magnetometer likewise.
+        incomplete_percent: samples without a quantity that others have.
+        rests: number of attitudes in which it has been at rest.
+        norm_m_s2: length of the acceleration at rest; ideally 9.81.
+        gravity_error_m_s2: largest length of R f + g at rest; ideally 0.
         tilt_deg: largest angle at rest between the acceleration in the inertial frame and up.
-        convention: what would explain that angle.
-        acc_noise_m_s2: deviation of the acceleration at rest, gyr_noise_deg_s that of the rate.
+        convention: a convention that would explain that angle.
+        acc_noise_m_s2: deviation of the acceleration at rest; gyr_noise_deg_s: that of the rate.
         bias_deg_s: mean rate at rest.
-        clock_ppm: what the device's clock loses against this machine's, with its standard error.
-        clock_restarts: times that it began anew.
-        field_ut: median length of the magnetic field, in uT or in the device's own unit.
-        field_change_percent: between the 5th and 95th percentile of that length.
+        clock_ppm: loss of the device's clock against this machine's; clock_ppm_error: its standard error.
+        clock_restarts: number of restarts of the device's clock.
+        field_ut: median strength of the magnetic field, in uT or in the device's own unit.
+        field_change_percent: range of that strength from the 5th to the 95th percentile.
         heading_deg: against the median of all sensors, lying side by side or standing in the pose.
         heading_on: "table" or "body".
         pose_tilt_deg: tilt against the calibration's pose in which the wearer stands.
-        swapped_with: the placement with which exchanged it would stand in that pose.
+        swapped_with: the placement with which it must be swapped to fit that pose.
         repeated_percent: samples that are the same as the one before, in motion.
-        frozen: what stands still while the sensor moves, or "everything" while the others go on.
-        saturated: what has been at the end of its range.
+        frozen: quantity that does not change while the sensor moves, or "everything" if only the other
+            sensors change.
+        saturated: quantities that have been at the end of their range.
         gyro_ratio: rate of the gyroscope over that of the orientation.
-        gyro_agreement: correlation of the two; 1.
+        gyro_agreement: correlation of the two; ideally 1.
         gyro_exchanged: the same with the best exchange of axes and signs.
         two_devices_deg: angle between two devices that alternate under this name.
         same_as: a placement that sends the same values.

@@ -1,4 +1,4 @@
-"""Times at rest, in which a sensor should measure gravity and nothing else."""
+"""Detection of rests, in which a sensor should measure gravity and nothing else."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from edgepose.diagnostics.sensor_health.columns import ACC, GYR, QUANTITIES, QUA
 from edgepose.rotations import Array
 
 REST_S, REST_ACC, REST_GYR_DEG_S, REST_TURN_DEG = 1.5, 0.5, 2.0, 1.0
-"""At rest: for so long, two of acceleration (m/s^2), rate and orientation deviate by less."""
+"""At rest: for `REST_S`, two of acceleration (m/s^2), rate and orientation deviate by less than this."""
 
 _RESTS = 8  # attitudes that are kept
 _OTHER_ATTITUDE_DEG = 10.0
@@ -30,7 +30,7 @@ class Rest(NamedTuple):
         quat: (4,) orientation; NaN where it is not measured.
         acc: (3,) specific force in the sensor's frame, m/s^2.
         force: (3,) the same in the inertial frame; NaN without orientation.
-        turn_deg: deviation of the orientation.
+        turn_deg: deviation of the orientation, degrees.
         acc_noise: deviation of the acceleration, m/s^2.
         gyr_noise: deviation of the rate, rad/s.
         bias: length of the mean rate, rad/s.
@@ -63,15 +63,15 @@ class Rests:
     """The newest rest in each attitude of a sensor."""
 
     def __init__(self) -> None:
-        """None is known."""
+        """Start with no rest."""
         self._rests: list[Rest] = []
 
     def update(self, rows: Array, has: Mapping[str, bool], period_s: float) -> NDArray[np.bool_]:
-        """Which of the rows are at rest; the rests among them become known.
+        """Find the rests in the newest rows, and return which of the rows are at rest.
 
         Args:
-            rows: (n, 15) newest rows that have all that the sensor sends.
-            has: what that is.
+            rows: (n, 15) newest complete rows.
+            has: which quantities the sensor sends.
             period_s: mean interval between them, seconds.
         """
         n = max(10, round(REST_S / period_s)) if period_s > 0.0 else len(rows)
@@ -93,31 +93,32 @@ class Rests:
         edges = np.flatnonzero(np.diff(ends, prepend=False, append=False))
         still = np.zeros(len(rows), bool)
         for first, end in edges.reshape(-1, 2):
-            # One that is of another unit, or broken, has no say; but a wearer trembles for a moment.
+            # A quantity in a wrong unit, or broken, is outvoted, but only in a long rest: a wearer's tremor
+            # is short.
             if votes[first:end].max() < measured and end - first < n:
                 continue
             start = max(0, first - n + 1)
             still[start:end] = True
-            # A rest ends with the beginning of a motion: its stillest part counts.
+            # The end of a rest includes the start of a motion, so use its stillest part.
             best = first + int(np.argmin(shaking[first:end]))
             self._keep(_rest(rows[best - n + 1 : best + 1], float(rows[end - 1, TIME])))
         return still
 
     def _keep(self, rest: Rest) -> None:
-        """The newest rest of every attitude."""
+        """Store a rest as the newest of its attitude."""
         others = [old for old in self._rests if _is_other(old, rest)]
         self._rests = [*others[1 - _RESTS :], rest]
 
     def lasting(self, since_s: float) -> Rest | None:
-        """The newest rest, if it has not ended before that time."""
+        """Return the newest rest, if it has not ended before `since_s`."""
         return self._rests[-1] if self._rests and self._rests[-1].end_s >= since_s else None
 
     def result(self, has: Mapping[str, bool]) -> RestResult:
-        """What the rests tell of a sensor that sends what `has` says."""
+        """Return the result so far; `has` says which quantities the sensor sends."""
         if not self._rests:
             return RestResult()
         rest = self._rests[-1]
-        alone = RestResult(
+        result = RestResult(
             len(self._rests),
             float(np.linalg.norm(rest.acc)),
             rest.acc_noise,
@@ -125,19 +126,19 @@ class Rests:
             math.degrees(rest.bias),
         )
         if not (has["orientation"] and has["acceleration"]):
-            return alone
-        forces = np.stack([own.force for own in self._rests])
+            return result
+        forces = np.stack([kept.force for kept in self._rests])
         tilt = max(map(tilt_deg, forces))
         convention = None
         if tilt > GRAVITY_TILT_LIMIT_DEG:
-            quats = np.stack([own.quat for own in self._rests])
-            convention = diagnose_gravity_direction(quats, np.stack([own.acc for own in self._rests]))
+            quats = np.stack([kept.quat for kept in self._rests])
+            convention = diagnose_gravity_direction(quats, np.stack([kept.acc for kept in self._rests]))
         error = float(np.linalg.norm(forces - [0.0, 0.0, GRAVITY], axis=1).max())
-        return alone._replace(gravity_error_m_s2=error, tilt_deg=tilt, convention=convention)
+        return result._replace(gravity_error_m_s2=error, tilt_deg=tilt, convention=convention)
 
 
 def is_table(rests: Sequence[Rest]) -> bool:
-    """Whether sensors lie side by side in one attitude, stiller than anybody stands."""
+    """Return whether sensors lie side by side in one attitude, stiller than on any wearer."""
     up = np.stack([rest.acc / max(float(np.linalg.norm(rest.acc)), 1e-9) for rest in rests])
     tilt = np.degrees(np.arccos(np.clip(up @ up.T, -1.0, 1.0)))
     noise = [math.degrees(rest.gyr_noise) for rest in rests if math.isfinite(rest.gyr_noise)]
@@ -149,8 +150,7 @@ def is_table(rests: Sequence[Rest]) -> bool:
 
 
 def _moving_deviation(values: Array, n: int) -> Array:
-    """Standard deviation, over all columns together, of the n rows up to each; infinite where there are
-    fewer."""
+    """Return the standard deviation, over all columns together, of the n rows up to each; inf if fewer."""
     result = np.full(len(values), np.inf)
     if len(values) < n:
         return result
@@ -178,7 +178,7 @@ def _rest(rows: Array, end_s: float) -> Rest:
 
 
 def _is_other(old: Rest, new: Rest) -> bool:
-    """Whether two rests are of different attitudes against gravity."""
+    """Return whether two rests are in different attitudes relative to gravity."""
     size = float(np.linalg.norm(old.acc) * np.linalg.norm(new.acc))
     if not size > 0.0:
         return False

@@ -24,12 +24,12 @@ class Sensor:
     """Keeps the newest rows of a sensor and passes each to the measurements once.
 
     Attributes:
-        pending: rows that have come since the last `fold`, see `columns`.
-        window: (n, 15) the newest rows before that.
+        pending: rows since the last `fold`, see `columns`.
+        window: (n, 15) the newest rows before the last `fold`.
     """
 
     def __init__(self) -> None:
-        """Nothing has come."""
+        """Start with no samples."""
         self.pending: list[tuple[float, ...]] = []
         self.window = np.empty((0, WIDTH))
         self._samples = 0
@@ -39,7 +39,7 @@ class Sensor:
         self._rests, self._repeats, self._gyro = Rests(), Repeats(), GyroAgreement()
 
     def fold(self) -> None:
-        """Measure the samples that have come since the last time."""
+        """Measure the pending samples."""
         if self.pending:
             self._extend(np.array(self.pending))
             self.pending = []
@@ -48,7 +48,7 @@ class Sensor:
             self._fresh = 0
 
     def _extend(self, new: Array) -> None:
-        """Move the window on."""
+        """Move the window forward over new rows."""
         if not self._samples:
             self._first_s = float(new[0, TIME])
         self._samples += len(new)
@@ -71,13 +71,13 @@ class Sensor:
             self._gyro.update(rows[-new - 1 :], period_s)
 
     def present_rest(self) -> Rest | None:
-        """The rest that lasts up to now, of a sensor with orientation."""
+        """Return the current rest of a sensor with orientation; None if it moves."""
         if not self._completeness.has["orientation"]:
             return None
         return self._rests.lasting(self.window[-1, TIME] - 3.0 * self._timing.period_s)
 
     def health(self, placement: str, now_s: float) -> SensorHealth:
-        """What is known of this sensor alone."""
+        """Return the health of this sensor, without comparisons to others."""
         if not self._samples:
             return SensorHealth(placement)
         return SensorHealth(
@@ -93,7 +93,7 @@ class Sensor:
         )
 
     def _two_devices_deg(self) -> float | None:
-        """Angle between two devices that alternate under one name."""
+        """Return the angle between two devices that alternate under one name; None if it is one device."""
         if not self._completeness.has["orientation"]:
             return None
         quats = self.window[-200:, QUAT]

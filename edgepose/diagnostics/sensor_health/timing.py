@@ -1,4 +1,4 @@
-"""When samples were measured and when they came: period, jitter, losses, delay."""
+"""Timing of samples and of their arrival: period, jitter, losses, delay."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from edgepose.diagnostics.sensor_health.columns import ARRIVAL, TIME
 from edgepose.rotations import Array
 
 _GAP = 1.5  # periods
-_SETTLE_S, _LATE_LEAST_S = 2.0, 3.0  # what has waited in the system comes first
+_SETTLE_S, _LATE_LEAST_S = 2.0, 3.0  # the first packets have waited in the system's buffers
 
 
 class TimingResult(NamedTuple):
@@ -26,26 +26,26 @@ class TimingResult(NamedTuple):
 
 
 class Timing:
-    """Period of the samples, and what is missing between them.
+    """Measures the period of the samples and counts missing ones.
 
     Attributes:
-        period_s: mean interval between samples, gaps left out, seconds; NaN until it is known.
+        period_s: mean interval between samples, without gaps, seconds; NaN until it is known.
     """
 
     def __init__(self) -> None:
-        """Nothing is known."""
+        """Start with no samples."""
         self.period_s = self._jitter_s = math.nan
         self._lost = 0
 
     def update(self, window: Array, fresh: int) -> None:
-        """Measure the window (n, 15), at the end of which so many rows are new."""
+        """Measure the window (n, 15), whose last `fresh` rows are new."""
         times = window[:, TIME]
         intervals = np.diff(times)
         middle = float(np.median(intervals))
         if not middle > 0.0:
             return
         steps = intervals / middle
-        # Only where nearly all intervals are multiples of one does a long one mean that something is missing.
+        # A long interval only means missing samples if nearly all intervals are multiples of one.
         regular = np.mean(np.abs(steps - np.round(steps)) < 0.2) > 0.9
         usual = intervals[steps < _GAP] if regular else intervals
         self.period_s, self._jitter_s = float(usual.mean()), float(usual.std())
@@ -54,13 +54,13 @@ class Timing:
             self._lost += int(np.round(steps[steps > _GAP] - 1.0).sum())
 
     def result(self, window: Array, samples: int, first_s: float, now_s: float) -> TimingResult:
-        """What is known at a time.
+        """Return the result at a time.
 
         Args:
             window: (n, 15) newest rows, at least one.
-            samples: that have come in all.
+            samples: number of all samples so far.
             first_s: time of the first of all samples.
-            now_s: the time.
+            now_s: current time.
         """
         return TimingResult(
             max(0.0, now_s - float(window[-1, TIME])),
@@ -73,7 +73,7 @@ class Timing:
 
 
 def _late_s(rows: Array) -> float:
-    """How much later than the fastest packets most come, once the device's clock is known."""
+    """Return the delay of most packets against the fastest ones, once the device's clock is known."""
     if not len(rows) or rows[-1, TIME] - rows[0, TIME] < _LATE_LEAST_S:
         return math.nan
     low, high = np.percentile(rows[:, ARRIVAL] - rows[:, TIME], [5, 95])

@@ -1,1 +1,1 @@
-"""Files of poses."""
+"""Formats of pose files."""

@@ -1,4 +1,4 @@
-"""What all formats of poses share."""
+"""Base of all pose formats."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from edgepose.formats.registered import FileFormat
 from edgepose.pose import PoseSequence
 
 LARGEST_TIME = 1e12
-"""Seconds, and numbers of frames, beyond this are taken for damage."""
+"""Larger times, in seconds, and frame numbers count as damage."""
 
 
 @dataclass(frozen=True)
@@ -23,9 +23,9 @@ class PoseFormat(FileFormat):
     """A format of poses; the module of each format ends with its `FORMAT`.
 
     Attributes:
-        read: returns the poses before the first bad one, and one line on what is bad or None. Raises
+        read: returns the poses before the first bad one, and one line on the problem, or None. Raises
             EdgeposeError if no pose is usable.
-        holds_poses: whether a file with one of the suffixes holds poses and not a recording of sensors; by
+        holds_poses: whether a file with one of the suffixes contains poses and not a recording of sensors; by
             default all do.
     """
 
@@ -34,10 +34,10 @@ class PoseFormat(FileFormat):
 
 
 def all_new(count: int) -> tuple[list[frozenset[str]], list[bool]]:
-    """`held` and `warming_up` of poses of which nothing is known to be missing."""
+    """Return `held` and `warming_up` of `count` complete poses."""
     return [frozenset()] * count, [False] * count
 
 
 def is_absurd(values: NDArray[Any], most: float = LARGEST) -> NDArray[np.bool_]:
-    """Which of the numbers are NaN, or too large to be true."""
+    """Return which of the numbers are NaN or implausibly large."""
     return ~(np.abs(values.astype(np.float64)) <= most)

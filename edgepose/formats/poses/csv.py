@@ -1,4 +1,4 @@
-"""Poses as CSV, in any of the representations of `edgepose run`."""
+"""Poses from CSV files, in any of the representations of `edgepose run`."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ from edgepose.skeleton import JOINTS
 Array = NDArray[np.float64]
 
 MAX_LINE = 16_384
-"""Characters; a true row has less than 4000, and a file without line breaks must not fill the memory."""
+"""Longest line, characters; valid rows have fewer than 4000, and an endless line must not fill memory."""
 
 BLOCK = 4096
-"""Poses that are read from a CSV file at a time."""
+"""Poses read from a CSV file at a time."""
 
 _HEADER = b"frame,time_s,status,"
 
 
 def read_csv(path: Path) -> tuple[PoseSequence, str | None]:
-    """The poses before the first bad one, and what is wrong with that; "-" is standard input."""
+    """Read the poses before the first bad one, and the problem with that one; "-" is standard input."""
     blocks: list[PoseSequence] = []
     problem = None
     try:
-        blocks.extend(read_blocks(path))  # one by one: what has come before an error stays
+        blocks.extend(read_blocks(path))  # keeps the blocks before an error
     except EdgeposeError as error:
         if not blocks:
             raise
@@ -47,18 +47,19 @@ def read_csv(path: Path) -> tuple[PoseSequence, str | None]:
 
 
 def read_blocks(path: str | Path) -> Iterator[PoseSequence]:
-    """Poses of a CSV file in blocks of up to `BLOCK`, at least one, in any of the representations, which
-    is found from its header; "-" is standard input.
+    """Yield the poses of a CSV file in one or more blocks of up to `BLOCK`; "-" is standard input.
+
+    The header shows which representation the file has.
 
     Raises:
-        FileFormatError: no such file, or not a file of poses; names the row, counted from 1 for the header.
-            All poses before that have come.
+        FileFormatError: no such file, or not a file of poses; names the row, where the header is row 1. All
+            poses before that row have been yielded.
     """
     if str(path) == "-":
         yield from _read_rows(sys.stdin, "standard input")
         return
     try:
-        # A byte that is no text spoils its row, not the block that is read with it.
+        # With "replace", a byte that is not text invalidates only its row.
         with Path(path).open(encoding="utf-8-sig", errors="replace", newline="") as file:
             yield from _read_rows(file, str(path))
     except OSError as error:
@@ -66,7 +67,7 @@ def read_blocks(path: str | Path) -> Iterator[PoseSequence]:
 
 
 class _BadRowError(FileFormatError):
-    """A row that is no pose; `row` is its number, counted from 1 for the header."""
+    """A row that is not a pose; `row` is its number, where the header is row 1."""
 
     def __init__(self, name: str, row: int, problem: str) -> None:
         super().__init__(f"{name}, row {row}: {problem}")
@@ -84,7 +85,7 @@ def _read_rows(file: TextIO, name: str) -> Iterator[PoseSequence]:
             read = partial(
                 _block, first=first, last=last, columns=columns, form=form, has_translation=moves, name=name
             )
-            poses, error = _good(block, first, read)
+            poses, error = _good_rows(block, first, read)
             if poses is not None:
                 first, last = first + len(poses.frames), (int(poses.frames[-1]), float(poses.time_s[-1]))
                 yield poses
@@ -98,10 +99,10 @@ def _read_rows(file: TextIO, name: str) -> Iterator[PoseSequence]:
         raise FileFormatError(f"{name} has no poses, only a header")
 
 
-def _good(
+def _good_rows(
     rows: list[list[str]], first: int, read: Callable[[list[list[str]]], PoseSequence]
 ) -> tuple[PoseSequence | None, EdgeposeError | None]:
-    """The poses before the first bad row, and what is wrong with that; the first row has number `first`."""
+    """Return the poses before the first bad row, and its problem; the first row has number `first`."""
     problem = None
     while rows:
         try:
@@ -117,13 +118,13 @@ _TOO_LONG = "the line is too long for a file of poses"
 def _lines(file: TextIO) -> Iterator[str]:
     while line := file.readline(MAX_LINE):
         if len(line) == MAX_LINE:
-            yield _TOO_LONG  # a bad row, and the rows before it stay good
+            yield _TOO_LONG  # a bad row; the rows before it stay valid
             return
         yield line
 
 
 def _recognise(header: list[str], name: str) -> tuple[str, bool, bool]:
-    """Representation, whether there are standard deviations and translation, as a header announces them."""
+    """Return representation, whether there are standard deviations, and whether there is a translation."""
     for form in ROTATION_FORMATS:
         for std in (False, True):
             for moves in (False, True):
@@ -146,7 +147,7 @@ def _block(
     has_translation: bool,
     name: str,
 ) -> PoseSequence:
-    """Poses of rows of which the first has number `first`, after the frame and time `last`."""
+    """Parse rows, starting with number `first`, that follow the frame number and time `last`."""
     frame_before, time_before = last or (None, -np.inf)
     frames, times, numbers = array("q"), array("d"), array("d")
     held, warming_up = list[frozenset[str]](), list[bool]()
@@ -177,8 +178,8 @@ def _block(
     numbered = np.frombuffer(frames, np.int64)
     bad = is_absurd(seconds, LARGEST_TIME) | is_absurd(numbered, LARGEST_TIME) | is_absurd(values).any(axis=1)
     if bad.any():
-        what = "a number is infinite or not a number, or far too large"
-        raise _BadRowError(name, int(bad.argmax()) + first, what)
+        problem = "a number is infinite or not a number, or far too large"
+        raise _BadRowError(name, int(bad.argmax()) + first, problem)
     width = len(ROTATION_FORMATS[form])
     rotations, off = _rotations(
         form, values[:, : len(JOINTS) * width].reshape(len(frames), len(JOINTS), width)
@@ -186,13 +187,14 @@ def _block(
     if (off > 1e-3).any():
         at, joint = np.argwhere(off > 1e-3)[0].tolist()
         raise _BadRowError(name, at + first, f"the numbers of {JOINTS[joint]} are not a rotation")
-    where = values[:, -3:] if has_translation else None
-    return PoseSequence(numbered, seconds, rotations, where, held, warming_up)
+    translation = values[:, -3:] if has_translation else None
+    return PoseSequence(numbered, seconds, rotations, translation, held, warming_up)
 
 
 def _rotations(form: str, values: Array) -> tuple[Array, Array]:
-    """Rotation matrices (T, 24, 3, 3) of the numbers (T, 24, n) of one representation, and how far (T, 24)
-    these are from any rotation's.
+    """Convert numbers (T, 24, n) of one representation to matrices (T, 24, 3, 3).
+
+    The second result (T, 24) is the deviation of the numbers from those of a rotation.
     """
     none = np.zeros(values.shape[:2])
     if form == "axis-angle":
@@ -203,7 +205,7 @@ def _rotations(form: str, values: Array) -> tuple[Array, Array]:
         norms = np.linalg.norm(values, axis=-1, keepdims=True)
         return quat_to_matrix(values / np.where(norms > 0.0, norms, 1.0)), np.abs(norms[..., 0] - 1.0)
     matrices = values.reshape(*values.shape[:-1], 3, 3)
-    # Six written digits leave a matrix a little off a rotation; anything further is not one.
+    # Six digits leave a matrix slightly off a rotation; anything further off is not a rotation.
     nearest = nearest_rotation(matrices)
     return nearest, np.abs(matrices - nearest).max(axis=(-2, -1))
 
@@ -221,7 +223,7 @@ def _concatenate(blocks: list[PoseSequence]) -> PoseSequence:
 
 
 def holds_poses(path: Path) -> bool:
-    """Whether a file starts as a CSV file of poses does; "-" is standard input, which stays unread."""
+    """Return whether a file starts like a CSV file of poses; "-" is standard input, which stays unread."""
     try:
         if str(path) == "-":
             return _starts_as_poses(cast(BufferedReader, sys.stdin.buffer).peek(32))
@@ -232,7 +234,7 @@ def holds_poses(path: Path) -> bool:
 
 
 def _starts_as_poses(start: bytes) -> bool:
-    # Of a pipe only a few bytes may have come; recordings start with other ones.
+    # A pipe may have delivered only a few bytes so far; recordings start with different ones.
     start = start.removeprefix(b"\xef\xbb\xbf")[: len(_HEADER)]
     return start != b"" and _HEADER.startswith(start)
 

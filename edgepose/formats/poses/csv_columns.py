@@ -1,4 +1,4 @@
-"""Columns of poses as comma-separated values, described in docs/reference/outputs.md."""
+"""Columns of pose CSV files, described in docs/reference/outputs.md."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ ROTATION_FORMATS = {
     "matrix": ("r00", "r01", "r02", "r10", "r11", "r12", "r20", "r21", "r22"),
     "euler": ("rz", "rx", "ry"),
 }
-"""Column endings of each representation; euler: R = Rz Rx Ry, turns about the axes as they have moved."""
+"""Column endings of each representation; euler: R = Rz Rx Ry, rotations about the moving axes."""
 
 
 def pose_columns(rotations: str, std: bool, translation: bool = False) -> list[str]:
-    """Names of all columns, in order; `rotations` is a key of `ROTATION_FORMATS`."""
+    """Return the names of all columns, in order; `rotations` is a key of `ROTATION_FORMATS`."""
     names = ["frame", "time_s", "status"] + [
         f"{joint}_{end}" for joint in JOINTS for end in ROTATION_FORMATS[rotations]
     ]
@@ -28,7 +28,7 @@ def pose_columns(rotations: str, std: bool, translation: bool = False) -> list[s
 
 
 def numbers(rotations: str, matrices: NDArray[Any]) -> NDArray[Any]:
-    """Rotation matrices (24, 3, 3) in the representation `rotations`, (24, n)."""
+    """Convert rotation matrices (24, 3, 3) to the representation `rotations`, (24, n)."""
     if rotations == "axis-angle":
         return matrix_to_rotvec(matrices)
     if rotations == "quat":

@@ -1,4 +1,4 @@
-"""True poses in the pickles of DIP-IMU, and of TotalCapture as DIP's authors publish it."""
+"""True poses from the pickles of DIP-IMU, and of TotalCapture as published by DIP's authors."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from edgepose.pose import PoseSequence
 
 
 def read_dip(path: Path) -> tuple[PoseSequence, None]:
-    """True poses of DIP-IMU or of DIP's TotalCapture."""
+    """Read the true poses of DIP-IMU or of DIP's TotalCapture."""
     rotations = dip_imu.read_true_pose(path)
     count = len(rotations)
     frames = np.arange(count)
     return PoseSequence(frames, frames / dip_imu.RATE, rotations, None, *all_new(count)), None
 
 
-# Such a file is a recording of sensors; its poses are read where poses are asked for.
+# Such a file counts as a recording of sensors; its poses are only read where poses are needed.
 FORMAT = PoseFormat((".pkl",), read_dip, holds_poses=lambda path: False)

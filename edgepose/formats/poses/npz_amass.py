@@ -1,4 +1,4 @@
-"""Poses as NPZ with the keys of AMASS; the arrays are in docs/reference/outputs.md."""
+"""Poses as NPZ with the keys of AMASS; docs/reference/outputs.md describes the arrays."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ Array = NDArray[np.float64]
 BETAS = 16
 """Shape coefficients of SMPL; all are zero, the average body."""
 
-_POSE_BYTES = 8 * 9 * len(JOINTS)  # that a pose takes
+_POSE_BYTES = 8 * 9 * len(JOINTS)  # memory for a pose
 
 
 # --- reading ------------------------------------------------------------------------------------------------
 
 
 def read_npz(path: Path) -> tuple[PoseSequence, None]:
-    """Poses of an AMASS file, in its world with Z up, or the true poses of a recording, which are in T.
+    """Read the poses of an AMASS file, in its world with Z up, or the true poses of a recording, in T.
 
-    Frames, times and status are there if edgepose has written the file. Of SMPL-H and SMPL-X the body's 22
-    joints are taken, hands stay at rest.
+    Frames, times and status are included if edgepose wrote the file. From SMPL-H and SMPL-X the 22 joints of
+    the body are taken; hands stay at rest.
     """
     arrays, in_t = _load(path)
     if "poses" not in arrays or arrays["poses"].ndim != 2 or not len(arrays["poses"]):
@@ -49,7 +49,7 @@ def read_npz(path: Path) -> tuple[PoseSequence, None]:
     rotations[:, :joints] = rotvec_to_matrix(vectors)
     translation = _numbers(path, arrays, "trans", (count, 3)) if "trans" in arrays else None
     if translation is not None and not translation.any():
-        translation = None  # AMASS wants the array where nothing is known, too
+        translation = None  # AMASS requires the array even if the translation is unknown
     if not in_t:
         rotations[:, 0] = Z_UP_TO_T @ rotations[:, 0]
         translation = None if translation is None else translation @ Z_UP_TO_T.T
@@ -58,7 +58,7 @@ def read_npz(path: Path) -> tuple[PoseSequence, None]:
 
 
 def _load(path: Path) -> tuple[dict[str, NDArray[Any]], bool]:
-    """The arrays of a file that matter, and whether it is a recording with true poses in T."""
+    """Load the relevant arrays of a file, and whether it is a recording with true poses in T."""
     wanted = ("poses", "trans", "mocap_framerate", "mocap_frame_rate", "time_s", "frame", "held", "filling")
     try:
         names = member_names(path)
@@ -68,14 +68,14 @@ def _load(path: Path) -> tuple[dict[str, NDArray[Any]], bool]:
         raise FileFormatError(f"cannot read poses from {path}: {error.strerror or error}") from error
     except BROKEN as error:
         reason = " ".join(str(error).split())
-        raise FileFormatError(f"{path}: not a whole NPZ file ({reason}); copy it again") from None
+        raise FileFormatError(f"{path}: not a complete NPZ file ({reason}); copy it again") from None
 
 
 def _numbers(path: Path, arrays: Mapping[str, NDArray[Any]], key: str, shape: tuple[int, ...]) -> Array:
-    """An array as numbers, finite and not absurd."""
+    """Return an array of `shape` as numbers, checked to be finite and plausible."""
     values = arrays[key]
     if values.dtype.kind not in "fiub" or values.shape != shape:
-        raise FileFormatError(f"{path}: {key!r} is {values.dtype} {values.shape} and not numbers {shape}")
+        raise FileFormatError(f"{path}: {key!r} is {values.dtype} {values.shape}, not numbers {shape}")
     numbers = values.astype(np.float64)
     bad = is_absurd(numbers, LARGEST_TIME if key in ("time_s", "frame") else LARGEST)
     if bad.any():
@@ -85,16 +85,16 @@ def _numbers(path: Path, arrays: Mapping[str, NDArray[Any]], key: str, shape: tu
 
 
 def _clock(path: Path, arrays: Mapping[str, NDArray[Any]], count: int) -> tuple[NDArray[np.int64], Array]:
-    """Frames (T,) and times (T,): as written, else counted from 0 at the file's rate."""
+    """Return frames (T,) and times (T,): as stored, or counted from 0 at the file's rate."""
     frames = np.arange(count)
     if "frame" in arrays:
         frames = _numbers(path, arrays, "frame", (count,)).astype(np.int64)
         if (np.diff(frames) <= 0).any():
-            raise FileFormatError(f"{path}: the numbers in 'frame' do not rise")
+            raise FileFormatError(f"{path}: the numbers in 'frame' do not increase")
     if "time_s" in arrays:
         times = _numbers(path, arrays, "time_s", (count,))
         if (np.diff(times) <= 0).any():
-            raise FileFormatError(f"{path}: the times in 'time_s' do not rise")
+            raise FileFormatError(f"{path}: the times in 'time_s' do not increase")
         return frames, times
     key = "mocap_framerate" if "mocap_framerate" in arrays else "mocap_frame_rate"
     if key not in arrays or arrays[key].size != 1:
@@ -108,19 +108,19 @@ def _clock(path: Path, arrays: Mapping[str, NDArray[Any]], count: int) -> tuple[
 def _states(
     path: Path, arrays: Mapping[str, NDArray[Any]], count: int
 ) -> tuple[list[frozenset[str]], list[bool]]:
-    """`held` and `warming_up` of T poses."""
+    """Return `held` and `warming_up` of the poses."""
     if "held" not in arrays or "filling" not in arrays:
         return all_new(count)
     held = _numbers(path, arrays, "held", (count, len(PLACEMENTS))) != 0
     filling = _numbers(path, arrays, "filling", (count,)) != 0
-    places = np.arange(len(PLACEMENTS))
-    masks = (held @ (1 << places)).tolist()
-    sets = {mask: frozenset(PLACEMENTS[i] for i in places if mask >> i & 1) for mask in set(masks)}
+    bits = np.arange(len(PLACEMENTS))
+    masks = (held @ (1 << bits)).tolist()
+    sets = {mask: frozenset(PLACEMENTS[i] for i in bits if mask >> i & 1) for mask in set(masks)}
     return [sets[mask] for mask in masks], filling.tolist()
 
 
 def holds_poses(path: Path) -> bool:
-    """Whether an archive has poses and is no recording of sensors, which may hold true poses besides."""
+    """Return whether an archive has poses and is not a recording of sensors with true poses."""
     try:
         names = member_names(path)
     except (OSError, *BROKEN):
@@ -129,7 +129,7 @@ def holds_poses(path: Path) -> bool:
 
 
 def _is_recording(names: set[str]) -> bool:
-    """Whether an archive with these members is a recording of sensors, which may hold true poses besides."""
+    """Return whether an archive with these members is a recording of sensors, perhaps with true poses."""
     return any(f"{placement}_quat.npy" in names for placement in PLACEMENTS)
 
 
@@ -137,18 +137,18 @@ def _is_recording(names: set[str]) -> bool:
 
 
 def write_npz(path: Path, blocks: Iterable[PoseSequence], count: int, rate: float) -> None:
-    """Write poses with little of them in memory at a time.
+    """Write poses, keeping only a part of them in memory.
 
     Args:
         path: file to write.
         blocks: the poses, in order.
-        count: how many poses the blocks hold together.
+        count: total number of poses.
         rate: frames per second.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
-    frames, times, held, filling, places = [], [], [], [], []
+    frames, times, held, filling, positions = [], [], [], [], []
     with zipfile.ZipFile(path, "w") as archive:
         with archive.open("poses.npy", "w", force_zip64=True) as member:
             header = {"descr": "<f4", "fortran_order": False, "shape": (count, 72)}
@@ -159,9 +159,9 @@ def write_npz(path: Path, blocks: Iterable[PoseSequence], count: int, rate: floa
                 times.append(block.time_s)
                 held.append(held_sensors(block.held))
                 filling.append(np.array(block.warming_up, bool))
-                places.append(_places(block))
+                positions.append(_positions(block))
         arrays: dict[str, NDArray[Any]] = {
-            "trans": np.concatenate(places),
+            "trans": np.concatenate(positions),
             "betas": np.zeros(BETAS),
             "gender": np.array("neutral"),
             "mocap_framerate": np.array(float(rate)),
@@ -176,14 +176,14 @@ def write_npz(path: Path, blocks: Iterable[PoseSequence], count: int, rate: floa
 
 
 def _vectors(block: PoseSequence) -> NDArray[np.float32]:
-    """Axis-angle vectors (T, 72), the pelvis against AMASS's world with Z up."""
+    """Return axis-angle vectors (T, 72), the pelvis relative to AMASS's world with Z up."""
     rotations = block.rotations.copy()
     rotations[:, 0] = Z_UP_TO_T.T @ rotations[:, 0]
     return matrix_to_rotvec(rotations).reshape(len(rotations), 72).astype("<f4")
 
 
-def _places(block: PoseSequence) -> NDArray[np.float32]:
-    """Places of the pelvis (T, 3), metres, Z up; zeros where nothing is known."""
+def _positions(block: PoseSequence) -> NDArray[np.float32]:
+    """Return positions of the pelvis (T, 3), metres, Z up; zeros if unknown."""
     if block.translation is None:
         return np.zeros((len(block.frames), 3), "<f4")
     return (block.translation @ Z_UP_TO_T).astype("<f4")

@@ -1,6 +1,6 @@
-"""All formats of poses, and the functions that read poses of any of them.
+"""All pose formats, and functions that read poses of any format.
 
-Files are hostile until checked: what comes out is finite, in order and made of rotations.
+Files are not trusted: poses that are returned are finite, in order and made of valid rotations.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ READERS = {
     "bvh": "edgepose.formats.poses.bvh:FORMAT",
     "dip": "edgepose.formats.poses.dip:FORMAT",
 }
-"""Where each `PoseFormat` is; modules are imported in this order until one fits a file."""
+"""Location of each `PoseFormat`; modules are imported in this order until one fits a file."""
 
 
 def read_poses(path: str | Path) -> PoseSequence:
-    """Poses of a .npz file with the keys of AMASS, a .bvh file with SMPL's joints, a .pkl of DIP's with true
-    poses, a file of an installed format, or of a CSV file, whatever its ending.
+    """Read poses from a file.
+
+    That is a .npz file with the keys of AMASS, a .bvh file with SMPL's joints, one of DIP's .pkl files with
+    true poses, a file of a plug-in's format, or a CSV file with any other ending.
 
     Args:
         path: file to read; "-" is CSV on standard input.
@@ -39,37 +41,37 @@ def read_poses(path: str | Path) -> PoseSequence:
 
 
 def salvage_poses(path: Path) -> tuple[PoseSequence, str | None]:
-    """The poses before the first bad one, and one line on what is bad; see `read_poses`.
+    """Read the poses before the first bad one, and one line on the problem; see `read_poses`.
 
     Raises:
-        FileFormatError: there is none.
+        FileFormatError: no pose is usable.
     """
     poses, problem = _read(path)
-    return poses, problem and f"{problem}; {len(poses.frames)} poses are taken"
+    return poses, problem and f"{problem}; {len(poses.frames)} poses are kept"
 
 
 def is_poses(path: Path) -> bool:
-    """Whether a file seems to hold poses and not a recording of sensors; "-" is standard input."""
+    """Return whether a file seems to contain poses, not a recording of sensors; "-" is standard input."""
     return find_format(path).holds_poses(path)
 
 
 def find_format(path: Path) -> PoseFormat:
-    """The format of a file by its ending; CSV is also that of unknown endings and of "-"."""
+    """Return the format of a file by its ending; CSV for unknown endings and for "-"."""
     suffix = path.suffix.lower()
     if not suffix:
         return built_in_format(PoseFormat, READERS["csv"])
     return next(
-        (known for known in all_formats(PoseFormat, READERS.values()) if suffix in known.suffixes), None
+        (format for format in all_formats(PoseFormat, READERS.values()) if suffix in format.suffixes), None
     ) or built_in_format(PoseFormat, READERS["csv"])
 
 
 def pose_suffixes() -> tuple[str, ...]:
-    """Endings of files that may hold poses."""
-    return tuple(suffix for known in all_formats(PoseFormat, READERS.values()) for suffix in known.suffixes)
+    """Return the endings of files that may contain poses."""
+    return tuple(suffix for format in all_formats(PoseFormat, READERS.values()) for suffix in format.suffixes)
 
 
 def _read(path: Path) -> tuple[PoseSequence, str | None]:
-    """The poses before the first bad one, and what is wrong with the file."""
+    """Read the poses before the first bad one, and the problem with the file."""
     poses, problem = find_format(path).read(path)
     if not FRAME_TIMES[0] < poses.frame_time < FRAME_TIMES[1]:
         raise FileFormatError(f"{path}: {poses.frame_time:g} s from pose to pose is not possible")

@@ -1,1 +1,1 @@
-"""Recordings of sensors: one module for each format."""
+"""Formats of sensor recordings, one module each."""

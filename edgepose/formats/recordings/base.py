@@ -1,7 +1,7 @@
-"""What all formats of recordings share: the checks that every sample passes, and samples to and from arrays.
+"""Base of all recording formats: checks of every sample, and conversion of samples to and from arrays.
 
-Files are hostile until checked: what leaves `SampleTable` is finite, in time order and of unit length where
-it must be.
+Files are not trusted: data from `SampleTable` is finite and in time order, and its quaternions are of unit
+length.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from edgepose.placements import PLACEMENTS
 Array = NDArray[np.float64]
 
 QUANTITIES = {"quat": 4, "acc": 3, "gyr": 3, "mag": 3}
-"""Numbers in each quantity of a sample, in the order of `ImuSample` and of `SensorData`."""
+"""Size of each quantity of a sample, in the order of `ImuSample` and of `SensorData`."""
 
 MAX_SAMPLES = 20_000_000
-"""Most samples that are read into memory: 9 hours of six sensors at 100 Hz."""
+"""Largest number of samples that are read into memory: 9 hours of six sensors at 100 Hz."""
 
 _MAX_VALUE = 1e6  # no sensor measures more, in any of the units
 _MAX_TIME_S = 1e11
@@ -36,12 +36,12 @@ _CHUNK = 4096
 
 
 class ReadOptions(NamedTuple):
-    """How a recording is read; formats ignore what does not concern them.
+    """Options for reading a recording; formats ignore those that do not apply.
 
     Attributes:
-        names: sensors that may occur, for formats that can hold more than the six placements.
-        salvage: leave bad rows out and say so in `Recording.damage` instead of raising. CSV and NPZ only:
-            files of other programs are always salvaged.
+        names: sensors that may occur, for formats that allow more than the six placements.
+        salvage: leave bad rows out and report them in `Recording.damage` instead of raising. CSV and NPZ
+            only: files of other programs are always salvaged.
         ids: placements by serial number, for formats that identify sensors by it.
     """
 
@@ -56,21 +56,21 @@ class RecordingFormat(FileFormat):
 
     Attributes:
         read: reads a file, or folder, of the format. Raises EdgeposeError or OSError if nothing is usable.
-        is_folder: whether a folder is a recording of the format; None where recordings are files.
+        is_folder: whether a folder is a recording of the format; None if recordings are files.
     """
 
     read: Callable[[Path, ReadOptions], Recording]
     is_folder: Callable[[Path], bool] | None = None
 
     def fits(self, path: Path, folder: bool) -> bool:
-        """Whether a file is of the format by its ending, or a folder by what is in it."""
+        """Return whether a file is of the format by its ending, or a folder by its content."""
         if folder:
             return self.is_folder is not None and self.is_folder(path)
         return path.suffix.lower() in self.suffixes
 
 
 def iter_samples(recording: Recording) -> Iterator[ImuSample]:
-    """All samples of a recording in time order."""
+    """Iterate over all samples of a recording in time order."""
     streams = [_sensor_samples(PLACEMENTS.index(name), data) for name, data in recording.sensors.items()]
     return heapq.merge(*streams, key=attrgetter("time_s"))
 
@@ -82,16 +82,16 @@ def recording_from_samples(
     name: str = "samples",
     salvage: bool = False,
 ) -> Recording:
-    """Recording of samples, each sensor's in time order.
+    """Build a recording from samples, each sensor's in time order.
 
     Args:
         rows: the samples.
         metadata: of the recording.
-        name: where they are from, for messages.
-        salvage: leave bad ones out and say so in `damage` instead of raising.
+        name: of their source, for messages.
+        salvage: leave bad samples out and report them in `damage` instead of raising.
 
     Raises:
-        FileFormatError: there is something in them that no sensor measures.
+        FileFormatError: a sample has values that no sensor measures.
     """
     table = SampleTable(name, salvage)
     for number, sample in enumerate(rows, start=1):
@@ -109,7 +109,7 @@ def _sensor_samples(index: int, data: SensorData) -> Iterator[ImuSample]:
     for start in range(0, len(data.time_s), _CHUNK):
         rows = slice(start, start + _CHUNK)
         times = data.time_s[rows].tolist()
-        # A number that is NaN differs from itself.
+        # `v[0] == v[0]` is false for NaN.
         columns = [
             [None] * len(times)
             if q is None
@@ -121,7 +121,7 @@ def _sensor_samples(index: int, data: SensorData) -> Iterator[ImuSample]:
 
 
 def shorten(text: str) -> str:
-    """Quoted beginning of a text from a file, for a message."""
+    """Quote the beginning of a text from a file, for a message."""
     return repr(text.strip() if len(text) < 80 else text[:77] + "...")
 
 
@@ -129,11 +129,11 @@ class SampleTable:
     """Rows of numbers (time, then the quantities) by sensor, checked a block at a time.
 
     Attributes:
-        count: good rows so far, save those of the last, unchecked blocks that turn out bad.
+        count: number of good rows so far; rows of the last, unchecked blocks count as good.
     """
 
     def __init__(self, name: str, salvage: bool = False, names: Sequence[str] = PLACEMENTS) -> None:
-        """An empty table.
+        """Create an empty table.
 
         Args:
             name: of the file, for messages.
@@ -146,7 +146,7 @@ class SampleTable:
         self._left_out = 0
         self._problem = ""  # of the first row left out
         self._rows: dict[str, list[list[float]]] = {}
-        self._marks: dict[str, list[tuple[int, int]]] = {}  # number and empty cells of each of these rows
+        self._marks: dict[str, list[tuple[int, int]]] = {}  # row number and number of empty cells
         self._blocks: dict[str, list[Array]] = {}
         self._checked = 0
         self.count = 0
@@ -155,7 +155,7 @@ class SampleTable:
         """Leave a row out.
 
         Raises:
-            FileFormatError: nothing is to be left out.
+            FileFormatError: the table does not salvage.
         """
         if not self._salvage:
             raise FileFormatError(f"{self._name}: {problem}")
@@ -163,13 +163,13 @@ class SampleTable:
         self._left_out += 1
 
     def damage(self) -> str | None:
-        """What to say of rows that were left out."""
+        """Return a message on rows that were left out; None if there are none."""
         if not self._left_out:
             return None
         return f"{self._name}: {self._left_out} bad rows left out, the first: {self._problem}"
 
     def add(self, sensor: str, number: int, row: list[float], empty: int) -> None:
-        """Take one row: its number in the file, 14 numbers, how many of them are empty (NaN)."""
+        """Add a row: its number in the file, 14 numbers, and how many of them are empty (NaN)."""
         rows = self._rows.setdefault(sensor, [])
         rows.append(row)
         self._marks.setdefault(sensor, []).append((number, empty))
@@ -178,10 +178,10 @@ class SampleTable:
             self._close(sensor)
 
     def add_block(self, sensor: str, numbers: NDArray[np.int_], rows: Array, empty: NDArray[np.int_]) -> None:
-        """Take rows (n, 14) with their numbers (n,) and counts of empty cells (n,).
+        """Add rows (n, 14) with their numbers in the file (n,) and counts of empty cells (n,).
 
         Raises:
-            FileFormatError: there is something in them that no sensor measures.
+            FileFormatError: a row has values that no sensor measures.
         """
         if not len(rows):
             return
@@ -202,8 +202,8 @@ class SampleTable:
         )
         start = 0
         for name, size in QUANTITIES.items():
-            there = ~np.isnan(values[:, start : start + size])
-            check(there.any(axis=1) & ~there.all(axis=1), f"has only a part of {name}")
+            measured = ~np.isnan(values[:, start : start + size])
+            check(measured.any(axis=1) & ~measured.all(axis=1), f"has only a part of {name}")
             start += size
         norm = np.linalg.norm(values[:, :4], axis=1)
         check(np.abs(norm - 1.0) > 0.1, "has a quaternion that is not of unit length")
@@ -219,7 +219,7 @@ class SampleTable:
             raise FileFormatError(f"{self._name}: more than {MAX_SAMPLES} samples; split the recording")
 
     def sensors(self) -> dict[str, SensorData]:
-        """All data by sensor, in the order of the names."""
+        """Return all data by sensor, in the order of the names."""
         for sensor in self._rows:
             self._close(sensor)
         result = {}

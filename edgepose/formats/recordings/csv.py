@@ -1,4 +1,4 @@
-"""Recordings as CSV, one row a sample."""
+"""Recordings as CSV, one row per sample."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ _MAX_LINE = 4096
 
 
 def metadata_lines(metadata: Mapping[str, str]) -> str:
-    """Metadata as lines `# key: value`; control characters become blanks or "?"."""
+    """Format metadata as lines `# key: value`; control characters become blanks or "?"."""
     return "".join(f"# {_one_line(f'{key}: {value}')}\n" for key, value in metadata.items())
 
 
 def _one_line(text: str) -> str:
-    """A line break would start a row of its own, an escape sequence would reach a terminal."""
+    """Replace line breaks, which would start a row, and control characters, which could reach a terminal."""
     line = " ".join(text.splitlines()).replace("\t", " ")
     return "".join("?" if unicodedata.category(character) == "Cc" else character for character in line)
 
 
 def csv_header(metadata: Mapping[str, str]) -> str:
-    """First lines of a CSV recording, up to its column names."""
+    """Return the first lines of a CSV recording, up to its column names."""
     return metadata_lines(metadata) + COLUMNS + "\n"
 
 
 def csv_row(sample: ImuSample) -> str:
-    """One line of a CSV recording: times to the microsecond, numbers to nine digits."""
+    """Format one line of a CSV recording: times to the microsecond, numbers to nine digits."""
     cells = [f"{sample.time_s:.6f}", PLACEMENTS[sample.sensor]]
     for quantity, size in ((sample.quat, 4), (sample.acc, 3), (sample.gyr, 3), (sample.mag, 3)):
         cells += [""] * size if quantity is None else [f"{v:.9g}" for v in quantity]
@@ -56,7 +56,7 @@ def write_csv(path: Path | str, recording: Recording) -> None:
 
 def read_csv(path: Path, options: ReadOptions) -> Recording:
     """Read a CSV file; "-" is standard input."""
-    # Bytes that are no UTF-8 become a mark that is no number either.
+    # "replace" turns bytes that are not UTF-8 into a character that does not parse as a number.
     opened = (
         nullcontext(sys.stdin)
         if str(path) == "-"
@@ -72,12 +72,12 @@ def read_csv(path: Path, options: ReadOptions) -> Recording:
 
 
 class _Lines:
-    """Lines of a text file, counted, none longer than a recording's can be.
+    """Counted lines of a text file, with a limit on their length.
 
     Attributes:
-        number: of the present line, from 1.
-        line: the present line.
-        unlimited: give a line that is too long in pieces instead of raising.
+        number: of the current line, from 1.
+        line: the current line.
+        unlimited: yield a line that is too long in pieces instead of raising.
     """
 
     def __init__(self, path: Path, file: TextIO) -> None:
@@ -103,7 +103,7 @@ class _Lines:
 
     @property
     def cut(self) -> bool:
-        """Whether the present line is the last one and has no end."""
+        """Whether the current line is the last one and has no line end."""
         return not self.line.endswith(("\n", "\r"))
 
 
@@ -125,7 +125,7 @@ def _read_metadata(path: Path, lines: _Lines) -> dict[str, str]:
 def _read_rows(
     path: Path, lines: _Lines, salvage: bool, names: Sequence[str]
 ) -> tuple[SampleTable, str | None]:
-    """All rows, and what to say if the last one is cut off."""
+    """Read all rows, and a message if the last one is cut off."""
     table = SampleTable(str(path), salvage, names)
     rows = csv.reader(lines, quoting=csv.QUOTE_NONE)
     while True:
@@ -139,7 +139,7 @@ def _read_rows(
         except csv.Error as error:
             table.reject(f"row {lines.number}: {error}")
         except ValueError as error:
-            # The pieces of a line that is too long have no end either.
+            # The pieces of a line that is too long have no line end either.
             if not lines.cut or len(lines.line) == _MAX_LINE:
                 table.reject(f"row {lines.number} {error}")
                 continue
@@ -150,24 +150,24 @@ def _read_rows(
 
 
 def _parse_row(cells: list[str], cut: bool, names: Sequence[str]) -> tuple[str, list[float]]:
-    """Sensor and numbers (time first, NaN where empty) of a row; cut says that the row has no line end.
+    """Parse a row to its sensor and numbers (time first, NaN where empty); `cut`: it has no line end.
 
     Raises:
-        ValueError: what is wrong with the row.
+        ValueError: the problem with the row.
     """
     if len(cells) != _WIDTH:
-        raise ValueError(f"has {len(cells)} columns and not {_WIDTH}")
+        raise ValueError(f"has {len(cells)} columns instead of {_WIDTH}")
     time_s, sensor, *rest = cells
-    sensor = sensor.strip('"')  # some programs quote text; a quoted line break cannot be meant here
+    sensor = sensor.strip('"')  # some programs quote text; quoted line breaks are not supported
     if sensor not in names:
         raise ValueError(f"names an unknown sensor {shorten(sensor)}; the names are {', '.join(names)}")
     if cut and (rest[-1] or rest[-2]):
-        # Digits may be missing, which nobody can see.
+        # The last number may lack digits.
         raise ValueError("has no line end")
     try:
         return sensor, [float(time_s), *[float(cell) if cell else nan for cell in rest]]
     except ValueError as error:
-        raise ValueError(f"holds something that is no number ({shorten(str(error))})") from None
+        raise ValueError(f"has a value that is not a number ({shorten(str(error))})") from None
 
 
 FORMAT = RecordingFormat((".csv",), read_csv)

@@ -1,12 +1,12 @@
 """Recordings of Xsens MVN, exported as MVNX: XML with one element for each frame.
 
-`<subject frameRate>` has `<sensors>` with a `<sensor label>` each, then `<frames>` of which those of the type
-"normal" are the recording; the others are poses of the calibration. A frame has its `time` in milliseconds
-and lists of numbers of all sensors in the order of the labels: `sensorOrientation` (quaternions w x y z,
-sensor to global), `sensorFreeAcceleration` (without gravity, global frame, m/s^2), or in old versions
+`<subject frameRate>` has `<sensors>`, each a `<sensor label>`, then `<frames>`. Frames of the type "normal"
+are the recording; the others are poses of the calibration. A frame has its `time` in milliseconds and lists
+of numbers of all sensors in the order of the labels: `sensorOrientation` (quaternions w x y z, sensor to
+global), `sensorFreeAcceleration` (without gravity, global frame, m/s^2), or in old versions
 `sensorAcceleration` (with gravity, sensor frame) and `sensorAngularVelocity` (rad/s), and
-`sensorMagneticField` (1 is about the earth's field). The global frame has Z up, X to the north or to where
-the wearer looked when they were calibrated.
+`sensorMagneticField` (1 is about the earth's field). In the global frame Z is up, and X points north or to
+where the wearer looked during calibration.
 """
 
 from __future__ import annotations
@@ -36,23 +36,23 @@ _WIDTHS = {
     "sensorAngularVelocity": 3,
     "sensorMagneticField": 3,
 }
-_EXTRAS = ("sensorAngularVelocity", "sensorMagneticField")  # without which the rest of a frame is good
+_EXTRAS = ("sensorAngularVelocity", "sensorMagneticField")  # a frame is usable without them
 _METADATA = {
     "frame": "Z up",
     "units": "s, m/s^2, rad/s; mag in units of the earth's field",
     "source": "MVNX",
 }
 _CHUNK = 1 << 16
-_LONGEST = 1 << 20  # bytes of one tag or list of numbers; true ones have less than 4000
-_DEEPEST = 50  # elements inside one another; true ones are 6
+_LONGEST = 1 << 20  # bytes of one tag or list of numbers; MVN writes fewer than 4000
+_DEEPEST = 50  # nested elements; MVN writes 6
 _MOST_SENSORS = 100
 
 
 def read_mvnx(path: Path) -> Recording:
-    """The recording in a file: of the sensors at the six placements, those that it has.
+    """Read a recording of the sensors at the six placements, as far as the file has them.
 
     Raises:
-        FileFormatError: it cannot be read, is no MVNX, or has none of the six sensors.
+        FileFormatError: it cannot be read, is not MVNX, or has none of the six sensors.
     """
     frames = _Frames(path)
     problems: list[str] = []
@@ -63,7 +63,7 @@ def read_mvnx(path: Path) -> Recording:
 
 
 def _samples(path: Path, frames: _Frames, problems: list[str]) -> Iterator[ImuSample]:
-    """Samples of all frames; what is wrong with the file is added to the problems."""
+    """Yield the samples of all frames; add problems of the file to `problems`."""
     try:
         with path.open("rb") as file:
             for chunk in chain(iter(partial(file.read, _CHUNK), b""), [b""]):
@@ -78,27 +78,27 @@ def _samples(path: Path, frames: _Frames, problems: list[str]) -> Iterator[ImuSa
         raise FileFormatError(f"{path}: no frame of an MVNX recording ({why}); export it from MVN again")
     if frames.bad == frames.count:
         raise FileFormatError(
-            f"{path}: no frame has whole lists of its sensors' numbers; export sensorOrientation and "
-            "sensorFreeAcceleration, too"
+            f"{path}: no frame has complete lists of its sensors' numbers; export sensorOrientation and "
+            "sensorFreeAcceleration too"
         )
     if broken:
         problems.append(
-            f"{path}: breaks off ({broken}), {frames.count} frames before that are good; copy the file again"
+            f"{path}: breaks off ({broken}), the {frames.count} frames before are good; copy the file again"
         )
     if frames.bad:
         problems.append(f"{path}: {frames.bad} bad frames left out")
     for name, count in frames.bad_lists.items():
-        problems.append(f"{path}: {count} {name} that are not whole left out")
+        problems.append(f"{path}: {count} incomplete {name} left out")
 
 
 class _Frames:
-    """Samples out of the bytes of a file, of which there is never more than a piece in memory.
+    """Incremental parser from the bytes of a file to samples; only a part of the file is in memory.
 
     Attributes:
         rate: frames a second.
-        count: frames so far.
-        bad: frames that had to be left out.
-        bad_lists: how many lists had to be, of frames that are good without them, by name.
+        count: number of frames so far.
+        bad: number of frames left out.
+        bad_lists: number of lists left out, by name, in frames that are usable without them.
     """
 
     def __init__(self, path: Path) -> None:
@@ -108,9 +108,9 @@ class _Frames:
         self._path = path
         self._labels: list[str] = []
         self._depth = self._fed = self._length = 0
-        self._time_ms: str | None = None  # of the frame that is open, if it is one of the recording
+        self._time_ms: str | None = None  # of the open frame, if it belongs to the recording
         self._texts: dict[str, list[str]] = {}
-        self._list: list[str] | None = None  # the one that is open
+        self._list: list[str] | None = None  # texts of the open list
         self._samples: list[ImuSample] = []
         self._parser = expat.ParserCreate()
         self._parser.StartDoctypeDeclHandler = self._refuse
@@ -119,10 +119,10 @@ class _Frames:
         self._parser.EndElementHandler = self._end
 
     def feed(self, chunk: bytes) -> str | None:
-        """Take the next bytes, none at the end of the file; what is wrong with them, if they are the last.
+        """Parse the next bytes (none at the end of the file); return the problem if parsing has to stop.
 
         Raises:
-            FileFormatError: it is no MVNX, and there is no frame yet.
+            FileFormatError: the file is not MVNX, and there is no frame yet.
         """
         self._fed += len(chunk)
         try:
@@ -140,18 +140,18 @@ class _Frames:
         return None
 
     def take(self) -> list[ImuSample]:
-        """Samples of the frames that have ended since the last call."""
+        """Return the samples of the frames completed since the last call."""
         samples, self._samples = self._samples, []
         return samples
 
     def _refuse(self, *declared: object) -> None:
-        # Entities could be of any size, or in any file; MVN declares none.
+        # Entities could expand to any size or refer to other files; MVN declares none.
         raise FileFormatError(f"{self._path}: not an MVNX file: it declares a document type")
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         self._depth += 1
         if self._depth > _DEEPEST:
-            raise FileFormatError(f"{self._path}: not an MVNX file: elements are too deep in one another")
+            raise FileFormatError(f"{self._path}: not an MVNX file: elements are nested too deeply")
         if name == "subject":
             self.rate = self._rate_of(attributes.get("frameRate", ""))
         elif name == "sensor":
@@ -199,7 +199,7 @@ class _Frames:
         return rate
 
     def _check(self) -> None:
-        """Raise if what must come before the frames has not come."""
+        """Raise if the frame rate or the sensors are missing, which must come before the frames."""
         if not self.rate:
             raise FileFormatError(f"{self._path}: has frames, but no subject with a frame rate before them")
         if not any(label in self._labels for label in LABELS):
@@ -207,10 +207,10 @@ class _Frames:
             raise FileFormatError(f"{self._path}: has no sensor called {', '.join(LABELS)} (it has {found})")
 
     def _frame(self, time_ms: str) -> list[ImuSample]:
-        """Samples of a frame.
+        """Return the samples of a frame.
 
         Raises:
-            ValueError, OverflowError: there is no list, or one that is not whole.
+            ValueError, OverflowError: there is no list, or one is incomplete.
         """
         lists: dict[str, list[float]] = {}
         for name, texts in self._texts.items():
@@ -222,7 +222,7 @@ class _Frames:
                 self.bad_lists[name] += 1
         if not lists:
             raise ValueError
-        # Milliseconds are rounded; frames come at an even rate.
+        # Times are rounded to milliseconds; frames are evenly spaced.
         time_s = round(float(time_ms) * self.rate / 1000.0) / self.rate
         samples = []
         for sensor, label in enumerate(LABELS):
@@ -236,18 +236,18 @@ class _Frames:
         return samples
 
     def _list_of(self, name: str, words: list[str]) -> list[float]:
-        """The numbers of a list; raises ValueError if it is not whole."""
+        """Return the numbers of a list; raise ValueError if it is incomplete."""
         if len(words) != _WIDTHS[name] * len(self._labels):
             raise ValueError
         return [float(word) for word in words]
 
 
 def _sample(sensor: int, time_s: float, numbers: dict[str, Any]) -> ImuSample:
-    """Sample of the numbers that a frame has of a sensor."""
+    """Build a sensor's sample from its numbers in a frame."""
     quat, free = numbers.get("sensorOrientation"), numbers.get("sensorFreeAcceleration")
     acc = numbers.get("sensorAcceleration")
     if quat is not None and free is not None:
-        unit = unit_quaternion(*quat)  # a sample without one is left out, as in every recording
+        unit = unit_quaternion(*quat)  # without one, `recording_from_samples` leaves the sample out
         acc = unit and rotate_back(unit, (free[0], free[1], free[2] + GRAVITY))
     gyr, mag = (
         values if values is not None and all(map(isfinite, values)) else None  # NaN: not measured

@@ -1,4 +1,4 @@
-"""Recordings as NPZ, one array a quantity of a sensor."""
+"""Recordings as NPZ, one array per quantity of a sensor."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 def write_npz(path: Path | str, recording: Recording) -> None:
     """Write a recording as NPZ, quantities as float32.
 
-    Times are one array `t` where all sensors share them, else `<placement>_t`. `sparse` names the arrays in
+    Times are one array `t` if all sensors share them, otherwise `<placement>_t`. `sparse` names the arrays in
     which a row of NaN means not measured.
     """
     arrays: dict[str, NDArray[Any]] = {}
@@ -37,7 +37,7 @@ def write_npz(path: Path | str, recording: Recording) -> None:
                 arrays[f"{placement}_{name}"] = values.astype(np.float32)
     arrays["sparse"] = np.array([key for key, values in arrays.items() if np.isnan(values).any()], dtype=str)
     arrays["metadata"] = np.array([f"{key}: {value}" for key, value in recording.metadata.items()], dtype=str)
-    # A file and not a name, to which numpy might add .npz.
+    # An open file, because numpy might add .npz to a name.
     with Path(path).open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
 
@@ -48,7 +48,7 @@ def read_npz(path: Path, options: ReadOptions) -> Recording:
         arrays = _load_arrays(path, options.names)
     except BROKEN as error:
         raise FileFormatError(
-            f"{path}: not a whole NPZ file ({error}); what is left of a cut one cannot be read: copy it again"
+            f"{path}: not a complete NPZ file ({error}); a truncated one cannot be read: copy it again"
         ) from None
     sparse = set(_lines_of(path, arrays, "sparse"))
     metadata = {}
@@ -63,7 +63,7 @@ def read_npz(path: Path, options: ReadOptions) -> Recording:
 
 
 def _load_arrays(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Arrays of an NPZ file that belong to a recording."""
+    """Load the arrays of an NPZ file that belong to a recording."""
     result = {}
     with open_npz(path) as archive:
         for key in archive.files:
@@ -71,7 +71,7 @@ def _load_arrays(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
             is_sensor = name in QUANTITIES or (name == "t" and placement)
             if is_sensor and placement not in names:
                 raise FileFormatError(
-                    f"{path}: {shorten(key)} is of an unknown sensor; the names are {', '.join(names)}"
+                    f"{path}: {shorten(key)} has an unknown sensor; the names are {', '.join(names)}"
                 )
             if is_sensor or key in ("t", "sparse", "metadata"):
                 result[key] = archive[key]
@@ -91,7 +91,7 @@ def _add_arrays(
     key = f"{placement}_t" if f"{placement}_t" in arrays else "t"
     if key not in arrays:
         raise FileFormatError(
-            f"{path}: has no times of {placement}; they are in an array 't' or '{placement}_t'"
+            f"{path}: has no times of {placement}; they must be in an array 't' or '{placement}_t'"
         )
     columns = [_numbers(path, arrays, key, (arrays[key].size,))[:, None]]
     n = len(columns[0])
@@ -111,7 +111,7 @@ def _add_arrays(
 def _numbers(path: Path, arrays: Mapping[str, NDArray[Any]], key: str, shape: tuple[int, ...]) -> Array:
     array = arrays[key]
     if array.dtype.kind not in "fiu" or array.shape != shape:
-        raise FileFormatError(f"{path}: {key!r} is {array.dtype} {array.shape} and not numbers {shape}")
+        raise FileFormatError(f"{path}: {key!r} is {array.dtype} {array.shape}, not numbers {shape}")
     return array.astype(np.float64)
 
 

@@ -1,8 +1,8 @@
-"""Raw captures of a serial port on disk: its bytes as they came, and next to them when they came.
+"""Raw captures of a serial port on disk: its bytes as they came, and a file with their arrival times.
 
-`walk.bin` holds nothing but the bytes. `walk.bin.times` is text: `# key: value` lines, then one line for each
+`walk.bin` contains only the bytes. `walk.bin.times` is text: `# key: value` lines, then one line for each
 piece that was read from the port, `time_s,end`: Unix time of its arrival, seconds, and the number of bytes in
-walk.bin up to its end. A capture without times, of another program, is read as well.
+walk.bin up to its end. A capture without times, from another program, can be read too.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ _CHUNK = 1 << 16
 
 
 class Piece(NamedTuple):
-    """Bytes that came together.
+    """Bytes that were read from the port together.
 
     Attributes:
-        arrival_s: Unix time, seconds; None where nobody noted it.
+        arrival_s: Unix time, seconds; None if unknown.
         data: the bytes.
     """
 
@@ -33,25 +33,25 @@ class Piece(NamedTuple):
 
 
 def times_path(path: Path) -> Path:
-    """Where the arrival times of a capture are."""
+    """Return the path of a capture's arrival times."""
     return path.with_name(path.name + ".times")
 
 
 def times_header(metadata: Mapping[str, str]) -> str:
-    """First lines of the arrival times."""
+    """Return the first lines of the file of arrival times."""
     return metadata_lines(metadata) + COLUMNS + "\n"
 
 
 def times_row(arrival_s: float, end: int) -> str:
-    """One line of the arrival times; the number is exact."""
+    """Format one line of the arrival times; the time keeps all its digits."""
     return f"{arrival_s!r},{end}\n"
 
 
 def read_capture(path: Path) -> Iterator[Piece]:
-    """All pieces of a capture.
+    """Yield all pieces of a capture.
 
-    What was still on its way to the disk when the power went is missing from either file: bytes without a
-    time get the last one, times without bytes are left out.
+    After a power failure the end of either file may be missing: bytes without a time get the last one, times
+    without bytes are ignored.
 
     Raises:
         FileFormatError: a file cannot be read, or the times are damaged before their last line.
@@ -71,7 +71,7 @@ def read_capture(path: Path) -> Iterator[Piece]:
 
 
 def _read_times(path: Path) -> Iterator[tuple[float, int]]:
-    """Arrival and end of each piece, both never decreasing."""
+    """Yield the arrival and end of each piece; neither ever decreases."""
     if not path.exists():
         return
     arrival_s, end = 0.0, 0

@@ -1,4 +1,4 @@
-"""All formats of recordings, and the functions that read a recording of any of them."""
+"""All recording formats, and functions that read a recording of any format."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ READERS = {
     "xio-session": "edgepose.formats.recordings.xio_session:FORMAT",
     "packed-session": "edgepose.formats.recordings.packed_session:FORMAT",
 }
-"""Where each `RecordingFormat` is; modules are imported in this order until one fits a file."""
+"""Location of each `RecordingFormat`; modules are imported in this order until one fits a file."""
 
 
 def read_recording(path: Path | str, ids: Mapping[int, str] | None = None) -> Recording:
-    """Recording of all six sensors, of any format; a file of an unknown ending, and "-", is CSV.
+    """Read a recording of all six sensors in any format; a file with an unknown ending, and "-", is CSV.
 
-    A bad row of CSV or NPZ is an error; of other programs' formats it is left out, and `damage` says so.
+    A bad row of CSV or NPZ is an error; in other programs' formats it is left out and reported in `damage`.
 
     Args:
         path: file, or folder of a session.
-        ids: placements by serial number, for sessions whose names have no placements in them.
+        ids: placements by serial number, for sessions whose file or folder names contain no placements.
 
     Raises:
-        FileFormatError: it cannot be read, or is anything else than a recording of all six sensors.
+        FileFormatError: it cannot be read, or is not a recording of all six sensors.
     """
     recording = _read(Path(path), ReadOptions(ids=ids))
     missing = missing_sensors(recording)
@@ -47,36 +47,36 @@ def read_recording(path: Path | str, ids: Mapping[int, str] | None = None) -> Re
 
 
 def salvage_recording(path: Path | str, ids: Mapping[int, str] | None = None) -> Recording:
-    """What is good in a recording, of any number of sensors; `damage` tells of bad rows that are left out.
+    """Read the good rows of a recording of any number of sensors; `damage` reports bad rows left out.
 
     Args:
         path: file, or folder of a session.
-        ids: as of `read_recording`.
+        ids: as in `read_recording`.
 
     Raises:
-        FileFormatError: it cannot be read, or is no recording at all.
+        FileFormatError: it cannot be read, or is not a recording.
     """
     return _read(Path(path), ReadOptions(salvage=True, ids=ids))
 
 
 def read_sensors(path: Path | str, names: Sequence[str]) -> Recording:
-    """Recording of any of the named sensors, as `read_recording` reads those of the six placements.
+    """Read a recording of any of the named sensors, like `read_recording` for the six placements.
 
-    Only CSV and NPZ hold other sensors than the six.
+    Only CSV and NPZ can contain other sensors than the six.
 
     Raises:
-        FileFormatError: it cannot be read, or is anything else than a recording of such sensors.
+        FileFormatError: it cannot be read, or is not a recording of such sensors.
     """
     return _read(Path(path), ReadOptions(tuple(names)))
 
 
 def missing_sensors(recording: Recording) -> list[str]:
-    """Placements of which there is no sample."""
+    """Return the placements without samples."""
     return [name for name in PLACEMENTS if name not in recording.sensors]
 
 
 def find_format(path: Path) -> RecordingFormat | None:
-    """The format of a recording by the file's ending, or by what is in a folder; None if it is of none.
+    """Return the format of a recording by the file's ending or the folder's content; None if unknown.
 
     "-" is CSV on standard input.
     """
@@ -84,28 +84,29 @@ def find_format(path: Path) -> RecordingFormat | None:
         return built_in_format(RecordingFormat, READERS["csv"])
     folder = path.is_dir()
     return next(
-        (known for known in all_formats(RecordingFormat, READERS.values()) if known.fits(path, folder)), None
+        (format for format in all_formats(RecordingFormat, READERS.values()) if format.fits(path, folder)),
+        None,
     )
 
 
 def recording_suffixes() -> tuple[str, ...]:
-    """Endings of recordings that are files."""
+    """Return the endings of recordings that are files."""
     return tuple(
-        suffix for known in all_formats(RecordingFormat, READERS.values()) for suffix in known.suffixes
+        suffix for format in all_formats(RecordingFormat, READERS.values()) for suffix in format.suffixes
     )
 
 
 def _read(path: Path, options: ReadOptions) -> Recording:
     try:
-        known = find_format(path)
-        if known is None:
+        format = find_format(path)
+        if format is None:
             if path.is_dir():
                 raise FileFormatError(
                     f"{path}: unknown kind of file (Is a directory with no recording in it); give the folder "
                     "that holds the files or folders of all sensors"
                 )
-            known = built_in_format(RecordingFormat, READERS["csv"])
-        return known.read(path, options)
+            format = built_in_format(RecordingFormat, READERS["csv"])
+        return format.read(path, options)
     except (OSError, UnicodeDecodeError) as error:
         raise FileFormatError(
             f"{path}: cannot read it: {getattr(error, 'strerror', None) or error}"

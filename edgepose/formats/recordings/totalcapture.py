@@ -1,8 +1,8 @@
-"""TotalCapture's files of Xsens sensors (cvssp.org/data/totalcapture).
+"""Xsens recordings of TotalCapture (cvssp.org/data/totalcapture).
 
-`NAME_Xsens_AuxFields.sensors`: the number of sensors and of frames, then for each frame its number from 1 and
-a line a sensor: name, quaternion w x y z to the inertial frame, acceleration with gravity in the sensor's
-frame, and more; 60 Hz.
+`NAME_Xsens_AuxFields.sensors`: the numbers of sensors and of frames, then for each frame its number from 1
+and one line per sensor: name, quaternion w x y z to the inertial frame, acceleration with gravity in the
+sensor's frame, and more; 60 Hz.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ RATE = 60.0
 """Frames a second."""
 
 MAX_FRAMES = 1_000_000
-_NUMBERS = 7  # of each line: quaternion and acceleration; AuxFields has more behind them
+_NUMBERS = 7  # of each line: quaternion and acceleration; further numbers are ignored
 _AT_REST = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY)
 _LONGEST_LINE = 4096
-_TILT_DEG = 30.0  # of what a sensor measures on average over a take
+_TILT_DEG = 30.0  # of a sensor's mean specific force over a take
 _METADATA = {
     "rate": f"{RATE:g}",
     "frame": "Z up",
@@ -45,10 +45,10 @@ _METADATA = {
 
 
 def read_recording(path: Path) -> Recording:
-    """The sensors of a file, as they were strapped on; rows that are no good are not there.
+    """Read the sensors of a file, as they were strapped on, without bad rows.
 
     Raises:
-        FileFormatError: not such a file, or its inertial frame has not Z up.
+        FileFormatError: not such a file, or its inertial frame does not have Z up.
     """
     readings = read_sensors(path)
     orientation, force, measured = readings.orientation, readings.force, readings.measured
@@ -56,27 +56,27 @@ def read_recording(path: Path) -> Recording:
     times = np.arange(len(quats)) / RATE
     sensors = {}
     for i, (name, placement) in enumerate(zip(NAMES, PLACEMENTS, strict=True)):
-        there = measured[:, i]
-        if not there.any():
+        rows = measured[:, i]
+        if not rows.any():
             continue
-        mean = (orientation[there, i] @ force[there, i, :, None]).mean(axis=0)[:, 0]
+        mean = (orientation[rows, i] @ force[rows, i, :, None]).mean(axis=0)[:, 0]
         if not tilt_deg(mean) < _TILT_DEG:
             raise FileFormatError(
-                f"{path}: {name} measures gravity along {np.round(mean, 1).tolist()} and not along Z; "
-                "the file is not laid out as TotalCapture's"
+                f"{path}: {name} measures gravity along {np.round(mean, 1).tolist()} instead of Z; "
+                "the file does not have TotalCapture's layout"
             )
-        sensors[placement] = SensorData(times[there], quats[there, i], force[there, i])
+        sensors[placement] = SensorData(times[rows], quats[rows, i], force[rows, i])
     return Recording(sensors, _METADATA, readings.damage)
 
 
 class Readings(NamedTuple):
-    """What a file holds.
+    """Content of a file.
 
     Attributes:
         orientation: (T, 6, 3, 3) R_IS.
         force: (T, 6, 3) specific force in the sensors' frames, m/s^2.
-        measured: (T, 6) where both are good; elsewhere they are those of a sensor at rest.
-        damage: one line on what is not; None if all is.
+        measured: (T, 6) whether both are good; elsewhere they are those of a sensor at rest.
+        damage: one line on bad data; None if there is none.
     """
 
     orientation: Array
@@ -86,7 +86,7 @@ class Readings(NamedTuple):
 
 
 def read_sensors(path: Path) -> Readings:
-    """What is good in a .sensors file.
+    """Read the good data of a .sensors file.
 
     Raises:
         FileFormatError: not such a file.
@@ -105,7 +105,7 @@ def read_sensors(path: Path) -> Readings:
                     )
                     break
                 block = list(islice(lines, sensors))
-                # Where the file is cut digits may be missing, which nobody can see.
+                # The last line of a truncated file may lack digits.
                 if (len(block) < sensors or frame < frames) and block and not block[-1][1].endswith("\n"):
                     block.pop()
                 rows.extend(_frame(block, frame, problems).ravel())
@@ -113,7 +113,7 @@ def read_sensors(path: Path) -> Readings:
         raise FileFormatError(f"{path}: cannot be read: {error.strerror or error}") from error
     damage = None
     if problems:
-        damage = f"{path}, {problems[0]}; {len(problems)} such places in all, the rest is good"
+        damage = f"{path}, {problems[0]}; {len(problems)} problems in all, the rest is good"
     values = np.frombuffer(rows).reshape(-1, len(NAMES), _NUMBERS)
     measured = ~np.isnan(values[..., 0])
     if not measured.any():
@@ -124,7 +124,7 @@ def read_sensors(path: Path) -> Readings:
 
 
 def _frame(lines: list[tuple[int, str]], frame: int, problems: list[str]) -> Array:
-    """Rows (6, 7) of a frame's lines, NaN where there is none; adds what is wrong to the problems."""
+    """Parse the rows (6, 7) of a frame's lines, NaN where missing; add problems to `problems`."""
     rows = np.full((len(NAMES), _NUMBERS), np.nan)
     missing = set(NAMES)
     for number, line in lines:
@@ -142,7 +142,7 @@ def _frame(lines: list[tuple[int, str]], frame: int, problems: list[str]) -> Arr
 
 
 def _counts(path: Path, line: str) -> tuple[int, int]:
-    """Numbers of sensors and of frames in a file's first line."""
+    """Parse the numbers of sensors and of frames in a file's first line."""
     cells = line.split()
     if len(cells) == 2 and all(cell.isdecimal() and len(cell) < 9 for cell in cells):
         sensors, frames = map(int, cells)
@@ -154,10 +154,10 @@ def _counts(path: Path, line: str) -> tuple[int, int]:
 
 
 def _row(cells: list[str]) -> list[float]:
-    """Quaternion and acceleration of a line.
+    """Parse the quaternion and acceleration of a line.
 
     Raises:
-        ValueError: they are none.
+        ValueError: they are invalid.
     """
     row = [float(cell) for cell in cells]
     if len(row) != _NUMBERS or not np.abs(row).max() < 1e4 or not abs(np.linalg.norm(row[:4]) - 1.0) < 0.1:

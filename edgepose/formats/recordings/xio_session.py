@@ -1,4 +1,4 @@
-"""Sessions of x-io's software: a folder with a folder for each sensor, and CSV files in that."""
+"""Sessions of x-io's software: a folder with one folder of CSV files for each sensor."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from firmware_protocols.sample import Sample
 from firmware_protocols.ximu3 import Ximu3Decoder
 
 MAIN_FILE = "Inertial.csv"
-"""The file that makes a folder one of a sensor."""
+"""The file by which a sensor's folder is recognised."""
 
 _LETTERS = {"Inertial.csv": "I", "Magnetometer.csv": "M"}
 _ORIENTATIONS = {"Quaternion.csv": "Q", "RotationMatrix.csv": "R", "EulerAngles.csv": "A"}
@@ -34,39 +34,39 @@ _METADATA = {
 
 
 def is_sensor(folder: Path) -> bool:
-    """Whether a folder is one of an x-io sensor."""
+    """Return whether a folder belongs to an x-io sensor."""
     return (folder / MAIN_FILE).exists()
 
 
 def is_session(folder: Path) -> bool:
-    """Whether a folder holds folders of x-io sensors."""
+    """Return whether a folder contains folders of x-io sensors."""
     return any(folder.glob(f"*/{MAIN_FILE}"))
 
 
 def read_session(folder: Path, ids: Mapping[int, str] | None = None) -> Recording:
-    """The recording in a session, in the time of the sensors, whose clocks x-io's software sets alike.
+    """Read the recording of a session, in the time of the sensors, whose clocks x-io's software synchronises.
 
     Args:
         folder: of the session.
-        ids: placements by serial number. Without them a sensor's folder has the placement in its name, such
-            as "Left Lower Leg 64F61CB3 (UDP)".
+        ids: placements by serial number. Without them, folder names contain the placement, such as
+            "Left Lower Leg 64F61CB3 (UDP)".
 
     Raises:
-        FileFormatError: no folder is of a placement, two are of one, or a file is of another kind.
+        FileFormatError: no folder has a placement, two have the same one, or a file is of another kind.
     """
-    places = by_placement(folder, sorted(path.parent for path in folder.glob(f"*/{MAIN_FILE}")), ids)
+    folders = by_placement(folder, sorted(path.parent for path in folder.glob(f"*/{MAIN_FILE}")), ids)
     problems: list[str] = []
     rows = [
         sample
-        for name, sensor in places.items()
-        for sample in _samples(PLACEMENTS.index(name), sensor, problems)
+        for name, sensor_folder in folders.items()
+        for sample in _samples(PLACEMENTS.index(name), sensor_folder, problems)
     ]
     recording = recording_from_samples(rows, _METADATA, name=str(folder), salvage=True)
     starts = [data.time_s[0] for data in recording.sensors.values()]
     ends = [data.time_s[-1] for data in recording.sensors.values()]
     if starts and max(starts) > min(ends):
         problems.append(
-            f"{folder}: the sensors' clocks have no time in common; synchronise them and record anew"
+            f"{folder}: the sensors' clocks have no time in common; synchronise them and record again"
         )
     if recording.damage:
         problems.append(recording.damage)
@@ -74,33 +74,33 @@ def read_session(folder: Path, ids: Mapping[int, str] | None = None) -> Recordin
 
 
 def by_placement(folder: Path, sensors: Sequence[Path], ids: Mapping[int, str] | None) -> dict[str, Path]:
-    """Files or folders of the sensors of a session by placement; those of no placement are left out.
+    """Sort the files or folders of a session's sensors by placement; leave out those without one.
 
     Raises:
-        FileFormatError: none is of a placement, or two are of one.
+        FileFormatError: none has a placement, or two have the same one.
     """
-    places: dict[str, Path] = {}
+    result: dict[str, Path] = {}
     for sensor in sensors:
         placement = placement_of(sensor.name, ids)
         if placement is None:
             continue
-        if placement in places:
+        if placement in result:
             raise FileFormatError(
-                f"{folder}: {places[placement].name!r} and {sensor.name!r} are both {placement}; rename one"
+                f"{folder}: {result[placement].name!r} and {sensor.name!r} are both {placement}; rename one"
             )
-        places[placement] = sensor
-    if not places:
+        result[placement] = sensor
+    if not result:
         how = f"in the names of its {'folders' if sensors[0].is_dir() else 'files'}"
         how = how if ids is None else "with a serial number of --sensors"
         names = ", ".join(sensor.name for sensor in sensors)
         raise FileFormatError(
             f"{folder}: no placement {how} ({names}); placements are {', '.join(PLACEMENTS)}"
         )
-    return places
+    return result
 
 
 def placement_of(name: str, ids: Mapping[int, str] | None) -> str | None:
-    """Placement of a sensor by the name of its folder or file."""
+    """Return the placement of a sensor by the name of its folder or file; None if it has none."""
     if ids is not None:
         numbers = [int(number, 16) for number in _SERIAL_NUMBER.findall(name)]
         return next((ids[number] for number in numbers if number in ids), None)
@@ -109,9 +109,9 @@ def placement_of(name: str, ids: Mapping[int, str] | None) -> str | None:
 
 
 def _samples(index: int, folder: Path, problems: list[str]) -> Iterator[ImuSample]:
-    """Samples of a sensor; what is wrong with its files is added to the problems.
+    """Yield the samples of a sensor; add problems of its files to `problems`.
 
-    A line of a file is a message as the device sends it, but for the letter at its start.
+    A line of a file is a message as the device sends it, but without the letter at its start.
     """
     decoder = Ximu3Decoder()
     orientation = [(name, letter) for name, letter in _ORIENTATIONS.items() if (folder / name).exists()]
@@ -134,7 +134,7 @@ def _sample(index: int, sample: Sample) -> ImuSample:
 
 
 def _messages(path: Path, letter: str) -> Iterator[tuple[int, bytes]]:
-    """Time and message of each row; one without a time has that of the row before."""
+    """Yield the time and message of each row; a row without a time has that of the row before."""
     time_us = 0
     try:
         with open_table(path, lambda names: names[0].startswith(_TIME), _TIME) as table:

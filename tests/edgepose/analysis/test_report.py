@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from edgepose.analysis.joint_angles import ANGLES, LIMBS, joint_angles, walks
+from edgepose.analysis.joint_angles import ANGLES, LIMBS, joint_angles, walking_bouts
 from edgepose.analysis.report import POINTS, extremes, write_report
 from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
@@ -81,7 +81,7 @@ def motion(path: Path) -> tuple[np.ndarray, float]:
 def test_steps_of_a_real_walk_and_of_a_mirrored_one():
     local, rate = motion(WALK)
     offsets = default_body().offsets
-    (walk,) = walks(local, offsets, rate)
+    (walk,) = walking_bouts(local, offsets, rate)
     assert len(walk.frames) == 29
     assert (walk.left[1:] != walk.left[:-1]).all()
     cadence = 60.0 * rate / np.diff(walk.frames).mean()
@@ -89,11 +89,11 @@ def test_steps_of_a_real_walk_and_of_a_mirrored_one():
     mirror = np.diag([-1.0, 1.0, 1.0])
     sides = {"left": "right", "right": "left"}
     swap = [JOINTS.index("_".join(sides.get(word, word) for word in name.split("_"))) for name in JOINTS]
-    (other,) = walks(mirror @ local[:, swap] @ mirror, offsets, rate)
+    (other,) = walking_bouts(mirror @ local[:, swap] @ mirror, offsets, rate)
     np.testing.assert_array_equal(other.frames, walk.frames)
     np.testing.assert_array_equal(other.left, ~walk.left)
     # Twice as slow: the same steps, half the cadence.
-    (slow,) = walks(np.repeat(local, 2, axis=0), offsets, 2 * rate)
+    (slow,) = walking_bouts(np.repeat(local, 2, axis=0), offsets, 2 * rate)
     assert np.abs(slow.frames / 2 - walk.frames).max() <= 1
 
 
@@ -101,8 +101,8 @@ def test_no_steps_where_nobody_walks():
     offsets = default_body().offsets
     for clip in (OTHER, SHORT_WALK):  # the other is of two steps
         local, rate = motion(clip)
-        assert walks(local, offsets, rate) == []
-    assert walks(pose(), offsets, 60.0) == []
+        assert walking_bouts(local, offsets, rate) == []
+    assert walking_bouts(pose(), offsets, 60.0) == []
 
 
 def test_longest_holds():
@@ -187,7 +187,7 @@ def test_page_of_a_walk(command, tmp_path):
     assert page.links == []
     assert [image.shape[1] for image in page.images] == [1600, 990]
     rows = {row[0]: row[1:] for row in page.rows}
-    (walk,) = walks(read_poses(tmp_path / name).rotations, default_body().offsets, rate)
+    (walk,) = walking_bouts(read_poses(tmp_path / name).rotations, default_body().offsets, rate)
     assert rows["steps"][0].startswith(f"{len(walk.frames)} in ")
     cadence = 60.0 * rate / np.diff(walk.frames).mean()
     assert int(rows["cadence"][0].split()[0]) == pytest.approx(cadence, abs=0.6)
@@ -220,7 +220,7 @@ def test_page_of_a_bvh_file(command, tmp_path):
     result = command("report", tmp_path / "a.bvh")
     assert result.returncode == 0, result.stderr
     page = Page((tmp_path / "a.html").read_text(encoding="utf-8"))
-    (walk,) = walks(local, default_body().offsets, rate)
+    (walk,) = walking_bouts(local, default_body().offsets, rate)
     steps = {row[0]: row[1:] for row in page.rows}["steps"][0]
     assert steps.startswith(f"{len(walk.frames)} in ")
 

@@ -407,7 +407,7 @@ Q = np.array([0.5, 0.1, -0.7, 0.5]) / np.linalg.norm([0.5, 0.1, -0.7, 0.5])
         (Q[[1, 2, 3, 0]], rot.quat_rotate(rot.quat_conjugate(Q), [0, 0, 9.81]), "looks like x, y, z, w"),
         (Q, rot.quat_rotate(rot.quat_conjugate(Q), [0, 9.81, 0]), "90 deg off (looks like a frame with Y up"),
         (Q, rot.quat_rotate(rot.quat_conjugate(Q), [0, 5, 7]), "36 deg off (no usual convention fits)"),
-        (Q, np.array([0.01, 0, 0]), "gravity is removed already"),
+        (Q, np.array([0.01, 0, 0]), "gravity is already removed"),
     ],
 )
 def test_gravity_that_is_not_up_says_why(
@@ -528,7 +528,10 @@ def of_head(**changes: Any) -> str:
         (corrupt(version=True), "format version True"),
         (corrupt(version=KeyError), "format version None"),
         (corrupt(sensors=[]), "'sensors' is missing or not an object"),
-        (corrupt(sensors__head=KeyError, sensors__pelvis=KeyError), "no sensor head, pelvis; calibrate anew"),
+        (
+            corrupt(sensors__head=KeyError, sensors__pelvis=KeyError),
+            "no sensor head, pelvis; calibrate again with all six",
+        ),
         (corrupt(sensors__chest={}), "unknown sensor 'chest'"),
         (corrupt(sensors__head=3), "sensor head is not an object"),
         (of_head(bone_from_sensor=[1, 0, 0]), "sensor head: 'bone_from_sensor' is not a unit"),
@@ -549,8 +552,8 @@ def of_head(**changes: Any) -> str:
         (corrupt(created=5), "'created' is missing or not text"),
         (corrupt(metadata=[]), "'metadata' is missing or not an object"),
         (corrupt(orientation=3), "'orientation' is missing or not an object"),
-        (corrupt(orientation__filter="magic"), "'orientation' must say filter (none, kalman, vqf)"),
-        (corrupt(orientation__filter=["none"]), "'orientation' must say filter (none, kalman, vqf)"),
+        (corrupt(orientation__filter="magic"), "'orientation' must have filter (none, kalman, vqf)"),
+        (corrupt(orientation__filter=["none"]), "'orientation' must have filter (none, kalman, vqf)"),
         (corrupt(orientation__north=1), "north (true or false)"),
     ],
 )  # fmt: skip

@@ -128,9 +128,11 @@ def test_swapped_sensors_and_one_upside_down_are_told() -> None:
         calibration_of(measured(worn, np.zeros(6), slack_deg=20.0), np.zeros(6)), MAP, "rig.toml"
     )
     assert len(warnings) == 2
-    assert warnings[0].startswith("left_forearm and right_forearm look swapped: each sits as rig.toml says")
+    assert warnings[0].startswith(
+        "left_forearm and right_forearm look swapped: each is mounted as rig.toml says"
+    )
     assert warnings[1] == (
-        "pelvis sits x down, z back (upside down), and rig.toml says x up, z back; "
+        "pelvis is mounted x down, z back (upside down), but rig.toml says x up, z back; "
         "check that no two sensors are swapped and that it is the right way round"
     )
     nothing_said = MAP | {"left_forearm": None, "right_forearm": None, "pelvis": None}
@@ -197,19 +199,19 @@ def test_a_real_walk_gives_headings_though_not_finely(seed: int) -> None:
 def test_motion_that_shows_no_heading_is_refused_and_names_the_sensor() -> None:
     mounting, yaw = random_mounting(1), np.zeros(6)
     still = np.tile(straight_pose(), (200, 1, 1, 1))
-    with pytest.raises(EdgeposeError, match=r"left_forearm leant by 0 deg only, .*; face one way, and bow"):
+    with pytest.raises(EdgeposeError, match=r"left_forearm leaned by only 0 deg, .*; face one way, bow"):
         exercised(still, mounting, yaw)
     bones = exercises(RATE)
     head = BONES[PLACEMENTS.index("head")]
     t = np.arange(len(bones)) / RATE
     nodding = bones.copy()
     nodding[:, head] = rot.rotation_about_axis("x", 0.5 * np.sin(5.0 * t)) @ straight_pose()[head]
-    with pytest.raises(EdgeposeError, match="this motion: head leant forward as much as back;"):
+    with pytest.raises(EdgeposeError, match="this motion: head leaned forward as much as back;"):
         exercised(nodding, mounting, yaw)
     circling = bones.copy()
     cone = np.stack([0.6 * np.cos(3 * t), 0 * t, 0.6 * np.sin(3 * t)], axis=-1)
     circling[:, head] = rot.rotvec_to_matrix(cone) @ straight_pose()[head]
-    with pytest.raises(EdgeposeError, match=r"this motion: head leant in all directions \(4\d deg\);"):
+    with pytest.raises(EdgeposeError, match=r"this motion: head leaned in all directions \(4\d deg\);"):
         exercised(circling, mounting, yaw)
 
 

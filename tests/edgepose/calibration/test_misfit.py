@@ -89,9 +89,9 @@ def test_its_own_calibration_says_nothing(command, real, calibrated):
 def test_exchanged_sensors(command, real, calibrated, tmp_path, pairs):
     warnings, table, code = told(command, exchanged(real, tmp_path, pairs), calibrated)
     moved = {name for pair in pairs for name in pair}
-    message = next(line for line in warnings if "exchanged since the calibration" in line)
-    assert set(re.findall(r"(\w+) sits where", message)) == moved
-    assert set(re.findall(r"^(\w+): it sits where", table, re.MULTILINE)) == moved
+    message = next(line for line in warnings if "swapped since the calibration" in line)
+    assert set(re.findall(r"(\w+) is where", message)) == moved
+    assert set(re.findall(r"^(\w+): it is where", table, re.MULTILINE)) == moved
     assert code == 1
 
 
@@ -105,7 +105,7 @@ def test_the_calibration_of_another_rig(command, real, calibrated, tmp_path, see
         sensor["bone_from_sensor"] = (quat / np.linalg.norm(quat)).tolist()
     (tmp_path / "other.json").write_text(json.dumps(document))
     warnings, table, code = told(command, real, tmp_path / "other.json")
-    assert any("nobody has stood still in the calibration's pose" in line for line in warnings)
+    assert any("the wearer has not stood still in the calibration's pose" in line for line in warnings)
     assert re.search(r" [0-2] of 6 sensors fine", table)
     assert code == 1
 
@@ -213,7 +213,7 @@ def test_an_impossible_bone_is_told_once(calibrated):
         line for frame in frames(calibration, POSES["straight"], 60) for line in misfits.update(frame, bones)
     ]
     assert len(lines) == 1
-    assert lines[0].startswith("warning: head: turned against the pelvis as no body can")
+    assert lines[0].startswith("warning: head: turned against the pelvis as no body can turn")
 
 
 def test_headings_that_are_reset_do_not_tell_left_from_right(calibrated):

@@ -112,7 +112,7 @@ def test_a_second_wish_while_headings_still_turn():
     [
         ({"shake": 0.2}, "headings stay as they are: moved: left_forearm 8 deg, "),
         ({"held": ("head",)}, "headings stay as they are: nothing new from head"),
-        ({"lift": 0.6}, "headings stay as they are: another tilt than in the calibration: left_forearm 34 "),
+        ({"lift": 0.6}, "headings stay as they are: tilt differs from the calibration's: left_forearm 34 "),
     ],
 )
 def test_a_bad_hold_changes_nothing_and_says_why(changes, says):
@@ -129,7 +129,7 @@ def test_a_bad_hold_changes_nothing_and_says_why(changes, says):
 def test_a_start_without_headings_waits_for_the_pose():
     walk = Walk(hold_first=True)
     assert set(walk.go(6.0, worn(STRAIGHT, DRIFT), shake=0.2)) == {None}
-    assert walk.said[0].endswith("facing forward, and hold still: poses begin after that")
+    assert walk.said[0].endswith("facing forward, and hold still: poses start after that")
     assert walk.said[1].startswith("waiting for the pose: moved: left_forearm 8 deg")
     assert len(walk.said) == 2
     found = walk.go(START_HOLD_S + 1.5, worn(STRAIGHT, DRIFT))

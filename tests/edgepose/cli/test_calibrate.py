@@ -169,7 +169,7 @@ def test_warnings_go_to_stderr_and_into_the_file(tmp_path: Path) -> None:
         (["--hold", 60], "no 60 s in which all six sensors reported: they overlap for 3.0 s"),
         (
             ["--heading-reset", REAL, "--hold", 2],
-            "not lying as the pelvis sensor does: left_lower_leg (20 deg), ",
+            "not lying like the pelvis sensor: left_lower_leg (20 deg), ",
         ),
         (["--heading-reset", "nowhere.csv"], "nowhere.csv: cannot read it"),
         (["--hold", 2, "--body-frame", "pelvis:x"], "body frame pelvis:x: this axis is"),
@@ -359,7 +359,7 @@ def test_a_wearer_who_does_not_do_the_exercises(
     monkeypatch.setattr(cal, "EXERCISE_S", 0.1)
     words = ("--port", wearer.port, "--hold", 1, "--countdown", 0, "--out", tmp_path / "calib.json")
     result = run(*words, "--heading-reset", "motion")
-    assert error_of(result).startswith("no heading from this motion: left_forearm leant by 0 deg only, ")
+    assert error_of(result).startswith("no heading from this motion: left_forearm leaned by only 0 deg, ")
     assert result.output.count("Once more.") == 3
 
 

@@ -93,7 +93,7 @@ def test_a_damaged_recording(command, tmp_path):
     result = command("check", "--file", file, "--json")
     assert result.returncode == 0, result.stdout
     (warning,) = json.loads(result.stdout)["warnings"]
-    assert "no number" in warning
+    assert "not a number" in warning
     assert f"warning: {warning}\n" == result.stderr
 
 

@@ -211,7 +211,7 @@ def test_a_recording_cut_in_two(fail, wearer, tmp_path):
     file = tmp_path / "cut.npz"
     file.write_bytes(content[: len(content) // 2])
     text = fail(file=file)
-    assert f"{file}: not a whole NPZ file" in text
+    assert f"{file}: not a complete NPZ file" in text
     assert "copy it again" in text
 
 
@@ -251,7 +251,7 @@ def test_a_calibration_without_a_sensor(fail, wearer, tmp_path):
     del document["sensors"][PLACEMENTS[2]]
     file = tmp_path / "c.json"
     file.write_text(json.dumps(document))
-    assert f"{file}: no sensor {PLACEMENTS[2]}; calibrate anew with all six" in fail(calibration=file)
+    assert f"{file}: no sensor {PLACEMENTS[2]}; calibrate again with all six" in fail(calibration=file)
 
 
 # --- archives -----------------------------------------------------------------------------------------------

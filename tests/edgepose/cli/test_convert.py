@@ -235,9 +235,7 @@ def test_a_damaged_xio_session(tmp_path):
     assert np.isnan(recording.sensors["head"].acc).any(axis=1).sum() == 2
     assert len(list(iter_samples(recording))) == len(written)
     (session / "head" / "Quaternion.csv").write_text("W,X\n")
-    assert (
-        "starts with 'W,X' and not with 'Timestamp (us)'" in convert(Job(session, tmp_path / "a.csv")).problem
-    )
+    assert "starts with 'W,X', not with 'Timestamp (us)'" in convert(Job(session, tmp_path / "a.csv")).problem
     (session / "head" / "Quaternion.csv").unlink()
     (session / "Head 2").mkdir()
     shutil.copy(file, session / "Head 2")
@@ -289,7 +287,7 @@ def test_fifty_files_one_of_them_broken_by_two_processes(command, tmp_path):
         rf"^{folder / '7.csv'} +59 +0\.1  damaged: .*1 bad rows left out.* row 21 has 1 col", damaged
     )
     (failed,) = (line for line in lines if " failed: " in line)
-    assert re.search(rf"^{folder / 'deeper' / '9.npz'} +- +-  failed: .*not a whole NPZ file", failed)
+    assert re.search(rf"^{folder / 'deeper' / '9.npz'} +- +-  failed: .*not a complete NPZ file", failed)
     written = sorted(path for path in out.rglob("*") if path.is_file())
     assert len(written) == 49
     for path in written:

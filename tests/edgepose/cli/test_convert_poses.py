@@ -149,7 +149,7 @@ def test_bvh_with_another_zero_pose_or_tree(tmp_path):
         .replace("JOINT X", "JOINT left_wrist")
     )
     path.write_text(swapped)
-    with pytest.raises(EdgeposeError, match="its joint left_elbow does not hang where SMPL's does"):
+    with pytest.raises(EdgeposeError, match="its joint left_elbow does not have SMPL's parent"):
         read_poses(path)
     z_up = re.sub(r"OFFSET (\S+) (\S+) (\S+)", r"OFFSET \1 \3 \2", text)
     path.write_text(z_up)
@@ -233,8 +233,8 @@ def test_broken_files_cost_only_themselves(command, tmp_path):
     )
     said = lines(result.stdout)
     assert list(said.values()).count("ok") == 11
-    assert re.match(r"damaged: .*3\.csv, row 11: 1 columns.*; 9 poses are taken", said["3.csv"])
-    assert re.match("failed: .*not a whole NPZ file", said["x.npz"])
+    assert re.match(r"damaged: .*3\.csv, row 11: 1 columns.*; 9 poses are kept", said["3.csv"])
+    assert re.match("failed: .*not a complete NPZ file", said["x.npz"])
     assert re.match("failed: .*has no poses, only a header", said["empty.csv"])
     assert sorted(path.name for path in out.iterdir()) == sorted(f"{i}.bvh" for i in range(12))
     check(out / "3.bvh", 9)
@@ -252,7 +252,7 @@ def test_directories_of_archives_that_zipfile_refuses(tmp_path, at, mended):
     path = tmp_path / "a.npz"
     path.write_bytes(content)
     assert not is_poses(path)
-    with pytest.raises(EdgeposeError, match=r"a\.npz: not a whole NPZ file"):
+    with pytest.raises(EdgeposeError, match=r"a\.npz: not a complete NPZ file"):
         read_poses(path)
 
 
@@ -291,7 +291,7 @@ def test_a_status_that_would_break_a_row(tmp_path, status):
     path.write_text(path.read_text().replace("held head", f'"{status}"'))
     read, damage = salvage_poses(path)
     assert len(read.frames) == 3
-    assert "row 5: the status has a comma, a quote or a line break in it; 3 poses are taken" in damage
+    assert "row 5: the status has a comma, a quote or a line break in it; 3 poses are kept" in damage
 
 
 def test_names_of_other_sensors_in_a_status_stay(tmp_path):
@@ -356,7 +356,7 @@ def test_good_rows_of_a_damaged_bvh_file(command, tmp_path, change, count, says)
         read_poses(path)
     result = command("convert", path, "--to", "npz", "--out", tmp_path / "out")
     assert result.returncode == 1
-    assert re.match(f"damaged: .*{says}.*; {count} poses are taken", lines(result.stdout)["a.bvh"])
+    assert re.match(f"damaged: .*{says}.*; {count} poses are kept", lines(result.stdout)["a.bvh"])
     found = read_poses(tmp_path / "out" / "a.npz").rotations
     np.testing.assert_allclose(found, [pose.rotations for pose in poses(count)], atol=1e-5)
 

@@ -356,7 +356,9 @@ def test_formats_of_a_package(package, files, original, wearer, wanted, tmp_path
     assert len(warnings) == 3
     assert "cannot load the file format broken (acme_formats:NOWHERE): AttributeError" in warnings[0]
     assert "cannot load the file format gone (acme_not_installed:FORMAT): ModuleNotFound" in warnings[1]
-    assert warnings[2] == ("the file format odd (acme_formats:PACKAGE) is no RecordingFormat or PoseFormat")
+    assert warnings[2] == (
+        "the file format odd (acme_formats:PACKAGE) is not a RecordingFormat or PoseFormat"
+    )
     same_poses(poses("run", file, wearer, tmp_path), wanted["run"])
     written = tmp_path / "poses.acmepose"
     shutil.copy(tmp_path / "run.csv", written)

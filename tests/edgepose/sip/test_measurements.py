@@ -117,7 +117,7 @@ def test_what_cannot_be_measured_is_told():
     raw = swinging(100.0)._replace(quat=None)
     with pytest.raises(EdgeposeError, match="head: the recording has no orientations"):
         measure(recording(head=raw), PLAIN, 60.0)
-    with pytest.raises(EdgeposeError, match=r"head: no sample after all sensors had begun, at 10\.00 s"):
+    with pytest.raises(EdgeposeError, match=r"head: no sample after all sensors had started, at 10\.00 s"):
         measure(
             recording(pelvis=swinging(100.0, start=10.0), left_forearm=swinging(100.0, 20.0)), PLAIN, 60.0
         )
@@ -184,7 +184,9 @@ def test_orientations_are_made_as_the_calibration_says(wearer, with_thigh):
         tilt = 2.0 * np.arctan2(np.hypot(change[:, 1], change[:, 2]), np.hypot(change[:, 0], change[:, 3]))
         assert np.degrees(np.median(tilt)) < 2.0, name
         assert not np.array_equal(made.quat, sent.sensors[name].quat)
-    with pytest.raises(EdgeposeError, match=r"with --filter kalman, which takes the six .* left_upper_leg"):
+    with pytest.raises(
+        EdgeposeError, match=r"with --filter kalman, which takes only the six .* left_upper_leg"
+    ):
         reading.read(with_thigh, calibration)
 
 

@@ -170,7 +170,7 @@ def test_swapped_sensors_are_told(motion):
     assert not report.misfits(solved(measurements), measurements)
     told = report.misfits(solved(swapped), swapped)
     assert told
-    assert all("is it worn where its name says" in line for line in told)
+    assert all("check that it is worn where its name says" in line for line in told)
     assert {line.split()[0] for line in told} & {"left_forearm", "left_lower_leg"}
 
 

@@ -226,5 +226,5 @@ def test_calibrate_compares_how_sensors_are_worn(command, wearer, tmp_path):
     assert result.returncode == 0, result.stderr
     warnings = [line for line in result.stderr.splitlines() if "rig.toml" in line]
     assert len(warnings) == 1
-    assert warnings[0].startswith("warning: head sits x ")
+    assert warnings[0].startswith("warning: head is mounted x ")
     assert f"{rig} says {sits['head']}" in warnings[0]

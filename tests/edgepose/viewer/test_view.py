@@ -83,7 +83,7 @@ def test_solids_join_the_joints():
     body = default_body()
     rotations, joints = forward_kinematics(Rotation.random(24, random_state=1).as_matrix(), body.offsets)
     cylinders, balls = build(body.offsets)
-    quats, centres = cylinders.placed(rotations, joints)
+    quats, centres = cylinders.posed(rotations, joints)
     along = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).apply([0, 0, 1]) * cylinders.sizes[:, 2:] / 2
     for j, parent in enumerate(
         [0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21]
@@ -91,7 +91,7 @@ def test_solids_join_the_joints():
         np.testing.assert_allclose(centres[j] - along[j], joints[parent], atol=1e-6)
         np.testing.assert_allclose(centres[j] + along[j], joints[j + 1], atol=1e-6)
     assert len(centres) == 23 + len(TIPS)
-    places = balls.placed(rotations, joints)[1]
+    places = balls.posed(rotations, joints)[1]
     for place in joints:
         assert np.abs(places - place).sum(axis=1).min() < 1e-9
     for joint, side in zip(cylinders.joints, cylinders.sides, strict=True):

@@ -181,14 +181,14 @@ def test_true_poses_of_a_recording_are_in_the_body_frame(tmp_path):
         ({"poses": np.zeros((0, 72))}, "no poses in it"),
         ({"poses": np.zeros((5, 63))}, r"'poses' must be \(frames, 72\)"),
         ({"poses": np.full((5, 72), np.nan)}, "a number in 'poses' of frame 0 is not finite"),
-        ({"poses": np.array([["a"] * 72] * 5)}, "and not numbers"),
+        ({"poses": np.array([["a"] * 72] * 5)}, ", not numbers"),
         ({"trans": np.full((5, 3), 1e7)}, "a number in 'trans' of frame 0 is not finite, or far too large"),
-        ({"trans": np.zeros((4, 3))}, r"'trans' is float64 \(4, 3\) and not numbers \(5, 3\)"),
+        ({"trans": np.zeros((4, 3))}, r"'trans' is float64 \(4, 3\), not numbers \(5, 3\)"),
         ({"time_s": None, "mocap_framerate": None}, "needs one number 'mocap_framerate'"),
         ({"time_s": None, "mocap_framerate": np.array(0.0)}, "a frame rate of 0 Hz is not possible"),
-        ({"frame": np.array([0, 1, 1, 2, 3])}, "do not rise"),
+        ({"frame": np.array([0, 1, 1, 2, 3])}, "do not increase"),
         ({"held": np.zeros((5, 5), bool)}, "'held' is bool"),
-        ({"poses": np.array([None] * 5)}, "not a whole NPZ file .*pickle"),
+        ({"poses": np.array([None] * 5)}, "not a complete NPZ file .*pickle"),
     ],
 )
 def test_damaged_npz(tmp_path, change, message):
@@ -404,7 +404,7 @@ def test_times_that_do_not_rise(tmp_path):
         read_poses(tmp_path / "a.csv")
     assert len(salvage_poses(tmp_path / "a.csv")[0].frames) == 2
     np.savez(tmp_path / "a.npz", poses=np.zeros((3, 72)), time_s=[1.0, 3.0, 2.0], frame=[0, 1, 2])
-    with pytest.raises(EdgeposeError, match="the times in 'time_s' do not rise"):
+    with pytest.raises(EdgeposeError, match="the times in 'time_s' do not increase"):
         read_poses(tmp_path / "a.npz")
 
 

@@ -67,7 +67,7 @@ def test_a_silent_sensor_and_a_bad_matrix_cost_only_themselves(content, tmp_path
     content["imu_acc"][7, PLACES[1]] = np.inf
     recording = read_recording(written(tmp_path / "01.pkl", content))
     assert "head was not measured" in recording.damage
-    assert "4 samples left out, which are no rotation or no acceleration" in recording.damage
+    assert "4 samples left out that are not a rotation or not an acceleration" in recording.damage
     assert {name: len(data.time_s) for name, data in recording.sensors.items()} == {
         name: FRAMES - {"left_forearm": 3, "right_forearm": 1}.get(name, 0)
         for name in PLACEMENTS

@@ -138,7 +138,7 @@ def test_bad_frames_cost_only_themselves(tmp_path):
     parts[20] = parts[20][:begin] + " ".join(words)
     path.write_text("</frame>".join(parts))
     found = read_mvnx(path)
-    assert f"{path}: 3 bad frames left out; {path}: 1 sensorMagneticField that are not whole" in found.damage
+    assert f"{path}: 3 bad frames left out; {path}: 1 incomplete sensorMagneticField" in found.damage
     assert f"{path}: 1 bad rows left out" in found.damage
     assert "head has a quaternion that is not of unit length" in found.damage
     assert {name: len(data.time_s) for name, data in found.sensors.items()} == {
@@ -155,7 +155,7 @@ def test_a_magnetometer_that_measures_nothing(tmp_path, there):
     path.write_text(path.read_text().replace("0.250000 -0.500000 1.000000", there))
     found = read_mvnx(path)
     whole = there.count("nan") == 3
-    says = None if whole else f"{path}: {FRAMES} sensorMagneticField that are not whole left out"
+    says = None if whole else f"{path}: {FRAMES} incomplete sensorMagneticField left out"
     assert found.damage == says
     for name, data in found.sensors.items():
         assert data.mag is None
@@ -167,7 +167,9 @@ def test_frames_before_a_second_subject_are_good(tmp_path):
     write(path)
     path.write_text(path.read_text().replace("</subject>", '</subject><subject frameRate="0"></subject>'))
     found = read_mvnx(path)
-    assert "breaks off (the frame rate '0' of its subject is not possible), 40 frames before" in found.damage
+    assert (
+        "breaks off (the frame rate '0' of its subject is not possible), the 40 frames before" in found.damage
+    )
     assert [len(data.time_s) for data in found.sensors.values()] == [FRAMES] * 6
 
 
@@ -199,7 +201,7 @@ OUTSIDE = '<!DOCTYPE mvnx [<!ENTITY a SYSTEM "file:///etc/passwd">]>\n<mvnx'
         ("<mvnx", OUTSIDE, "it declares a document type"),
         ("<mvnx", '<mvnx a="' + "x" * 3_000_000 + '"', "a tag of more than 1048576 bytes"),
         ("<sensorOrientation>", "<sensorOrientation>" + "1 " * 600_000, "a list has more than 1048576 char"),
-        ("<comment/>", "<a>" * 100, "elements are too deep in one another"),
+        ("<comment/>", "<a>" * 100, "elements are nested too deeply"),
         ("<comment/>", "<sensor/>" * 200, "has more than 100 sensors"),
         ('frameRate="60"', "", "the frame rate '' of its subject is not possible"),
         ('frameRate="60"', 'frameRate="nan"', "the frame rate 'nan' of its subject is not possible"),
@@ -239,7 +241,7 @@ def test_frames_without_sensor_data(tmp_path):
     path = tmp_path / "walk.mvnx"
     write(path)
     path.write_text(re.sub(r"<sensor[A-Z]\w+>[^<]*</sensor\w+>", "", path.read_text()))
-    with pytest.raises(EdgeposeError, match=r"no frame has whole lists .* export sensorOrientation and"):
+    with pytest.raises(EdgeposeError, match=r"no frame has complete lists .* export sensorOrientation and"):
         read_mvnx(path)
     with pytest.raises(EdgeposeError, match=r"none\.mvnx: cannot read it: No such file"):
         read_mvnx(tmp_path / "none.mvnx")

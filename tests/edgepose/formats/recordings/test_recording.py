@@ -188,7 +188,7 @@ def test_damaged_npz_is_an_error_or_still_a_recording(tmp_path_factory, place, c
     ("old", "new", "problem"),
     [
         (",head,", ",hat,", "row 6 names an unknown sensor 'hat'"),
-        ("9.81", "abc", "row 2 holds something that is no number"),
+        ("9.81", "abc", "row 2 has a value that is not a number"),
         ("9.81", "nan", "row 2: left_forearm has a number that is NaN or absurd"),
         ("9.81", "", "row 2: left_forearm has only a part of acc"),
         ("9.81", "9" * 9000, "row 2 has 9 columns"),

@@ -100,5 +100,7 @@ def test_another_inertial_frame(file):
             row[1:5] = ["1", "0", "0", "0"]
             row[5:8] = ["0", "9.8", "0"]
     file.write_text("\n".join("\t".join(row) for row in rows) + "\n")
-    with pytest.raises(EdgeposeError, match=r"L_LowArm measures gravity along \[0\.0, 9\.8, 0\.0\] and not"):
+    with pytest.raises(
+        EdgeposeError, match=r"L_LowArm measures gravity along \[0\.0, 9\.8, 0\.0\] instead of Z"
+    ):
         read_recording(file)

@@ -77,5 +77,5 @@ def test_decimal_commas(tmp_path):
 def test_another_file(tmp_path):
     folder = logged(tmp_path, "Q")
     (folder / NAME / "Quaternion.csv").write_text("t,W,X,Y,Z\n")
-    with pytest.raises(EdgeposeError, match=r"Quaternion.csv: starts with 't,W,X,Y,Z' and not with"):
+    with pytest.raises(EdgeposeError, match=r"Quaternion.csv: starts with 't,W,X,Y,Z', not with"):
         read_session(folder)

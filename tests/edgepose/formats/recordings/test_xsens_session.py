@@ -129,8 +129,8 @@ def test_bad_rows_cost_only_themselves(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("// Update Rate: 100.0Hz\n", "", "no possible 'Update Rate: ... Hz'"),
-        ("100.0Hz", "0.0Hz", "no possible 'Update Rate: ... Hz'"),
+        ("// Update Rate: 100.0Hz\n", "", "no valid 'Update Rate: ... Hz'"),
+        ("100.0Hz", "0.0Hz", "no valid 'Update Rate: ... Hz'"),
         ("Acc_Y", "FreeAcc_N", "has no columns Acc_Y"),
     ],
 )
