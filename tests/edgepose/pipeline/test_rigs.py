@@ -213,7 +213,7 @@ def test_several_wearers_write_to_nothing_that_can_stop_them(command, rig, tmp_p
         result = command("run", *words(rig(), rig("ben", **{"csv": None, flag: output})))
         assert result.returncode == 2, result.stderr
         assert f"ben: --{flag} " in result.stderr
-        assert f"{output} is no file on a disk: a slow reader of it would hold up" in result.stderr
+        assert f"{output} is not a file on a disk: a slow reader of it would delay" in result.stderr
     # Where standard output is a file, there is no reader.
     rigs = map(str, words(rig(), rig("ben", csv="-")))
     with (tmp_path / "out.csv").open("w") as out:
@@ -228,7 +228,7 @@ def test_several_wearers_write_to_nothing_that_can_stop_them(command, rig, tmp_p
         ({}, ["--csv", "x.csv"], "--csv belongs to a wearer: with --rig, put csv into the file"),
         ({}, ["--calibration", "c.json"], "--calibration belongs to a wearer"),
         ({}, ["--online", "window"], "--online window runs one wearer; use --online stream for several"),
-        ({"realtime": True}, [], "anna and ben: beside sensors that send, a recording needs"),
+        ({"realtime": True}, [], "anna and ben: a recording beside live sensors needs"),
         ({"csv": "anna.csv"}, [], "anna: --csv and ben: --csv name the same file"),
         ({"csv": "short.npz"}, [], "ben: --csv would overwrite"),
     ],
