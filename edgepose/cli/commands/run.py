@@ -38,10 +38,10 @@ def run(wearers: list[WearerConfig], settings: NetworkConfig) -> None:
     \b
     Examples:
       edgepose run --port /dev/ttyUSB0 --calibration calib.json --csv poses.csv
-      edgepose run --port COM3 --calibration calib.json --udp 10.0.0.5:9000,format=binary
-      edgepose run --can socketcan:can0 --calibration calib.json --model rnn --view
-      edgepose run --sensors rig.toml --calibration calib.json --udp 127.0.0.1:9000
-      edgepose run --port COM3 --filter kalman --calibration calib.json --csv out.csv
+      edgepose run --port COM3 --calibration calib.json --udp 10.0.0.5:9000
+      edgepose run --can socketcan:can0 --calibration calib.json --npz walk.npz
+      edgepose run --sensors rig.toml --calibration calib.json --model rnn --view
+      edgepose run --port COM3 --filter kalman --calibration calib.json --view
       edgepose run --file walk.csv --calibration calib.json --csv - | head
       edgepose run --rig anna.toml --rig ben.toml --model rnn
     """
