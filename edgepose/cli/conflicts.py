@@ -26,9 +26,9 @@ def check_lines(wearers: Sequence[WearerConfig]) -> None:
             ids = lines[line] + other_lines[line]
             separate = lines[line] and other_lines[line] and None not in ids and len(set(ids)) == len(ids)
             if not separate:
-                hint = ", or ids of its own there with sensors" if line.startswith("bus") else ""
+                hint = ", or ids of its own in a sensor map" if line.startswith("bus") else ""
                 raise EdgeposeError(
-                    f"{wearer.path}, {other.path}: two of them have the {line}; give each its own{hint}"
+                    f"{wearer.path}, {other.path}: both use the {line}; give each its own{hint}"
                 )
 
 

@@ -55,22 +55,24 @@ def wait_for_all_sensors(batches: Iterator[Batch], say: Prompter) -> Iterator[Ba
     Raises:
         EdgeposeError: a sensor is still missing after `ALL_REPORT_S`.
     """
-    passed, prompted_s = 0.0, 0
+    passed_s, prompted_s = 0.0, 0
     start_s: float | None = None
     missing = set(range(len(PLACEMENTS)))
     for now_s, samples, *_ in batches:
         start_s = now_s if start_s is None else start_s
-        passed = now_s - start_s
+        passed_s = now_s - start_s
         missing -= {sample.sensor for sample in samples}
         if not missing:
             say("All six sensors report.")
             return batches
-        if int(passed) > prompted_s:
-            prompted_s = int(passed)
+        if int(passed_s) > prompted_s:
+            prompted_s = int(passed_s)
             say(f"Waiting for {_names(missing)}.")
-        if passed > ALL_REPORT_S:
+        if passed_s > ALL_REPORT_S:
             break
-    raise EdgeposeError(f"nothing from {_names(missing)} in {passed:.0f} s: check power, link and id of each")
+    raise EdgeposeError(
+        f"nothing from {_names(missing)} in {passed_s:.0f} s: check power, link and id of each"
+    )
 
 
 def _names(sensors: set[int]) -> str:

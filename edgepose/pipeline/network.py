@@ -21,15 +21,15 @@ FRAMES_PER_STEP = 64
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkConfig:
-    """The network of a run and the way it runs; the fields are flags of `edgepose run`.
+    """The network of a run and how it runs; the fields are flags of `edgepose run`.
 
     Attributes:
         model: name of a shipped model, or path of an archive.
         trust: load the archive even if its checksum is unknown.
         online: "stream" carries a bidirectional model's forward state from frame to frame; "window" computes
             a whole window for each frame.
-        past: frames in a window before the present one; None is the model's own number.
-        future: frames after the present one that are waited for; None is the model's own number.
+        past: frames in a window before the present one; None takes the model's own number.
+        future: frames after the present one that are waited for; None takes the model's own number.
         precision: number format of the weights, one of `edgepose.inference.quantisation.CHOICES`.
     """
 

@@ -61,13 +61,13 @@ def _speed(models: tuple[str, ...], trust: bool, as_json: bool) -> None:
         with TemporaryDirectory() as folder:
             engine = speed.load_engine(info, trust, "auto")
             steps = speed.step_costs(engine, Path(folder))
-        walks = {
+        throughputs = {
             name: speed.whole_walk(speed.load_engine(info, trust, "auto"), paced)._asdict()
             for name, paced in (("full_speed", False), ("paced", True))
         }
-        ways = [row._asdict() for row in speed.model_speeds(info, trust)]
+        rows = [row._asdict() for row in speed.model_speeds(info, trust)]
         report["models"].append(
-            {"name": info.path.stem, "start": start._asdict(), "steps_us": steps, **walks, "ways": ways}
+            {"name": info.path.stem, "start": start._asdict(), "steps_us": steps, **throughputs, "ways": rows}
         )
     show(json.dumps(report, indent=1) if as_json else _speed_tables(report, speed.BUDGET_US))
 
@@ -83,19 +83,19 @@ def _speed_tables(report: dict[str, Any], budget_us: float) -> str:
         lines.append(_row([step, *(f"{model['steps_us'][step]:.0f}" for model in models)]))
     lines += ["", *_header(["packets to UDP, all steps", "frames a second", "p50 ms", "p99 ms", "max ms"])]
     for model in models:
-        for key, words in (("full_speed", "at full speed"), ("paced", "at 60 Hz")):
-            walk = model[key]
-            times = (f"{walk[name]:.2f}" for name in ("p50_ms", "p99_ms", "max_ms"))
-            lines.append(_row([f"{model['name']}, {words}", f"{walk['per_s']:.0f}", *times]))
+        for key, label in (("full_speed", "at full speed"), ("paced", "at 60 Hz")):
+            throughput = model[key]
+            times = (f"{throughput[name]:.2f}" for name in ("p50_ms", "p99_ms", "max_ms"))
+            lines.append(_row([f"{model['name']}, {label}", f"{throughput['per_s']:.0f}", *times]))
     header = ["model", "way", "weights", "us", "p50", "p99", "max", "frames a second", "of 1/60 s", "times"]
     lines += ["", *_header(header)]
-    for way in (way for model in models for way in model["ways"]):
-        name = "torch.nn.LSTM, defaults" if way["mode"] == "reference" else way["mode"]
-        times = (f"{way[key]:.0f}" for key in ("us", "p50_us", "p99_us", "max_us"))
-        share = f"{100 * way['us'] / budget_us:.1f} %"
-        speed = f"{1e6 / way['us']:.0f}"
+    for row in (row for model in models for row in model["ways"]):
+        name = "torch.nn.LSTM, defaults" if row["mode"] == "reference" else row["mode"]
+        times = (f"{row[key]:.0f}" for key in ("us", "p50_us", "p99_us", "max_us"))
+        share = f"{100 * row['us'] / budget_us:.1f} %"
+        speed = f"{1e6 / row['us']:.0f}"
         lines.append(
-            _row([way["model"], name, way["precision"], *times, speed, share, f"{way['times']:.1f}"])
+            _row([row["model"], name, row["precision"], *times, speed, share, f"{row['times']:.1f}"])
         )
     lines += ["", *_header(["a fresh process", "imports s", "model s", "memory MB"])]
     for model in models:
@@ -182,8 +182,8 @@ def _table(scores: list[Score], magnetometer: bool) -> str:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join(
         "  ".join(
-            cell.ljust(width) if place < 2 else cell.rjust(width)
-            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
+            cell.ljust(width) if column < 2 else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
         )
         for row in rows
     )

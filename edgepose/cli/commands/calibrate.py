@@ -232,7 +232,7 @@ def _metadata(source: SourceConfig, plan: CalibrationPlan, measured: Measured) -
         metadata["from_s"] = measured.from_s
     if measured.devices:
         metadata["devices"] = {
-            PLACEMENTS[place]: device._asdict() for place, device in sorted(measured.devices.items())
+            PLACEMENTS[index]: device._asdict() for index, device in sorted(measured.devices.items())
         }
     metadata["samples"] = dict(zip(PLACEMENTS, summary.samples, strict=True))
     metadata["force_m_s2"] = _by_placement(np.linalg.norm(summary.force, axis=-1))

@@ -71,10 +71,10 @@ def run(wearers: list[WearerConfig], settings: NetworkConfig) -> None:
 
 def _headline(network: Network, precision: str, wearer_count: int, has_keys: bool) -> str:
     wearers = f"{wearer_count} wearers with " if wearer_count > 1 else ""
-    way = "window" if network.windowed else "stream"
+    mode = "window" if network.windowed else "stream"
     hint = ", r re-zeroes headings" if has_keys else ""
     return (
-        f"running {wearers}{network.config.model} ({network.kind}, {way}) in {precision}; "
+        f"running {wearers}{network.config.model} ({network.kind}, {mode}) in {precision}; "
         f"Ctrl-C ends the run{hint}"
     )
 

@@ -91,7 +91,7 @@ def read_rigs(paths: Sequence[Path]) -> list[WearerConfig]:
     repeated = [name for name, count in Counter(wearer.name for wearer in wearers).items() if count > 1]
     if repeated:
         raise ConfigError(
-            f"{', '.join(map(str, paths))}: two of them have the name {repeated[0]}; give each its own"
+            f"{', '.join(map(str, paths))}: two wearers have the name {repeated[0]}; give each its own"
         )
     if len(wearers) > 1:
         check_lines(wearers)

@@ -59,7 +59,7 @@ def end_status() -> None:
 
 
 def clear_bar() -> None:
-    """Write the next message over click's progress bar, which is then drawn again below it."""
+    """Make the next message overwrite click's progress bar, which is then drawn again below it."""
     global _status
     _status = has_terminal()
 
