@@ -79,6 +79,7 @@ class SolveOutputs:
             inputs: files to read, by flag.
 
         Raises:
+            click.UsageError: no output for poses is given, or an output is also an input or another output.
             EdgeposeError: an output exists, cannot be written, or has the wrong ending.
         """
         if not (self.csv or self.npz or self.bvh):
