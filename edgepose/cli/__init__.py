@@ -1,4 +1,4 @@
-"""The command line: one thin file a command, imported only when that command is used."""
+"""The command line: one thin module per command, imported when that command is used."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import click
 
 from edgepose import __version__
 from edgepose.cli.terminal.messages import prepare, say
-from edgepose.cli.terminal.stop_signal import endings
+from edgepose.cli.terminal.stop_signal import stop_signals
 from edgepose.errors import as_edgepose_error
 
 COMMANDS = (
@@ -32,18 +32,18 @@ COMMANDS = (
     "solve",
     "view",
 )
-"""Commands of the runtime; others are found through the entry-point group `edgepose.commands`."""
+"""Commands of this package; other packages add theirs through the entry-point group `edgepose.commands`."""
 
 
 class LazyGroup(click.Group):
-    """A group that imports a command's module when the command is asked for."""
+    """A group of commands whose modules are imported on demand."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Names of all commands, without importing any."""
+        """Return the names of all commands without importing any."""
         return sorted({*COMMANDS, *(point.name for point in entry_points(group="edgepose.commands"))})
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """The command of that name, or None."""
+        """Import and return a command; None if there is none of that name."""
         if cmd_name in COMMANDS:
             command: click.Command = getattr(
                 importlib.import_module(f"edgepose.cli.commands.{cmd_name}"), cmd_name
@@ -58,7 +58,7 @@ class LazyGroup(click.Group):
     cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110}
 )
 @click.version_option(__version__, prog_name="edgepose")
-@click.option("--debug", is_flag=True, help="Show the whole traceback of an error.")
+@click.option("--debug", is_flag=True, help="Show the full traceback of an error.")
 def cli(debug: bool) -> None:
     """Six body-worn IMUs in, full-body SMPL poses out, in real time.
 
@@ -66,7 +66,7 @@ def cli(debug: bool) -> None:
     A first session, sensors on a serial port:
       edgepose devices
       edgepose calibrate --port /dev/ttyUSB0 --out calib.json
-      edgepose run --port /dev/ttyUSB0 --calibration calib.json --csv poses.csv --udp 127.0.0.1:9000
+      edgepose run --port /dev/ttyUSB0 --calibration calib.json --csv poses.csv
     """
 
 
@@ -75,16 +75,16 @@ def _terminate(number: int, frame: FrameType | None) -> NoReturn:
 
 
 def main() -> NoReturn:
-    """Entry point: errors become one line on stderr.
+    """Run the command line, and report an error as one line on stderr.
 
     Exit codes: 0 done, 1 the job failed, 2 wrong use, 130 interrupted.
     """
     prepare()
-    # These end a run as Ctrl-C does: files complete, counts printed. Under nohup, SIGHUP ends nothing.
-    for number in endings():
+    # Like Ctrl-C, these signals end a run with complete files and a summary. Under nohup, SIGHUP is ignored.
+    for number in stop_signals():
         if number != signal.SIGINT:
             signal.signal(number, _terminate)
-    # torch warns of its own plans when it reads int8 weights; nobody at a terminal can change these.
+    # When torch reads int8 weights it logs deprecation warnings, which a user cannot act on.
     os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
     debug = "--debug" in sys.argv[1:]
     try:
@@ -97,7 +97,7 @@ def main() -> NoReturn:
     except (click.Abort, KeyboardInterrupt):
         say("edgepose: stopped")
         sys.exit(130)
-    except BrokenPipeError:  # of standard output; what it held must not be tried again at the end
+    except BrokenPipeError:  # stdout: its buffer must not be flushed again at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         sys.exit(1)
     except Exception as error:

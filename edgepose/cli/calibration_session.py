@@ -1,9 +1,10 @@
-"""The hold and the heading reset of a calibration, from a live source or from a recording."""
+"""Hold and heading reset of a calibration, from a live source or from a recording."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
@@ -20,40 +21,58 @@ from edgepose.sources import Device, open_source
 from edgepose.sources.replay import is_recording
 
 ROUTINE_S = 30.0
-"""Longest motion that is taken from a recording unless --motion says from where to where."""
+"""Length of the motion that is taken from a recording without --motion, seconds."""
 
 
 def finds_forward(heading_reset: str | None) -> bool:
-    """Whether that way of heading reset also finds out where the wearer faces."""
+    """Return whether this kind of heading reset also finds the direction that the wearer faces."""
     return heading_reset is not None and heading_reset.partition(":")[0] in ("motion", "mounting")
 
 
-class CalibrationPlan(NamedTuple):
-    """What the wearer will do: the command's flags, and how the sensors sit if the heading reset needs it."""
+@dataclass(frozen=True, kw_only=True)
+class CalibrationPlan:
+    """Steps of a calibration; all fields except `mounting` are flags of `edgepose calibrate`.
+
+    Attributes:
+        pose: pose of the hold.
+        body_frame: the direction that the wearer faces; None is the default for the heading reset.
+        heading_reset: "live", "motion", "mounting[:AXIS]" or a file; None for none.
+        motion: start and end of the movements in a recording, seconds.
+        hold_s: length of the hold, seconds.
+        from_s: start of the hold in a recording, seconds; None looks for the stillest part.
+        countdown_s: time before each live hold, seconds.
+        mounting: how the sensors are worn, in the order of PLACEMENTS, if the heading reset needs it.
+    """
 
     pose: str
+    body_frame: str | None
     heading_reset: str | None
-    mounting: list[str]
     motion: tuple[float, float] | None
     hold_s: float
     from_s: float | None
     countdown_s: float
+    mounting: Sequence[str] = ()
 
     @property
-    def lying(self) -> Path | None:
-        """The recording of sensors that lie side by side."""
-        way = self.heading_reset
-        return None if way is None or way == "live" or finds_forward(way) else Path(way)
+    def side_by_side(self) -> Path | None:
+        """The recording of sensors that lie side by side, if the heading reset names one."""
+        reset = self.heading_reset
+        return None if reset is None or reset == "live" or finds_forward(reset) else Path(reset)
+
+    @property
+    def facing(self) -> str:
+        """The body frame, or its default."""
+        return self.body_frame or ("heading:0" if finds_forward(self.heading_reset) else "pelvis:-z")
 
 
 class Measured(NamedTuple):
-    """What a calibration is made of.
+    """Measurements for a calibration.
 
     Attributes:
         summary: the hold.
         reset: the heading reset, if there is one.
-        from_s: when the hold begins in a recording, seconds.
-        devices: what sent the samples, by placement.
+        from_s: start of the hold in a recording, seconds; None if it was live.
+        devices: the devices that sent the samples, by placement.
     """
 
     summary: HoldSummary
@@ -61,9 +80,20 @@ class Measured(NamedTuple):
     from_s: float | None
     devices: Mapping[int, Device]
 
+    @property
+    def warnings(self) -> list[str]:
+        """Warnings about the hold and the heading reset."""
+        return [*self.summary.warnings, *(() if self.reset is None else self.reset.warnings)]
 
-def live(source: SourceConfig, plan: CalibrationPlan, orient: OrientationStage, say: Prompter) -> Measured:
-    """The hold and the heading reset of a wearer in front of a live source."""
+
+def measure_live(
+    source: SourceConfig, plan: CalibrationPlan, orient: OrientationStage, say: Prompter
+) -> Measured:
+    """Guide a wearer through the hold and the heading reset with live sensors.
+
+    Raises:
+        EdgeposeError: sensors are missing, the wearer moved, or headings would be arbitrary.
+    """
     reset = _side_by_side(source, plan, orient, say)
     with open_source(**source.arguments()) as opened:
         batches = wait_for_all_sensors((b._replace(samples=orient(b.samples)) for b in opened), say)
@@ -73,7 +103,7 @@ def live(source: SourceConfig, plan: CalibrationPlan, orient: OrientationStage, 
             )
             wait_for_enter(batches, say)
         summary = record_hold(batches, plan.pose, plan.countdown_s, plan.hold_s, say, calibration.check_hold)
-        # Not before: magnetometers may be slower than the rest.
+        # Checked only now, because magnetometers may be slower than the other sensors.
         _check_north(orient, plan)
         if plan.heading_reset == "motion":
             upright = summary.orientation
@@ -83,24 +113,28 @@ def live(source: SourceConfig, plan: CalibrationPlan, orient: OrientationStage, 
     return Measured(summary, reset or _mounted(plan, summary), None, opened.devices)
 
 
-def recorded(
+def measure_recorded(
     source: SourceConfig, plan: CalibrationPlan, orient: OrientationStage, say: Prompter
 ) -> Measured:
-    """The hold and the heading reset in a recording."""
+    """Find the hold and the heading reset in a recording.
+
+    Raises:
+        EdgeposeError: they are not in it, the wearer moved, or headings would be arbitrary.
+    """
     reset = _side_by_side(source, plan, orient, say)
     everything, damage, devices = _read(source, orient)
     _check_north(orient, plan)
     still, start_s = _window(source.name, (everything, damage), plan.from_s, plan.hold_s, say)
     if plan.from_s is None:
-        say("If the wearer stood in the pose at another time, say so with --from.")
+        say("If the wearer stood in the pose at another time, give its start with --from.")
     summary = calibration.check_hold(still, "choose a still part with --from, or record again")
     if plan.heading_reset == "motion":
         end_s = start_s + plan.hold_s
         moving = calibration.trim(everything, *(plan.motion or (end_s, end_s + ROUTINE_S)))
         if not all(len(sensor.time_s) for sensor in moving):
             raise EdgeposeError(
-                f"{source.name}: not all six sensors report where the movements should be; say where "
-                "with --motion FROM:TO, or use another --heading-reset"
+                f"{source.name}: not all six sensors report during the movements; give their time with "
+                "--motion FROM:TO, or use another --heading-reset"
             )
         reset = calibration.headings_from_motion(moving, summary.orientation)
     return Measured(summary, reset or _mounted(plan, summary), start_s, devices)
@@ -109,30 +143,31 @@ def recorded(
 def _side_by_side(
     source: SourceConfig, plan: CalibrationPlan, orient: OrientationStage, say: Prompter
 ) -> HeadingReset | None:
-    """Heading reset from a recording of the sensors lying side by side, if there is one.
+    """Return the heading reset from a recording of the sensors lying side by side, if the plan names one.
 
     Raises:
-        EdgeposeError: they do not lie so, or their headings mean nothing in another recording.
+        EdgeposeError: the sensors do not lie side by side, or their headings do not hold in other recordings.
     """
-    if plan.lying is None:
+    path = plan.side_by_side
+    if path is None:
         return None
-    say(f"Heading reset from {plan.lying}.")
-    own = orient.fresh()
-    everything, damage, _ = _read(dataclasses.replace(source, file=plan.lying, port=None, can=None), own)
-    if not own.north:
+    say(f"Heading reset from {path}.")
+    fresh = orient.fresh()
+    everything, damage, _ = _read(dataclasses.replace(source, file=path, port=None, can=None), fresh)
+    if not fresh.north:
         raise EdgeposeError(
-            "the filter's headings begin anew in each recording, so another one cannot reset them: "
-            "use --heading-reset motion, live or mounting"
+            "without magnetometers the filter starts each recording with arbitrary headings, which another "
+            "recording cannot reset: use --heading-reset motion, live or mounting"
         )
     return calibration.headings_side_by_side(
-        _window(str(plan.lying), (everything, damage), None, plan.hold_s, say)[0]
+        _window(str(path), (everything, damage), None, plan.hold_s, say)[0]
     )
 
 
 def _mounted(plan: CalibrationPlan, summary: HoldSummary) -> HeadingReset | None:
-    """Heading reset from how the sensors sit, if that is wanted."""
-    way, _, axis = (plan.heading_reset or "").partition(":")
-    if way != "mounting":
+    """Return the heading reset from the mounting of the sensors, if the plan asks for it."""
+    kind, _, axis = (plan.heading_reset or "").partition(":")
+    if kind != "mounting":
         return None
     if plan.mounting:
         return calibration.headings_from_mounting(summary.orientation, plan.mounting)
@@ -140,13 +175,13 @@ def _mounted(plan: CalibrationPlan, summary: HoldSummary) -> HeadingReset | None
 
 
 def _check_north(orient: OrientationStage, plan: CalibrationPlan) -> None:
-    """Raises EdgeposeError if a filter has begun with any headings and nothing will bring them together."""
+    """Raise EdgeposeError if a filter started with arbitrary headings and no heading reset aligns them."""
     if orient.mixed:
         raise EdgeposeError(
-            "some sensors have a magnetometer and others none: their headings would differ; add --no-mag"
+            "some sensors have a magnetometer and others do not: their headings would differ; add --no-mag"
         )
-    # Sensors that lay side by side in another recording had a north there.
-    if (plan.heading_reset is None or plan.lying is not None) and not orient.north:
+    # A reset from another recording assumes that headings have a north.
+    if (plan.heading_reset is None or plan.side_by_side is not None) and not orient.north:
         raise EdgeposeError(
             "without a magnetometer in each sensor the filter's headings are arbitrary: "
             "add --heading-reset motion, live or mounting"
@@ -157,7 +192,7 @@ def _check_north(orient: OrientationStage, plan: CalibrationPlan) -> None:
 
 
 def _read(source: SourceConfig, orient: OrientationStage) -> tuple[Hold, str | None, Mapping[int, Device]]:
-    """Everything in a recording or a raw capture, what is wrong with it, and what sent it."""
+    """Return all samples of a recording or a raw capture, its damage, and the devices that sent them."""
     path = source.file
     assert path is not None
     if is_recording(path):
@@ -176,7 +211,7 @@ def _read(source: SourceConfig, orient: OrientationStage) -> tuple[Hold, str | N
 
 
 def _serial_numbers(sensors: Path | None) -> Mapping[int, str] | None:
-    """Placements by serial number in a map of sensors."""
+    """Return placements by serial number from a sensor map."""
     if sensors is None:
         return None
     from edgepose.sources.sensor_map import read_map
@@ -187,19 +222,19 @@ def _serial_numbers(sensors: Path | None) -> Mapping[int, str] | None:
 def _window(
     name: str, read: tuple[Hold, str | None], from_s: float | None, seconds: float, say: Prompter
 ) -> tuple[Hold, float]:
-    """The part of a recording that is a hold, and its start on the recording's clock, seconds."""
+    """Return the hold in a recording, and its start on the recording's clock, seconds."""
     everything, damage = read
     if damage:
         say(f"warning: {damage}")
     start = calibration.stillest_start(everything, seconds) if from_s is None else from_s
     first = min((s.time_s[0] for s in everything if len(s.time_s)), default=0.0)
     last = max((s.time_s[-1] for s in everything if len(s.time_s)), default=0.0)
-    # The last sample comes a little before the end.
+    # The last sample is a little earlier than the end.
     if from_s is not None and not first - 1e-6 <= start <= last - seconds + 0.1:
         raise EdgeposeError(
-            f"{name}: it has no {seconds:g} s from {start:g} s; it lasts from {first:.2f} to {last:.2f} s, "
-            "choose --from and --hold within that"
+            f"{name}: it does not contain {seconds:g} s from {start:g} s on; it lasts from {first:.2f} to "
+            f"{last:.2f} s, choose --from and --hold within that"
         )
-    why = "" if from_s is not None else ", the first as still as the stillest"
+    why = "" if from_s is not None else ", the first of the stillest parts"
     say(f"{name}: hold from {start:.2f} to {start + seconds:.2f} s{why}.")
     return calibration.trim(everything, start, start + seconds), start

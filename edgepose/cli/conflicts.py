@@ -1,4 +1,4 @@
-"""Conflicts: lines that two wearers cannot share, inputs that an output must not replace."""
+"""Conflicts between wearers, and between the files that a run reads and writes."""
 
 from __future__ import annotations
 
@@ -18,84 +18,95 @@ if TYPE_CHECKING:
     from edgepose.sources.sensor_map import SensorMap
 
 
-def check_lines(rigs: Sequence[WearerConfig]) -> None:
-    """Raises EdgeposeError where two wearers listen to one line, unless it is a bus on which each has ids."""
-    for (rig, lines), (other, others) in combinations([(rig, _lines(rig)) for rig in rigs], 2):
-        for line in lines.keys() & others.keys():
-            ids = lines[line] + others[line]
-            apart = lines[line] and others[line] and None not in ids and len(set(ids)) == len(ids)
-            if not apart:
-                hint = ", or ids of its own there with sensors" if line.startswith("bus") else ""
+def check_lines(wearers: Sequence[WearerConfig]) -> None:
+    """Raise EdgeposeError if two wearers use one line, unless it is a bus on which they have separate ids."""
+    with_lines = [(wearer, _lines(wearer)) for wearer in wearers]
+    for (wearer, lines), (other, other_lines) in combinations(with_lines, 2):
+        for line in lines.keys() & other_lines.keys():
+            ids = lines[line] + other_lines[line]
+            separate = lines[line] and other_lines[line] and None not in ids and len(set(ids)) == len(ids)
+            if not separate:
+                hint = ", or ids of its own in a sensor map" if line.startswith("bus") else ""
                 raise EdgeposeError(
-                    f"{rig.path}, {other.path}: two of them have the {line}; give each its own{hint}"
+                    f"{wearer.path}, {other.path}: both use the {line}; give each its own{hint}"
                 )
 
 
-def check_all_files(rigs: Sequence[WearerConfig], model: Path) -> None:
-    """Raises click.UsageError where a file to write is one to read, or would hold up or meet another's.
+def check_all_live(wearers: Sequence[WearerConfig]) -> None:
+    """Raise click.UsageError if some wearers are live and others are read at once."""
+    live = wearers[0].source.live
+    if different := [wearer.name for wearer in wearers if wearer.source.live != live]:
+        raise click.UsageError(
+            f"{wearers[0].name} and {different[0]}: a recording beside live sensors needs  realtime = true"
+        )
+
+
+def check_all_files(wearers: Sequence[WearerConfig], model: Path) -> None:
+    """Raise click.UsageError if an output would replace an input or another output, or delay other wearers.
 
     Args:
-        rigs: the wearers.
-        model: archive that is loaded.
+        wearers: one or several.
+        model: the archive that is loaded.
     """
-    if sum(rig.outputs.csv == "-" for rig in rigs) > 1:
+    if sum(wearer.outputs.csv == "-" for wearer in wearers) > 1:
         raise click.UsageError("several wearers write CSV to standard output; give all but one a file")
     outputs: dict[str, str | Path | None] = {}
     inputs: dict[str, Path | None] = {"--model": model}
-    for rig in rigs:
-        whose = f"{rig.name}: " if rig.name else ""
-        outputs |= {whose + flag: file for flag, file in rig.outputs.files.items()}
-        inputs |= {whose + flag: file for flag, file in _inputs(rig).items()}
+    for wearer in wearers:
+        prefix = f"{wearer.name}: " if wearer.name else ""
+        outputs |= {prefix + flag: file for flag, file in wearer.outputs.files.items()}
+        inputs |= {prefix + flag: file for flag, file in _inputs(wearer).items()}
     check_files(outputs, inputs)
-    for rig in rigs:
-        with prefix_errors(rig.name):
-            rig.outputs.check()
-    if len(rigs) > 1:
+    for wearer in wearers:
+        with prefix_errors(wearer.name):
+            wearer.outputs.check()
+    if len(wearers) > 1:
         for flag, file in outputs.items():
             if file is not None and has_reader(file):
                 raise click.UsageError(
-                    f"{flag} {file} is no file on a disk: a slow reader of it would hold up every wearer; "
+                    f"{flag} {file} is not a file on a disk: a slow reader of it would delay every wearer; "
                     "give each a file, --udp or --tcp"
                 )
 
 
-def _inputs(rig: WearerConfig) -> dict[str, Path | None]:
-    """Files that are read for a wearer, by flag."""
-    source, sensor_map = rig.source, _map(rig)
-    spoken = [source.protocol]
-    spoken += [port.protocol or "" for port in sensor_map.ports.values()] if sensor_map is not None else []
-    patterns = {f"--protocol {name}": Path(name) for name in spoken if name.endswith(".toml")}
+def _inputs(wearer: WearerConfig) -> dict[str, Path | None]:
+    """Return the files that are read for a wearer, by flag."""
+    source, sensor_map = wearer.source, _sensor_map(wearer)
+    protocols = [source.protocol]
+    if sensor_map is not None:
+        protocols += [port.protocol or "" for port in sensor_map.ports.values()]
+    patterns = {f"--protocol {name}": Path(name) for name in protocols if name.endswith(".toml")}
     return {
-        "--rig": rig.path,
+        "--rig": wearer.path,
         "--file": source.file,
         "--sensors": source.sensors,
-        "--calibration": rig.calibration,
+        "--calibration": wearer.calibration,
         **patterns,
     }
 
 
-def _lines(rig: WearerConfig) -> dict[str, list[int | None]]:
-    """The lines that a wearer listens to, and the ids of their sensors on them as far as a map tells."""
+def _lines(wearer: WearerConfig) -> dict[str, list[int | None]]:
+    """Return the lines that a wearer uses, each with the sensor ids that the sensor map lists on it."""
     from edgepose.sources.line_config import line_specs
 
-    source = rig.source
+    source = wearer.source
     if source.file is not None:
         return {"standard input": []} if str(source.file) == "-" else {}
-    with prefix_errors(rig.name):
-        sensor_map = _map(rig)
-        found = line_specs(
+    with prefix_errors(wearer.name):
+        sensor_map = _sensor_map(wearer)
+        specs = line_specs(
             *(source.port, source.baud, source.can, source.bitrate, source.fd, source.protocol), sensor_map
         )
     lines: dict[str, list[int | None]] = {}
-    for link in found:
-        if link.unit == "bytes":
-            lines[f"port {link.name}"] = []  # which only one may open
+    for spec in specs:
+        if spec.unit == "bytes":
+            lines[f"port {spec.name}"] = []  # a port can only be opened once
         else:
-            lines[f"bus {link.name}"] = [] if sensor_map is None else list(sensor_map.places(link.name))
+            lines[f"bus {spec.name}"] = [] if sensor_map is None else list(sensor_map.places(spec.name))
     return lines
 
 
-def _map(rig: WearerConfig) -> SensorMap | None:
+def _sensor_map(wearer: WearerConfig) -> SensorMap | None:
     from edgepose.sources.sensor_map import read_map
 
-    return None if rig.source.sensors is None else read_map(rig.source.sensors)
+    return None if wearer.source.sensors is None else read_map(wearer.source.sensors)

@@ -1,4 +1,4 @@
-"""`edgepose bench`: how well and how fast parts of the program do their work, on data with known truth."""
+"""`edgepose bench`: measure speed, and accuracy on data with known truth."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ if TYPE_CHECKING:
     "--model",
     "models",
     multiple=True,
-    help="Shipped model or an archive's path; several times for several  [default: all shipped ones]",
+    help="Shipped model or path of an archive; repeatable.  [default: all shipped models]",
 )
-@click.option("--trust", is_flag=True, help="Load models although their sums are not known.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON in the place of tables.")
+@click.option("--trust", is_flag=True, help="Load models even if their checksums are unknown.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
 @click.pass_context
 def bench(ctx: click.Context, models: tuple[str, ...], trust: bool, as_json: bool) -> None:
-    """Measure how well and how fast parts of the program do their work.
+    """Measure the accuracy and speed of parts of the program.
 
-    Without a command: the speed of every step from packets to poses on one core of this machine, of the
-    models in all their modes and precisions, and of torch.nn.LSTM of the same size beside them.
+    Without a command, measure on one core of this machine the speed of every step from packets to poses, and
+    of the models in all modes and precisions, compared with a torch.nn.LSTM of the same size.
 
     \b
     Examples:
@@ -61,43 +61,43 @@ def _speed(models: tuple[str, ...], trust: bool, as_json: bool) -> None:
         with TemporaryDirectory() as folder:
             engine = speed.load_engine(info, trust, "auto")
             steps = speed.step_costs(engine, Path(folder))
-        walks = {
+        throughputs = {
             name: speed.whole_walk(speed.load_engine(info, trust, "auto"), paced)._asdict()
             for name, paced in (("full_speed", False), ("paced", True))
         }
-        ways = [row._asdict() for row in speed.model_speeds(info, trust)]
+        rows = [row._asdict() for row in speed.model_speeds(info, trust)]
         report["models"].append(
-            {"name": info.path.stem, "start": start._asdict(), "steps_us": steps, **walks, "ways": ways}
+            {"name": info.path.stem, "start": start._asdict(), "steps_us": steps, **throughputs, "ways": rows}
         )
     show(json.dumps(report, indent=1) if as_json else _speed_tables(report, speed.BUDGET_US))
 
 
 def _speed_tables(report: dict[str, Any], budget_us: float) -> str:
-    """Markdown, to read and to put on a page."""
+    """Return the speeds as Markdown tables."""
     about = report["machine"]
     lines = [f"{about['processor']}, one core; Python {about['python']}, torch {about['torch']}"]
     models = report["models"]
     names = [model["name"] for model in models]
-    lines += ["", *_head(["us a frame", *names])]
+    lines += ["", *_header(["us a frame", *names])]
     for step in models[0]["steps_us"]:
         lines.append(_row([step, *(f"{model['steps_us'][step]:.0f}" for model in models)]))
-    lines += ["", *_head(["packets to UDP, all steps", "frames a second", "p50 ms", "p99 ms", "max ms"])]
+    lines += ["", *_header(["packets to UDP, all steps", "frames a second", "p50 ms", "p99 ms", "max ms"])]
     for model in models:
-        for key, words in (("full_speed", "at full speed"), ("paced", "at 60 Hz")):
-            walk = model[key]
-            times = (f"{walk[name]:.2f}" for name in ("p50_ms", "p99_ms", "max_ms"))
-            lines.append(_row([f"{model['name']}, {words}", f"{walk['per_s']:.0f}", *times]))
-    heads = ["model", "way", "weights", "us", "p50", "p99", "max", "frames a second", "of 1/60 s", "times"]
-    lines += ["", *_head(heads)]
-    for way in (way for model in models for way in model["ways"]):
-        name = "torch.nn.LSTM, defaults" if way["mode"] == "reference" else way["mode"]
-        times = (f"{way[key]:.0f}" for key in ("us", "p50_us", "p99_us", "max_us"))
-        share = f"{100 * way['us'] / budget_us:.1f} %"
-        speed = f"{1e6 / way['us']:.0f}"
+        for key, label in (("full_speed", "at full speed"), ("paced", "at 60 Hz")):
+            throughput = model[key]
+            times = (f"{throughput[name]:.2f}" for name in ("p50_ms", "p99_ms", "max_ms"))
+            lines.append(_row([f"{model['name']}, {label}", f"{throughput['per_s']:.0f}", *times]))
+    header = ["model", "way", "weights", "us", "p50", "p99", "max", "frames a second", "of 1/60 s", "times"]
+    lines += ["", *_header(header)]
+    for row in (row for model in models for row in model["ways"]):
+        name = "torch.nn.LSTM, defaults" if row["mode"] == "reference" else row["mode"]
+        times = (f"{row[key]:.0f}" for key in ("us", "p50_us", "p99_us", "max_us"))
+        share = f"{100 * row['us'] / budget_us:.1f} %"
+        speed = f"{1e6 / row['us']:.0f}"
         lines.append(
-            _row([way["model"], name, way["precision"], *times, speed, share, f"{way['times']:.1f}"])
+            _row([row["model"], name, row["precision"], *times, speed, share, f"{row['times']:.1f}"])
         )
-    lines += ["", *_head(["a fresh process", "imports s", "model s", "memory MB"])]
+    lines += ["", *_header(["a fresh process", "imports s", "model s", "memory MB"])]
     for model in models:
         start = model["start"]
         memory = "-" if start["memory_mb"] is None else f"{start['memory_mb']:.0f}"
@@ -109,7 +109,7 @@ def _row(cells: list[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def _head(cells: list[str]) -> list[str]:
+def _header(cells: list[str]) -> list[str]:
     return [_row(cells), "|" + "---|" * len(cells)]
 
 
@@ -120,12 +120,12 @@ def _head(cells: list[str]) -> list[str]:
     type=click.Path(path_type=Path),
     help="Folder of trials: data_mat of the BROAD download, or .npz files with the same arrays.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print JSON in the place of tables.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
 def orientation(data: Path, as_json: bool) -> None:
-    """Compare orientation filters on BROAD: ours, and of vqf, imufusion and ahrs what is installed.
+    """Compare orientation filters on BROAD: edgepose's, and vqf, imufusion and ahrs if installed.
 
-    Errors are means over trials of root mean squares over their movement, in degrees; the time is that of one
-    core for each sample.
+    An error is the root mean square over the movement of a trial, then the mean over trials, in degrees. A
+    time is that of one core per sample.
 
     \b
     Example:
@@ -135,7 +135,7 @@ def orientation(data: Path, as_json: bool) -> None:
     from edgepose.benchmarks.filter_comparison import compare, cost_us
 
     files = find_trials(data)
-    scores = [score for of_trial in _with_progress(compare(files), len(files)) for score in of_trial]
+    scores = [score for trial_scores in _with_progress(compare(files), len(files)) for score in trial_scores]
     cost = cost_us(read_trial(files[0]))
     if as_json:
         rows = [score._asdict() for score in scores]
@@ -150,7 +150,7 @@ def orientation(data: Path, as_json: bool) -> None:
 
 
 def _with_progress(trials: Iterable[list[Score]], count: int) -> Iterator[list[Score]]:
-    """The scores, with a bar on a terminal and a line for each trial elsewhere."""
+    """Yield the scores of each trial, and show a progress bar on a terminal, a line per trial elsewhere."""
     if sys.stderr.isatty():
         with click.progressbar(
             trials, length=count, label="Filtering", file=sys.stderr, show_pos=True
@@ -163,27 +163,27 @@ def _with_progress(trials: Iterable[list[Score]], count: int) -> Iterator[list[S
 
 
 def _table(scores: list[Score], magnetometer: bool) -> str:
-    """A line for each filter."""
+    """Return a table with a row for each filter."""
     rows = [("filter", "", "total", "heading", "inclination", "undisturbed", "disturbed", "us")]
     for name in dict.fromkeys(score.filter for score in scores):
-        own = [score for score in scores if score.filter == name and score.magnetometer == magnetometer]
+        selected = [score for score in scores if score.filter == name and score.magnetometer == magnetometer]
         rows.append(
             (
                 name,
-                "offline" if own[0].offline else "online",
-                _mean([score.total for score in own]),
-                _mean([score.heading for score in own]),
-                _mean([score.inclination for score in own]),
-                _mean([score.total for score in own if not score.disturbed]),
-                _mean([score.total for score in own if score.disturbed]),
-                f"{sum(score.us for score in own) / len(own):.1f}",
+                "offline" if selected[0].offline else "online",
+                _mean([score.total for score in selected]),
+                _mean([score.heading for score in selected]),
+                _mean([score.inclination for score in selected]),
+                _mean([score.total for score in selected if not score.disturbed]),
+                _mean([score.total for score in selected if score.disturbed]),
+                f"{sum(score.us for score in selected) / len(selected):.1f}",
             )
         )
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join(
         "  ".join(
-            cell.ljust(width) if place < 2 else cell.rjust(width)
-            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
+            cell.ljust(width) if column < 2 else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
         )
         for row in rows
     )

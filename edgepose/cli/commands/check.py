@@ -1,4 +1,4 @@
-"""`edgepose check`: how each sensor of a rig does, live, and what to do about it."""
+"""`edgepose check`: show the health of each sensor of a rig, and how to fix problems."""
 
 from __future__ import annotations
 
@@ -30,17 +30,23 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-REDRAW_S, LISTEN_S = 0.25, 1.5
+REDRAW_S = 0.25
+"""Time between two updates of the live page, seconds."""
+
+LISTEN_S = 1.5
+"""Time before the live page shows the table, seconds."""
+
 DEFAULT_S = 10.0
+"""Time to listen where there is no terminal, seconds."""
 
 
 class State(NamedTuple):
-    """What there is to say at a time.
+    """State of the sensors at one time.
 
     Attributes:
-        seconds: since the beginning, on the source's clock.
-        counters: of the source.
-        sensors: health of each sensor, and what to say about it.
+        seconds: time since the start, on the source's clock.
+        counters: packet counts of the source.
+        sensors: health of each sensor, and its diagnosis.
     """
 
     seconds: float
@@ -49,7 +55,7 @@ class State(NamedTuple):
 
     @property
     def problems(self) -> int:
-        """Number of sensors with which something is wrong."""
+        """Number of sensors with a problem."""
         return sum(finding.problem for _, finding in self.sensors)
 
 
@@ -58,25 +64,25 @@ class State(NamedTuple):
 @click.option(
     "--seconds",
     type=click.FloatRange(0, min_open=True),
-    help=f"How long to listen.  [default: until Ctrl-C on a terminal, {DEFAULT_S:g} elsewhere; to the end of "
-    "--file]",
+    help="How long to listen, seconds.  [default: until Ctrl-C on a terminal, "
+    f"{DEFAULT_S:g} elsewhere; to the end of --file]",
 )
 @click.option(
     "--calibration",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Calibration of the wearer, who stands in its pose: headings and places are compared with it.",
+    help="Calibration of a wearer who stands in its pose: headings and placements are compared with it.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Write the result as JSON.")
 @click.pass_context
 def check(
     ctx: click.Context, source: SourceConfig, seconds: float | None, calibration: Path | None, as_json: bool
 ) -> None:
-    """Show how each sensor does, and what to do where something is wrong: docs/guide/check.md has the words.
+    """Show the health of each sensor, and how to fix problems. docs/guide/check.md explains the findings.
 
-    The rig may lie on a table or be worn. Hold it still for some seconds: gravity, noise and bias are only
-    seen at rest. Turn it to and fro: only then gyroscope and orientation can be compared.
+    The sensors may lie on a table or be worn. Hold them still for some seconds: gravity, noise and bias only
+    show at rest. Then turn each one to and fro: gyroscope and orientation can only be compared in motion.
 
-    The exit code is 0 if all six sensors are fine, and 1 if something is wrong with one.
+    The exit code is 0 if all six sensors are fine, and 1 if one of them has a problem.
 
     \b
     Examples:
@@ -90,8 +96,8 @@ def check(
     from edgepose.pipeline.rig_comparison import other_devices
     from edgepose.sources import open_source
 
-    fitting = None if calibration is None else load_calibration(calibration)
-    health = SensorHealthMonitor(fitting)
+    loaded = None if calibration is None else load_calibration(calibration)
+    health = SensorHealthMonitor(loaded)
     if seconds is None:
         seconds = DEFAULT_S if source.live and not is_terminal() else math.inf
     with ExitStack() as stack:
@@ -109,8 +115,8 @@ def check(
                 page.draw([title[:width], *table, *_wrapped(warnings, width)])
 
         state, error = _listen(opened, health, source.file is None, seconds, lambda: stop.asked, watch)
-        if fitting is not None and (other := other_devices(fitting, opened.devices)) is not None:
-            _log.warning("%s", other.removeprefix("warning: "))
+        if loaded is not None and (difference := other_devices(loaded, opened.devices)) is not None:
+            _log.warning("%s", difference.removeprefix("warning: "))
     if page is not None:
         for warning in warnings:
             say(f"warning: {warning}")
@@ -120,7 +126,7 @@ def check(
     if as_json:
         show(_json(source.name, state, warnings))
     else:
-        # With styles; what is in it is clean.
+        # Not with show, which would remove the colours; the cells contain no text from devices.
         click.echo("\n".join(_lines(state, shutil.get_terminal_size().columns if is_terminal() else None)))
     if error is not None:
         raise error
@@ -135,7 +141,16 @@ def _listen(
     stopped: Callable[[], bool],
     watch: Callable[[Callable[[], State]], None],
 ) -> tuple[State, EdgeposeError | None]:
-    """The state at the end, and the error that was it; `watch` is called a few times a second."""
+    """Return the state at the end, and the error that ended it, if any.
+
+    Args:
+        source: the open source.
+        health: monitor that gets the samples.
+        live: whether samples arrive from devices, so that their delay means something.
+        seconds: how long to listen.
+        stopped: whether to end early.
+        watch: called every `REDRAW_S` with a callable that returns the state.
+    """
     from edgepose.diagnostics.rules import diagnose
 
     start_s: float | None = None
@@ -161,7 +176,11 @@ def _listen(
 
 @contextmanager
 def _warnings(hidden: bool) -> Iterator[list[str]]:
-    """What the program warns of meanwhile; hidden, it is not written elsewhere."""
+    """Collect the program's warnings while the context is entered.
+
+    Args:
+        hidden: do not write them to standard error as well.
+    """
     result: list[str] = []
     handler = logging.Handler()
     handler.emit = lambda record: result.append(printable(record.getMessage()))  # type: ignore[method-assign]
@@ -179,9 +198,16 @@ def _warnings(hidden: bool) -> Iterator[list[str]]:
 
 
 class _Column(NamedTuple):
-    """A column: its head, the unit of its numbers, the text of a cell, and how soon it may be left out."""
+    """A column of the table.
 
-    head: str
+    Attributes:
+        header: name of the column.
+        unit: unit of its numbers.
+        text: returns the text of a sensor's cell.
+        rank: order in which columns are left out on a narrow screen, highest first.
+    """
+
+    header: str
     unit: str
     text: Callable[[SensorHealth], str]
     rank: int
@@ -214,7 +240,7 @@ _COLUMNS = (
 
 
 def _lines(state: State, width: int | None) -> list[str]:
-    """Headline, a row for each sensor, and advice; in columns that fit into the width, None for any."""
+    """Return a headline, a row for each sensor and advice, fitted into `width` columns (None: any width)."""
     fine = len(state.sensors) - state.problems
     counters = state.counters
     headline = (
@@ -228,11 +254,11 @@ def _lines(state: State, width: int | None) -> list[str]:
 def _rows(state: State, width: int | None) -> list[str]:
     names = [["", "sensor", *(sensor.placement for sensor, _ in state.sensors)]]
     columns = [
-        (column.rank, [column.head, column.unit, *(column.text(sensor) for sensor, _ in state.sensors)])
+        (column.rank, [column.header, column.unit, *(column.text(sensor) for sensor, _ in state.sensors)])
         for column in _COLUMNS
     ]
     findings = ["", "finding", *(finding.name for _, finding in state.sensors)]
-    # What nobody measures says nothing, and on a narrow screen less is enough.
+    # Leave out columns that no sensor has values for, and on a narrow screen the least important ones.
     columns = [(rank, cells) for rank, cells in columns if any(cell != "-" for cell in cells[2:])]
     while columns and width is not None and _width([*names, *(c for _, c in columns), findings]) > width:
         columns.remove(max(columns))
@@ -275,7 +301,7 @@ def _json(name: str, state: State, warnings: list[str]) -> str:
                 "finding": finding.name,
                 "problem": finding.problem,
                 "advice": finding.advice,
-                **_known(sensor),
+                **_health_fields(sensor),
             }
             for sensor, finding in state.sensors
         ],
@@ -283,8 +309,8 @@ def _json(name: str, state: State, warnings: list[str]) -> str:
     return json.dumps(document, indent=2, allow_nan=False)
 
 
-def _known(sensor: SensorHealth) -> dict[str, Any]:
-    """The fields of a sensor's health, null where a number is not known."""
+def _health_fields(sensor: SensorHealth) -> dict[str, Any]:
+    """Return the fields of a sensor's health for JSON; None for unknown numbers."""
     return {
         key: (float(f"{value:.6g}") if math.isfinite(value) else None) if isinstance(value, float) else value
         for key, value in dataclasses.asdict(sensor).items()

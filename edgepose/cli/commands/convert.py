@@ -1,4 +1,4 @@
-"""`edgepose convert`: recordings and poses of any kind to CSV, NPZ or BVH, many at once."""
+"""`edgepose convert`: convert recordings and poses of any kind to CSV, NPZ or BVH, many at once."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.utils.output_targets import check_free, check_output
 
 if TYPE_CHECKING:
-    from edgepose.convert import Result
+    from edgepose.convert import Job, Result
 
 
 @click.command(short_help="Convert recordings, captures and poses.")
@@ -27,28 +27,28 @@ if TYPE_CHECKING:
     "--to",
     required=True,
     type=click.Choice(["csv", "npz", "bvh"]),
-    help="Kind of file to write; bvh is for poses only.",
+    help="Format to write; bvh is for poses only.",
 )
 @click.option(
     "--out",
     required=True,
     type=click.Path(path_type=Path, file_okay=False),
-    help="Folder to write to; made if it is not there.",
+    help="Folder to write to; created if it does not exist.",
 )
 @click.option(
     "--filter",
     type=click.Choice(["none", "kalman", "smoother", "vqf"]),
     default="none",
     show_default=True,
-    help="Make orientations of gyroscope, accelerometer and, where there is one, magnetometer; smoother uses "
-    "what comes later, too. none: leave the devices' own.",
+    help="Compute orientations from gyroscope, accelerometer and, where available, magnetometer; smoother "
+    "uses later samples, too. none: keep the orientations that the sensors sent.",
 )
 @click.option(
     "--height",
     type=float,
     default=1.75,
     show_default=True,
-    help="The wearer's stature, for the bones of BVH files, metres.",
+    help="The wearer's height, metres, for the bones of BVH files.",
 )
 @protocol_option
 @sensors_option
@@ -57,9 +57,9 @@ if TYPE_CHECKING:
     type=click.IntRange(1),
     default=1,
     show_default=True,
-    help="Recordings converted at a time, each by a process of its own.",
+    help="Number of processes, each of which converts one recording at a time.",
 )
-@click.option("--skip-existing", is_flag=True, help="Leave out recordings whose output is there already.")
+@click.option("--skip-existing", is_flag=True, help="Skip recordings whose output exists.")
 @overwrite_option
 def convert(
     inputs: tuple[Path, ...],
@@ -76,13 +76,13 @@ def convert(
     """Convert recordings: CSV, NPZ, raw captures of a port, logs of a CAN bus, sessions of x-io's
     software and of Xsens' MT Manager, MVNX of Xsens' MVN, TotalCapture's .sensors and DIP-IMU's .pkl.
 
-    IN are files, patterns and folders. A folder stands for the recordings in it, at any depth; one that holds
-    a folder for each x-io sensor is one recording, whose sensors' folders have placements in their names (or,
-    with --sensors, their serial numbers as ids: id = 0x64F61CB3). Of a damaged recording what is good is
-    written, of poses in CSV or BVH those before the first bad one, and the exit code is 1.
+    IN are files, patterns and folders. A folder stands for all recordings in it, at any depth. A folder with
+    one subfolder per x-io sensor is one recording; the names of the subfolders contain the placements, or
+    --sensors maps their serial numbers as ids (id = 0x64F61CB3). The good part of a damaged recording is
+    written, and the poses of a CSV or BVH file before the first bad one; the exit code is then 1.
 
-    Files of poses, CSV and BVH as `run` writes them or NPZ with the keys of AMASS, become CSV, NPZ or BVH; of
-    a recording that holds true poses, as DIP-IMU's do, --to bvh takes these. - is CSV on standard input.
+    Files of poses (CSV and BVH as `run` writes them, NPZ with the keys of AMASS) become CSV, NPZ or BVH. From
+    a recording with true poses, such as DIP-IMU's, --to bvh takes these. - reads CSV from standard input.
 
     \b
     Examples:
@@ -91,26 +91,22 @@ def convert(
       edgepose convert walk.part.csv --to npz --out saved
       edgepose convert raw.csv --to npz --out oriented --filter smoother
       edgepose convert poses/ --to bvh --out for-blender --jobs 2 --height 1.68
-      edgepose run --file walk.npz ... --csv - | edgepose convert - --to bvh --out .
+      edgepose run ... --csv - | edgepose convert - --to bvh --out .
     """
     from edgepose.convert import Options, Result, convert_all, plan
     from edgepose.skeleton import default_body
     from edgepose.sources.sensor_map import read_map
 
     if skip_existing and overwrite:
-        raise click.UsageError("--skip-existing leaves alone what --overwrite replaces: give one of them")
-    # A mistake in one of these is told once.
+        raise click.UsageError("--skip-existing keeps what --overwrite replaces: give one of them")
+    # Checked here, so that a mistake in them is reported once and not for each recording.
     default_body(height)
     if sensors is not None:
         read_map(sensors)
     planned = plan(inputs, to, out)
     done = {job: Result(job, skipped=True) for job in planned if skip_existing and job.target.exists()}
     todo = [job for job in planned if job not in done]
-    if not overwrite:
-        check_free((job.target for job in todo), "give --skip-existing, --overwrite or another --out")
-    for job in todo:
-        if job.target.is_symlink():  # what it leads to may be of another kind
-            check_output(job.target, "the output", (f".{to}",), overwrite)
+    _check_targets(todo, to, overwrite)
     try:
         options = Options(protocol, sensors, filter, height, overwrite)
         for result in _with_progress(convert_all(todo, options, jobs), len(todo)):
@@ -120,12 +116,21 @@ def convert(
     failed = sum(result.problem is not None for result in done.values())
     if failed:
         raise EdgeposeError(
-            f"{failed} of {len(planned)} recordings not or not wholly converted; see the table"
+            f"{failed} of {len(planned)} recordings not converted, or only in part; see the table"
         )
 
 
+def _check_targets(jobs: Sequence[Job], to: str, overwrite: bool) -> None:
+    """Raise EdgeposeError if a job would replace a file that it must not replace."""
+    if not overwrite:
+        check_free((job.target for job in jobs), "give --skip-existing, --overwrite or another --out")
+    for job in jobs:
+        if job.target.is_symlink():  # it may lead to a file of another kind
+            check_output(job.target, "the output", (f".{to}",), overwrite)
+
+
 def _with_progress(results: Iterable[Result], count: int) -> Iterator[Result]:
-    """The results, with a bar on a terminal and a line for each elsewhere."""
+    """Yield the results, and show a progress bar on a terminal, a line per result elsewhere."""
     from edgepose.convert import describe
 
     if sys.stderr.isatty():
@@ -135,7 +140,7 @@ def _with_progress(results: Iterable[Result], count: int) -> Iterator[Result]:
                 bar.update(1)
         return
     for number, result in enumerate(results, start=1):
-        yield result  # first: what is told must be in the table, whenever Ctrl-C comes
+        yield result  # before the line, so that after Ctrl-C the table has every result that was shown
         say(_one_line(f"{number} of {count}  {result.job.source}: {describe(result)}"))
 
 
@@ -151,5 +156,5 @@ def _table(results: Sequence[Result]) -> str:
 
 
 def _one_line(text: str) -> str:
-    """Text in which names of files may have line breaks."""
+    """Replace line breaks and tabs, which may be in file names."""
     return printable(text).replace("\n", "?").replace("\t", "?")

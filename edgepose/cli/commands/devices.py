@@ -1,4 +1,4 @@
-"""`edgepose devices`: what could be read from on this machine."""
+"""`edgepose devices`: list the serial ports and CAN interfaces of this machine."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 @click.option(
     "--probe",
     is_flag=True,
-    help="Listen to each for some seconds, to the ports at the usual speeds, and tell protocol, sensor ids "
-    "and rates. Nothing is sent to the sensors.",
+    help="Listen to each for some seconds, to ports at the usual speeds, and report protocol, sensor ids and "
+    "rates. Nothing is sent to the sensors.",
 )
 def devices(names: tuple[str, ...], probe: bool) -> None:
-    """List the serial ports and CAN interfaces of this machine, or those that are named.
+    """List the serial ports and CAN interfaces of this machine, or only the named ones.
 
     \b
     Examples:
@@ -36,14 +36,14 @@ def devices(names: tuple[str, ...], probe: bool) -> None:
     if ports or not names:
         show("Serial ports (edgepose run --port NAME):")
         width = max(map(len, ports), default=0)
-        for name, what in ports.items():
-            show(f"  {name.ljust(width)}  {what}".rstrip())
+        for name, description in ports.items():
+            show(f"  {name.ljust(width)}  {description}".rstrip())
             if probe:
-                show(f"    {_port_says(name)}")
+                show(f"    {_probe_port(name)}")
         if not ports:
             show(
-                "  none found; plug the hub in, or check that its driver is loaded and you may read it "
-                "(group dialout)"
+                "  none found; connect the sensors, and check that the driver is loaded and that you may "
+                "read the port (group dialout)"
             )
     if buses is None:
         buses = _buses()
@@ -52,31 +52,31 @@ def devices(names: tuple[str, ...], probe: bool) -> None:
         for name in buses:
             show(f"  {name}")
             if probe:
-                show(f"    {_bus_says(name)}")
+                show(f"    {_probe_bus(name)}")
         if not buses:
             show("  none found; adapters on a serial port are named slcan:PORT")
 
 
 def _is_bus(name: str) -> bool:
-    # Not COM3, nor anything under /dev.
+    # False for COM3 and for everything under /dev.
     return ":" in name and not name.startswith("/")
 
 
 def _ports() -> dict[str, str]:
-    """Ports found and what is known of them."""
+    """Return the serial ports of this machine with their descriptions."""
     from serial.tools import list_ports
 
     result = {}
     for port in sorted(list_ports.comports()):
-        what = port.description if port.description != "n/a" else ""
+        description = port.description if port.description != "n/a" else ""
         serial_number = f"serial number {port.serial_number}" if port.serial_number else ""
-        result[port.device] = "  ".join(part for part in (what, serial_number) if part)
+        result[port.device] = "  ".join(part for part in (description, serial_number) if part)
     return result
 
 
 def _buses() -> list[str]:
-    """CAN interfaces found."""
-    # Importing python-can costs more than the rest of this command.
+    """Return the CAN interfaces of this machine."""
+    # Imported late because python-can takes longer to import than all the rest of this command.
     from edgepose.sources.can_bus import can
 
     found = can.detect_available_configs(
@@ -85,36 +85,38 @@ def _buses() -> list[str]:
     return [f"{config['interface']}:{config['channel']}" for config in found]
 
 
-def _port_says(name: str) -> str:
+def _probe_port(name: str) -> str:
     from edgepose.sources.probe import probe_port
 
-    _tell(name)
+    _say_listening(name)
     try:
         finding, baud = probe_port(name)
     except EdgeposeError as error:
         return str(error)
-    return _says(finding, "bytes", f" at --baud {baud}")
+    return _describe(finding, "bytes", f" at --baud {baud}")
 
 
-def _bus_says(name: str) -> str:
+def _probe_bus(name: str) -> str:
     from edgepose.sources.probe import probe_bus
 
-    _tell(name)
+    _say_listening(name)
     try:
-        return _says(probe_bus(name), "frames", "")
+        return _describe(probe_bus(name), "frames", "")
     except EdgeposeError as error:
         return str(error)
 
 
-def _tell(name: str) -> None:
+def _say_listening(name: str) -> None:
     if sys.stderr.isatty():
         say(f"listening to {name} ...")
 
 
-def _says(finding: ProbeResult, unit: str, speed: str) -> str:
+def _describe(finding: ProbeResult, unit: str, speed: str) -> str:
     if finding.protocol is None:
         if not finding.amount:
-            return "nothing comes"
-        return f"{finding.amount} {unit} came, of no known protocol; the device may be set to another speed"
+            return "nothing arrives"
+        return (
+            f"{finding.amount} {unit} arrived, in no known protocol; the device may be set to another speed"
+        )
     ids = ", ".join(f"id {sensor} at {rate:.0f} Hz" for sensor, rate in finding.rates_hz.items())
     return f"--protocol {finding.protocol}{speed}: {ids}"

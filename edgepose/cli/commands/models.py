@@ -1,4 +1,4 @@
-"""`edgepose models`: the archives that there are, and their cards."""
+"""`edgepose models`: list model archives and show their cards."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ from edgepose.inference import archive
 @click.command(short_help="List model archives, show their cards.")
 @click.argument("names", nargs=-1, metavar="[NAME|PATH]...")
 @click.option(
-    "--trust", is_flag=True, help="Put the archives' SHA-256 sums on your own list, so that `run` loads them."
+    "--trust",
+    is_flag=True,
+    help="Add the archives' SHA-256 checksums to your own list, so that `run` loads them.",
 )
 def models(names: tuple[str, ...], trust: bool) -> None:
-    """List the shipped model archives, or show what an archive says of itself. Nothing of an archive is run.
+    """List the shipped model archives, or show the cards of archives. No code in an archive is run.
 
     \b
     Examples:
@@ -58,6 +60,6 @@ def _show(info: archive.ArchiveInfo) -> None:
         show(card.read_text(encoding="utf-8").rstrip())
     else:
         for key, value in info.metadata.items():
-            # JSON, so that a text from a stranger's file cannot steer the terminal.
+            # JSON, so that text from an untrusted file cannot control the terminal.
             show(f"{json.dumps(key)[1:-1]}: {json.dumps(value)}")
     show(f"\nfile: {Path(info.path)}\nsha256: {info.sha256}\ntrusted: {'yes' if info.trusted else 'no'}")

@@ -1,4 +1,4 @@
-"""`edgepose record`: what arrives, to a recording."""
+"""`edgepose record`: write what arrives to a recording."""
 
 from __future__ import annotations
 
@@ -31,15 +31,16 @@ if TYPE_CHECKING:
 @click.option(
     "--seconds",
     type=click.FloatRange(0, min_open=True),
-    help="Length of the recording from the first sample on.  [default: until Ctrl-C or the end of --file]",
+    help="Length of the recording from the first sample on, seconds.  [default: until Ctrl-C or the end of "
+    "--file]",
 )
 @overwrite_option
 def record(source: SourceConfig, out: str, seconds: float | None, overwrite: bool) -> None:
-    """Write what arrives to OUT until Ctrl-C; at most the last second is lost when the power goes.
+    """Write what arrives to OUT until Ctrl-C. A power cut loses at most the last second.
 
-    The ending of OUT says what is written: .csv and .npz samples; .bin the bytes of one port as they come,
-    with their times in OUT.times; .log, .asc and .blf the frames of a CAN bus. All of them are read with
-    --file. - is CSV on standard output.
+    The ending of OUT decides what is written. .csv, .npz: samples. .bin: the bytes of one port as they
+    arrive, with their times in OUT.times. .log, .asc, .blf: the frames of CAN buses. --file reads all of
+    them. - writes CSV to standard output.
 
     \b
     Examples:
@@ -54,18 +55,18 @@ def record(source: SourceConfig, out: str, seconds: float | None, overwrite: boo
     kind = recorder.kind(out)
     if kind == "port" and (source.port is None or "," in source.port or source.can is not None):
         raise click.UsageError(
-            f"{out} takes the bytes of one port: give --port PORT, or name it .csv or .npz"
+            f"{out} stores the bytes of one port: give --port PORT, or name it .csv or .npz"
         )
     if kind == "bus" and (source.can is None or source.port is not None):
-        raise click.UsageError(f"{out} takes the frames of a CAN bus: give --can, or name it .csv or .npz")
+        raise click.UsageError(f"{out} stores the frames of a CAN bus: give --can, or name it .csv or .npz")
     with ExitStack() as stack:
-        written = {"OUT": out, "OUT (while it grows)": recorder.growing(out)}
-        check_files(written, {"--file": source.file, "--sensors": source.sensors})
+        outputs = {"OUT": out, "OUT (while it grows)": recorder.growing(out)}
+        check_files(outputs, {"--file": source.file, "--sensors": source.sensors})
         recorder.check_free(out, overwrite)
         opened = stack.enter_context(open_source(**source.arguments()))
         stop = stack.enter_context(StopSignal())
         output = recorder.open_output(out, _metadata(source), overwrite)
-        say(f"recording to {out}; Ctrl-C ends it. Samples are counted in the order {', '.join(PLACEMENTS)}")
+        say(f"recording to {out}; Ctrl-C ends it. Sample counts are in the order {', '.join(PLACEMENTS)}")
         summary = recorder.record(
             opened,
             output,
@@ -92,17 +93,17 @@ def _metadata(source: SourceConfig) -> dict[str, str]:
 
 
 def _progress(source: Source) -> Callable[[RecordSummary], None]:
-    """A callback that keeps one line on a terminal up to date; elsewhere it writes a line now and then."""
+    """Return a callback that updates one line on a terminal; elsewhere it writes a line every 10 s."""
     every_s = 1.0 if has_terminal() else 10.0
-    shown_s, before = time.monotonic(), 0
+    shown_s, shown_total = time.monotonic(), 0
 
     def show(summary: RecordSummary) -> None:
-        nonlocal shown_s, before
+        nonlocal shown_s, shown_total
         now_s = time.monotonic()
         if now_s - shown_s >= every_s:
             total = sum(summary.samples)
-            rate = (total - before) / (now_s - shown_s)
-            shown_s, before = now_s, total
+            rate = (total - shown_total) / (now_s - shown_s)
+            shown_s, shown_total = now_s, total
             status(
                 f"{summary.seconds:.0f} s, {' '.join(map(str, summary.samples))}, {rate:.0f} a second, "
                 f"{source.counters.lost} lost"
@@ -112,7 +113,7 @@ def _progress(source: Source) -> Callable[[RecordSummary], None]:
 
 
 def _report(out: str, summary: RecordSummary, source: Source) -> None:
-    """Prints the counts of a finished recording."""
+    """Report the counts of a finished recording."""
     end_status()
     total = sum(summary.samples)
     rate = total / summary.seconds if summary.seconds else 0.0
@@ -122,4 +123,4 @@ def _report(out: str, summary: RecordSummary, source: Source) -> None:
     say(f"packets  {counts.packets} good, {counts.lost} lost, {counts.bad} bad, {counts.unknown} unknown")
     silent = [name for name, n in zip(PLACEMENTS, summary.samples, strict=True) if not n]
     if total and silent:
-        say(f"warning: nothing came from {', '.join(silent)}; poses need all six sensors")
+        say(f"warning: nothing arrived from {', '.join(silent)}; poses need all six sensors")

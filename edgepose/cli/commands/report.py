@@ -1,4 +1,4 @@
-"""`edgepose report`: one page about the poses of a file."""
+"""`edgepose report`: make a page about the poses of a file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from edgepose.cli.terminal.messages import show
 from edgepose.utils.output_targets import check_output
 
 
-@click.command(short_help="Make a page with angles, steps and sensors of poses.")
+@click.command(short_help="Make a page with the angles, steps and sensors of poses.")
 @click.argument("poses", type=click.Path(path_type=Path))
 @click.option(
     "--out",
@@ -24,14 +24,14 @@ from edgepose.utils.output_targets import check_output
     type=float,
     default=1.75,
     show_default=True,
-    help="The wearer's stature, for the figures and for telling steps, metres.",
+    help="The wearer's height, metres, for the figures and for finding steps.",
 )
 @overwrite_option
 def report(poses: Path, out: Path | None, height: float, overwrite: bool) -> None:
     """Make one HTML page about the poses of a file (CSV, BVH, or NPZ with the keys of AMASS): figures, steps
     and cadence, joint angles over time, ranges of motion, and how often each sensor was silent.
 
-    The page has everything in it. It needs `pip install 'edgepose[plot]'`.
+    The page is one self-contained file. The command needs `pip install 'edgepose[plot]'`.
 
     \b
     Examples:
@@ -43,7 +43,7 @@ def report(poses: Path, out: Path | None, height: float, overwrite: bool) -> Non
     from edgepose.skeleton import default_body
 
     if poses.is_dir():
-        raise click.UsageError(f"{poses} is a folder: name a file of poses")
+        raise click.UsageError(f"{poses} is a folder: give a file of poses")
     path = poses.with_suffix(".html") if out is None else out
     if os.path.realpath(path) == os.path.realpath(poses):
         raise click.UsageError(f"--out would overwrite {poses}; name another file")

@@ -1,16 +1,18 @@
-"""`edgepose solve`: the poses of a whole recording at once, without a network."""
+"""`edgepose solve`: find the poses of a whole recording at once, without a network."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from edgepose.cli.options.body import BodyFlags, body_options
+from edgepose.cli.options.gathered import gathered
 from edgepose.cli.options.outputs import check_files, overwrite_option
 from edgepose.cli.terminal.messages import end_status, has_terminal, say, status
 from edgepose.errors import EdgeposeError
@@ -22,8 +24,10 @@ if TYPE_CHECKING:
     from edgepose.sip.energy import Weights
     from edgepose.sip.measurements import Measurements
     from edgepose.sip.solve import Method, OnProgress, Solution
+    from edgepose.skeleton import Body
 
 PLAIN_EVERY_S = 10.0
+"""Time between two lines of progress where there is no terminal, seconds."""
 
 
 def _weights(ctx: click.Context, param: click.Parameter, value: str) -> Weights:
@@ -33,25 +37,161 @@ def _weights(ctx: click.Context, param: click.Parameter, value: str) -> Weights:
     for part in value.split(",") if value else ():
         name, _, number = part.strip().partition("=")
         try:
-            size = float(number)
+            weight = float(number)
         except ValueError:
-            size = -1.0
-        if name not in Weights._fields or not 0.0 <= size < 1e6:
+            weight = -1.0
+        if name not in Weights._fields or not 0.0 <= weight < 1e6:
             raise click.BadParameter(
-                f"{part!r} is not NAME=NUMBER with one of {', '.join(Weights._fields)} and a number from 0"
+                f"{part!r} is not NAME=NUMBER with one of {', '.join(Weights._fields)} and a number from 0 on"
             )
-        weights = weights._replace(**{name: size})
+        weights = weights._replace(**{name: weight})
     return weights
 
 
-@click.command(short_help="Find the poses of a whole recording at once, without a network.")
+@dataclass(frozen=True, kw_only=True)
+class SolverFlags:
+    """How poses are found; the fields are flags of `edgepose solve`."""
+
+    method: Method
+    weights: Weights
+    prior: Path | None
+    hold_from: float | None
+    rate: float
+    evaluations: int
+    jobs: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolveOutputs:
+    """Files to write; the fields are flags of `edgepose solve`."""
+
+    csv: str | None
+    rotations: str
+    npz: str | None
+    bvh: str | None
+    plot: str | None
+    overwrite: bool
+
+    def check(self, inputs: Mapping[str, Path | None]) -> None:
+        """Make sure that there is an output for the poses, and that no file is lost.
+
+        Args:
+            inputs: files to read, by flag.
+
+        Raises:
+            click.UsageError: no output for poses is given, or an output is also an input or another output.
+            EdgeposeError: an output exists, cannot be written, or has the wrong ending.
+        """
+        if not (self.csv or self.npz or self.bvh):
+            raise click.UsageError("give at least one output: --csv FILE, --npz FILE or --bvh FILE")
+        growing = None if self.npz is None or is_stream(self.npz) else part_path(self.npz)
+        files = {"--csv": self.csv, "--npz": self.npz, "--bvh": self.bvh, "--plot": self.plot}
+        check_files({**files, "--npz (while it grows)": growing}, inputs)
+        for name, ending in ((self.csv, ".csv"), (self.npz, ".npz"), (self.bvh, ".bvh")):
+            if name is not None:
+                check_output(name, "poses", (ending,), self.overwrite)
+        if self.plot is not None:
+            from edgepose.analysis.figures import check_picture
+
+            check_picture(Path(self.plot), "--plot", self.overwrite)
+
+    def open(self, stack: ExitStack, body: Body, rate: float, stopped: Callable[[], bool]) -> list[Sink]:
+        """Open the outputs for poses; the stack closes them."""
+        from edgepose.sinks.base import SinkContext, sink_factory
+
+        context = SinkContext(
+            body=body,
+            rate=rate,
+            rotations=self.rotations,
+            translation=True,
+            overwrite=self.overwrite,
+            stopped=stopped,
+        )
+        targets = {"npz": self.npz, "bvh": self.bvh, "csv": self.csv}
+        sinks = [
+            stack.enter_context(sink_factory(name)(target, context))
+            for name, target in targets.items()
+            if target is not None
+        ]
+        for sink in sinks:
+            sink.start()
+        return sinks
+
+
+def _solver_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the solver's flags except --method; the command gets them as `solver: SolverFlags`."""
+    flags = [
+        click.option(
+            "--weights",
+            callback=_weights,
+            default="",
+            metavar="NAME=NUMBER[,...]",
+            help="Weights of the energy's terms.  "
+            "[default: ori=1, acc=0.05, anthro=1, mahal=0.003, limits=0.1]",
+        ),
+        click.option(
+            "--prior",
+            type=click.Path(path_type=Path),
+            help="Prior over poses, a file written by `edgepose learn-prior`.  [default: the shipped one]",
+        ),
+        click.option(
+            "--hold-from",
+            type=float,
+            help="Start of a hold of the calibration's pose on the clock of IN, seconds; required with "
+            "sensors other than the six.  [default: as calibrated, if from this file]",
+        ),
+        click.option(
+            "--rate",
+            type=click.FloatRange(10, 240),
+            default=60.0,
+            show_default=True,
+            help="Poses per second.",
+        ),
+        click.option(
+            "--evaluations",
+            type=click.IntRange(2, 1000),
+            default=30,
+            show_default=True,
+            help="Maximum number of cost evaluations of sip per chunk of 15 s.",
+        ),
+        click.option(
+            "--jobs",
+            type=click.IntRange(1),
+            default=1,
+            show_default=True,
+            help="Number of processes, each of which solves one chunk at a time.",
+        ),
+    ]
+    return gathered(command, flags, "solver", SolverFlags)
+
+
+def _output_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the output flags; the command gets them as `outputs: SolveOutputs`."""
+    flags = [
+        click.option("--csv", metavar="FILE", help="Write poses as CSV; - is standard output."),
+        click.option(
+            "--rotations",
+            type=click.Choice(["axis-angle", "quat", "matrix", "euler"]),
+            default="axis-angle",
+            show_default=True,
+            help="Representation of rotations in the CSV.",
+        ),
+        click.option("--npz", metavar="FILE", help="Write poses as NPZ with the keys of AMASS."),
+        click.option("--bvh", metavar="FILE", help="Write poses as BVH."),
+        click.option("--plot", metavar="FILE", help="Write a picture of costs and residuals over time."),
+        overwrite_option,
+    ]
+    return gathered(command, flags, "outputs", SolveOutputs)
+
+
+@click.command(short_help="Find the poses of a whole recording, without a network.")
 @click.argument("recording", metavar="IN", type=click.Path(path_type=Path))
 @click.option(
     "--calibration",
     "calibration_path",
     required=True,
     type=click.Path(path_type=Path),
-    help="Calibration that `edgepose calibrate` wrote.",
+    help="Calibration file written by `edgepose calibrate`.",
 )
 @click.option(
     "--method",
@@ -61,161 +201,93 @@ def _weights(ctx: click.Context, param: click.Parameter, value: str) -> Weights:
     help="sip: all frames at once, by orientation and acceleration. sop: each frame by orientation alone.",
 )
 @body_options
-@click.option(
-    "--weights",
-    callback=_weights,
-    default="",
-    metavar="NAME=NUMBER[,...]",
-    help="Weights of the energy's terms.  [default: ori=1,acc=0.05,anthro=1,mahal=0.003,limits=0.1]",
-)
-@click.option(
-    "--prior",
-    "prior_path",
-    type=click.Path(path_type=Path),
-    help="What poses people take, a file of `edgepose learn-prior`.  [default: the shipped one]",
-)
-@click.option(
-    "--hold-from",
-    type=float,
-    help="When the wearer holds the calibration's pose in IN, on its clock, seconds; needed for sensors "
-    "other than the six.  [default: as calibrated, if from this file]",
-)
-@click.option(
-    "--rate", type=click.FloatRange(10, 240), default=60.0, show_default=True, help="Poses a second."
-)
-@click.option(
-    "--evaluations",
-    type=click.IntRange(2, 1000),
-    default=30,
-    show_default=True,
-    help="Cost evaluations of sip at most, for each chunk of 15 s.",
-)
-@click.option(
-    "--jobs",
-    type=click.IntRange(1),
-    default=1,
-    show_default=True,
-    help="Chunks solved at a time, each by a process of its own.",
-)
-@click.option("--csv", metavar="FILE", help="Write poses as CSV; - is standard output.")
-@click.option(
-    "--rotations",
-    type=click.Choice(["axis-angle", "quat", "matrix", "euler"]),
-    default="axis-angle",
-    show_default=True,
-    help="Representation of rotations in the CSV.",
-)
-@click.option("--npz", metavar="FILE", help="Write poses as NPZ with AMASS's keys.")
-@click.option("--bvh", metavar="FILE", help="Write poses as BVH.")
-@click.option("--plot", metavar="FILE", help="Draw costs and residuals over time, a picture.")
-@overwrite_option
+@_solver_options
+@_output_options
 def solve(
-    recording: Path,
-    calibration_path: Path,
-    method: Method,
-    body: BodyFlags,
-    weights: Weights,
-    prior_path: Path | None,
-    hold_from: float | None,
-    rate: float,
-    evaluations: int,
-    jobs: int,
-    csv: str | None,
-    rotations: str,
-    npz: str | None,
-    bvh: str | None,
-    plot: str | None,
-    overwrite: bool,
+    recording: Path, calibration_path: Path, body: BodyFlags, solver: SolverFlags, outputs: SolveOutputs
 ) -> None:
     """Find the poses of a whole recording at once: Sparse Inertial Poser.
 
-    No network and no training: poses that explain what the sensors measured and that people take. Any 3 to 17
-    sensors, named by bone. Translation comes along. Ctrl-C keeps the poses that are done.
+    It needs no network and no training. It finds poses that explain the measurements and that people are
+    likely to take, from any 3 to 17 sensors named by segment, and the path of the pelvis. Ctrl-C keeps the
+    poses found so far.
 
     \b
     Examples:
       edgepose solve walk.npz --calibration calib.json --csv poses.csv
-      edgepose solve walk.npz --calibration calib.json --height 1.68 --words long-legged --npz poses.npz
-      edgepose solve walk.npz --calibration calib.json --method sop --jobs 2 --csv - | head
+      edgepose solve walk.npz --calibration calib.json --height 1.68 --npz out.npz
+      edgepose solve walk.npz --calibration calib.json --method sop --csv - | head
     """
-    if not (csv or npz or bvh):
-        raise click.UsageError("give at least one output: --csv FILE, --npz FILE or --bvh FILE")
-    check_files(
-        {
-            **{"--csv": csv, "--npz": npz, "--bvh": bvh, "--plot": plot},
-            "--npz (while it grows)": None if npz is None or is_stream(npz) else part_path(npz),
-        },
-        {"IN": recording, "--calibration": calibration_path},
-    )
-    for name, ending in ((csv, ".csv"), (npz, ".npz"), (bvh, ".bvh")):
-        if name is not None:
-            check_output(name, "poses", (ending,), overwrite)
-    if plot is not None:
-        from edgepose.analysis.figures import check_picture
+    outputs.check({"IN": recording, "--calibration": calibration_path})
 
-        check_picture(Path(plot), "--plot", overwrite)
-
-    from edgepose.calibration import load_calibration
-    from edgepose.sinks.base import SinkContext, sink_factory
-    from edgepose.sip import inputs as reading
-    from edgepose.sip import residuals as report
+    from edgepose.sip import residuals
     from edgepose.sip.bodies import sensor_points
-    from edgepose.sip.measurements import measure
     from edgepose.sip.parameterisation import hinge_rig, smpl_rig
     from edgepose.sip.prior import load_prior
     from edgepose.sip.solve import Settings
     from edgepose.sip.solve import solve as solve_all
     from edgepose.sip.translation import pelvis_path
 
-    wearer, prior = body.build(), load_prior(prior_path)
-    calibration = load_calibration(calibration_path)
-    data = reading.read(recording, calibration)
-    if method == "sip" and all(sensor.acc is None for sensor in data.sensors.values()):
-        raise EdgeposeError(f"{recording}: no sensor has accelerations, which sip needs; use --method sop")
-    measurements = measure(data, reading.mounted(recording, data, calibration, hold_from), rate)
-    rig = hinge_rig(prior) if body.hinges else smpl_rig(prior, measurements.bones)
-    points = sensor_points(wearer, measurements.names)
-    settings = Settings(method, rig, points, weights, evaluations)
+    wearer_body, prior = body.build(), load_prior(solver.prior)
+    measurements, damage = _measure(recording, calibration_path, solver)
+    skeleton = hinge_rig(prior) if body.hinges else smpl_rig(prior, measurements.bones)
+    points = sensor_points(wearer_body, measurements.names)
+    settings = Settings(solver.method, skeleton, points, solver.weights, solver.evaluations)
+    interrupted = False
     with ExitStack() as stack:
-        # Opened before the work: a wrong name is told at once.
-        sinks: list[Sink] = []
-
-        interrupted = False
-        context = SinkContext(
-            body=wearer, rate=rate, rotations=rotations, translation=True, overwrite=overwrite,
-            stopped=lambda: interrupted,
-        )  # fmt: skip
-        for name, target in {"npz": npz, "bvh": bvh, "csv": csv}.items():
-            if target is not None:
-                sinks.append(stack.enter_context(sink_factory(name)(target, context)))
-        for sink in sinks:
-            sink.start()
-        solutions, interrupted = _collect(solve_all(measurements, settings, jobs, _progress()))
+        # Opened before the work, so that a wrong name is reported at once.
+        sinks = outputs.open(stack, wearer_body, solver.rate, lambda: interrupted)
+        solutions, interrupted = _collect(solve_all(measurements, settings, solver.jobs, _progress()))
         if not solutions:
             raise KeyboardInterrupt
-        solution = report.concatenate(solutions)
-        _write(sinks, solution, measurements, pelvis_path(solution, points.offsets, rate))
+        solution = residuals.concatenate(solutions)
+        _write(sinks, solution, measurements, pelvis_path(solution, points.offsets, solver.rate))
         for sink in sinks:
             sink.close()
-    say(report.table(solution, measurements))
-    for line in report.misfits(solution, measurements):
-        say(f"warning: {line}")
-    if plot is not None:
-        report.plot(plot, solution, measurements, overwrite)
-    done, frames = len(solution.rotations), len(measurements.time_s)
-    say(f"{done} of {frames} poses, {solution.evaluations} cost evaluations")
+    _report(solution, measurements, outputs)
     if interrupted:
         raise KeyboardInterrupt
-    if data.damage:
-        raise EdgeposeError(data.damage)
+    if damage:
+        raise EdgeposeError(damage)
+
+
+def _measure(path: Path, calibration_path: Path, solver: SolverFlags) -> tuple[Measurements, str | None]:
+    """Read a recording, and return its measurements and its damage.
+
+    Raises:
+        EdgeposeError: the recording or the calibration cannot be read, or the method needs other sensors.
+    """
+    from edgepose.calibration import load_calibration
+    from edgepose.sip.inputs import mounted, read
+    from edgepose.sip.measurements import measure
+
+    calibration = load_calibration(calibration_path)
+    data = read(path, calibration)
+    if solver.method == "sip" and all(sensor.acc is None for sensor in data.sensors.values()):
+        raise EdgeposeError(f"{path}: no sensor has accelerations, which sip needs; use --method sop")
+    mounts = mounted(path, data, calibration, solver.hold_from)
+    return measure(data, mounts, solver.rate), data.damage
+
+
+def _report(solution: Solution, measurements: Measurements, outputs: SolveOutputs) -> None:
+    """Say how well the poses explain the measurements, and plot it if requested."""
+    from edgepose.sip import residuals
+
+    say(residuals.table(solution, measurements))
+    for line in residuals.misfits(solution, measurements):
+        say(f"warning: {line}")
+    if outputs.plot is not None:
+        residuals.plot(outputs.plot, solution, measurements, outputs.overwrite)
+    done, frames = len(solution.rotations), len(measurements.time_s)
+    say(f"{done} of {frames} poses, {solution.evaluations} cost evaluations")
 
 
 def _collect(solutions: Iterable[Solution]) -> tuple[list[Solution], bool]:
-    """The solutions, and whether Ctrl-C or SIGTERM ended them early."""
+    """Return the solutions, and whether Ctrl-C or SIGTERM ended them early."""
     done: list[Solution] = []
     try:
         for solution in solutions:
-            done.append(solution)  # one by one: what is done stays
+            done.append(solution)  # one by one, so that an interrupt keeps them
     except KeyboardInterrupt:
         return done, True
     finally:
@@ -229,19 +301,19 @@ def _write(sinks: list[Sink], solution: Solution, measurements: Measurements, pa
     from edgepose.pose import PoseFrame
 
     rotations, std = solution.rotations.astype(np.float32), np.zeros(24, np.float32)
-    for i, (matrices, place) in enumerate(zip(rotations, path, strict=True)):
+    for i, (matrices, position) in enumerate(zip(rotations, path, strict=True)):
         held = frozenset(n for n, h in zip(measurements.names, measurements.held[i], strict=True) if h)
-        pose = PoseFrame(i, float(measurements.time_s[i]), matrices, std, place, held)
+        pose = PoseFrame(i, float(measurements.time_s[i]), matrices, std, position, held)
         for sink in sinks:
             sink.write(pose)
 
 
 def _progress() -> OnProgress:
-    """A line on a terminal with chunk, cost and time left; elsewhere a line now and then."""
+    """Return a callback that shows chunk, cost and time left: in one line on a terminal, else every 10 s."""
     terminal = has_terminal()
     every_s = 0.2 if terminal else PLAIN_EVERY_S
     started = shown = time.monotonic()
-    most = 0  # evaluations of any chunk so far
+    most = 0  # evaluations in the longest chunk so far
 
     def show(chunk: int, count: int, evaluations: int, cost: float) -> None:
         nonlocal shown, most

@@ -1,4 +1,4 @@
-"""`edgepose view`: poses as a figure in the browser."""
+"""`edgepose view`: show poses as a figure in the browser."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ if TYPE_CHECKING:
 @click.command(short_help="Show poses as a figure in the browser.")
 @click.argument("poses", required=False, metavar="[POSES]")
 @click.option(
-    "--udp", metavar="HOST:PORT", help="Show poses that `edgepose run --udp` sends here, as they come."
+    "--udp", metavar="HOST:PORT", help="Show poses that `edgepose run --udp` sends here, as they arrive."
 )
-@click.option(
-    "--reference", metavar="FILE", help="Poses that are drawn transparently over those of the file."
-)
+@click.option("--reference", metavar="FILE", help="File of poses to draw transparently over those of POSES.")
 @click.option(
     "--host",
     default="127.0.0.1",
     show_default=True,
-    help="Address at which browsers find the page; 0.0.0.0 lets other machines see it.",
+    help="Address of the page; 0.0.0.0 makes it visible to other machines.",
 )
 @click.option(
     "--port", type=click.IntRange(1, 65535), default=8080, show_default=True, help="TCP port of the page."
 )
-@click.option("--height", type=float, default=1.75, show_default=True, help="Stature of the figure, metres.")
-@click.option("--with-parent", is_flag=True, hidden=True, help="End with the program that has started this.")
+@click.option("--height", type=float, default=1.75, show_default=True, help="Height of the figure, metres.")
+@click.option(
+    "--with-parent", is_flag=True, hidden=True, help="Exit when the program that started this one exits."
+)
 def view(
     poses: str | None,
     udp: str | None,
@@ -48,10 +48,10 @@ def view(
     with_parent: bool,
 ) -> None:
     """Show poses as a 3-D figure in the browser until Ctrl-C: those of a file (CSV, BVH, or NPZ with the keys
-    of AMASS) with a time line, or those that come over UDP.
+    of AMASS) with a timeline, or those that arrive over UDP.
 
-    The page needs `pip install 'edgepose[view]'`. Beside the figure is what each sensor does: how many new
-    values a second, the longest gap, whether its last values are being repeated.
+    The command needs `pip install 'edgepose[view]'`. Beside the figure the page shows, for each sensor, new
+    values per second, the longest gap, and whether its last values are being repeated.
 
     \b
     Examples:
@@ -61,9 +61,9 @@ def view(
       edgepose view --udp 0.0.0.0:9000 --host 0.0.0.0
     """
     if (poses is None) == (udp is None):
-        raise click.UsageError("give POSES, a file, or --udp HOST:PORT")
+        raise click.UsageError("give a file of POSES, or --udp HOST:PORT")
     if reference is not None and poses is None:
-        raise click.UsageError("--reference needs POSES, a file")
+        raise click.UsageError("--reference needs a file of POSES")
 
     from edgepose.formats.poses.registry import read_poses
     from edgepose.skeleton import default_body
@@ -77,10 +77,10 @@ def view(
             viewer = stack.enter_context(closing(_open(host, port, body)))
             viewer.follow(receiver, lambda: stop.asked or (with_parent and os.getppid() != parent))
         else:
-            shown = read_poses(str(poses))
-            beside = None if reference is None else read_poses(reference)
+            sequence = read_poses(str(poses))
+            reference_sequence = None if reference is None else read_poses(reference)
             viewer = stack.enter_context(closing(_open(host, port, body)))
-            viewer.play(shown, beside, lambda: stop.asked)
+            viewer.play(sequence, reference_sequence, lambda: stop.asked)
 
 
 def _open(host: str, port: int, body: Body) -> Viewer:

@@ -1,4 +1,4 @@
-"""Flags that say whose body it is."""
+"""Flags for the wearer's body."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class BodyFlags(NamedTuple):
-    """The wearer's body: one field a flag; those that are None or empty were not given."""
+    """Values of the body flags; None or empty if a flag was not given."""
 
     body: str
     height: float | None
@@ -26,14 +26,14 @@ class BodyFlags(NamedTuple):
 
     @property
     def hinges(self) -> bool:
-        """Whether the skeleton has hinges as one rigged by hand, instead of SMPL's joints."""
+        """Whether to use a hand-rigged skeleton with hinges instead of SMPL's joints."""
         return self.body == "hinges"
 
     def build(self) -> Body:
-        """The body.
+        """Return the body.
 
         Raises:
-            EdgeposeError: no wearer is like that, or the model file is none.
+            EdgeposeError: no body has these measures, or the file is not an SMPL model.
         """
         from edgepose.sip.bodies import scaled, shaped_body
 
@@ -51,54 +51,54 @@ def _words(ctx: click.Context, param: click.Parameter, value: str) -> tuple[str,
 
 
 def body_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds the flags that say whose body it is; the command gets them as `body: BodyFlags`."""
+    """Add the flags of the wearer's body; the command gets them as `body: BodyFlags`."""
     flags = [
         click.option(
             "--body",
             default="smpl",
             show_default=True,
             metavar="smpl|hinges|FILE",
-            help="smpl: SMPL's joints with the average lengths for --height. hinges: a skeleton as rigged by "
-            "hand (SIP-M). FILE: your own SMPL model (.npz or .pkl); a .pkl's code is not run.",
+            help="smpl: SMPL's joints with average bone lengths for --height. hinges: a hand-rigged skeleton "
+            "(SIP-M). FILE: your own SMPL model (.npz or .pkl); code in a .pkl is not run.",
         ),
         click.option(
             "--height",
             type=click.FloatRange(MIN_HEIGHT, MAX_HEIGHT),
-            help="Height of the wearer, metres.  [default: 1.75]",
+            help="The wearer's height, metres.  [default: 1.75]",
         ),
         click.option(
             "--sex",
             type=click.Choice(["neutral", "male", "female"]),
-            help="Of the wearer.  [default: neutral]",
+            help="The wearer's sex.  [default: neutral]",
         ),
         click.option(
-            "--weight", type=float, help="Weight of the wearer, kg.  [default: the average for --height]"
+            "--weight", type=float, help="The wearer's weight, kg.  [default: the average for --height]"
         ),
         click.option(
             "--words",
             callback=_words,
             default="",
             metavar="WORD[,WORD...]",
-            help="Shape of the wearer: long-, short-legged, -armed, -necked; broad-, narrow-shouldered, "
-            "-hipped; muscular, slender.",
+            help="The wearer's shape: long- or short-legged, -armed, -necked; broad- or narrow-shouldered, "
+            "-hipped; muscular; slender.",
         ),
         click.option(
             "--scale",
             type=click.FloatRange(0.5, 2.0),
             default=1.0,
             show_default=True,
-            help="All lengths of the body times this (1.1: SIP-110).",
+            help="Factor on all lengths of the body (1.1: SIP-110).",
         ),
     ]
 
     @functools.wraps(command)
-    def with_body(**words: Any) -> Any:
-        body = BodyFlags(*(words.pop(name) for name in BodyFlags._fields))
+    def with_body(**values: Any) -> Any:
+        body = BodyFlags(*(values.pop(name) for name in BodyFlags._fields))
         if body.body not in ("smpl", "hinges") and (body.height or body.sex or body.weight or body.words):
             raise click.UsageError(
                 "a body from a file has its own shape: leave out --height, --sex, --weight and --words"
             )
-        return command(body=body, **words)
+        return command(body=body, **values)
 
     for flag in reversed(flags):
         with_body = flag(with_body)

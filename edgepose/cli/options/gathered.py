@@ -1,10 +1,11 @@
-"""Groups of flags that a command gets as one configuration."""
+"""Groups of flags that a command gets as one configuration object."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import click
@@ -14,26 +15,34 @@ from edgepose.errors import ConfigError
 Command = Callable[..., Any]
 
 
+@contextmanager
+def usage_errors() -> Iterator[None]:
+    """Report a ConfigError as wrong use of the command."""
+    try:
+        yield
+    except ConfigError as error:
+        raise click.UsageError(str(error)) from None
+
+
 def gathered(
     command: Command, flags: Sequence[Callable[[Command], Command]], name: str, config: type
 ) -> Command:
-    """A command with more flags, in this order, whose values it gets as one argument.
+    """Add flags to a command, which gets their values as one argument.
 
     Args:
-        command: function under the flags.
-        flags: click options named as the fields of `config`.
-        name: of the argument.
-        config: dataclass of the values; its ConfigError is wrong use of the flags.
+        command: the function to add flags to.
+        flags: click options, in the order of the help text, each named like a field of `config`.
+        name: name of the argument.
+        config: dataclass of the values. Fields without a flag keep their defaults. A ConfigError that it
+            raises is reported as wrong use.
     """
 
     @functools.wraps(command)
-    def with_config(**words: Any) -> Any:
-        own = {each.name: words.pop(each.name) for each in dataclasses.fields(config)}
-        try:
-            value = config(**own)
-        except ConfigError as error:
-            raise click.UsageError(str(error)) from None
-        return command(**{name: value}, **words)
+    def with_config(**values: Any) -> Any:
+        fields = [field.name for field in dataclasses.fields(config) if field.name in values]
+        with usage_errors():
+            gathered_values = config(**{field: values.pop(field) for field in fields})
+        return command(**{name: gathered_values}, **values)
 
     wrapped: Command = with_config
     for flag in reversed(flags):

@@ -1,4 +1,4 @@
-"""Flags of `edgepose run` that say where poses go, and the sinks they ask for."""
+"""Output flags of `edgepose run`, and checks of the files that a command writes."""
 
 from __future__ import annotations
 
@@ -17,23 +17,28 @@ from edgepose.utils.sockets import Destination, parse_destination
 
 
 def check_files(outputs: Mapping[str, str | Path | None], inputs: Mapping[str, Path | None]) -> None:
-    """Raises click.UsageError where a file to write, by flag, is one to read, or two flags name one file."""
+    """Raise click.UsageError if an output is also an input, or if two flags name the same output.
+
+    Args:
+        outputs: files to write, by flag.
+        inputs: files to read, by flag.
+    """
     written: dict[object, str] = {}
     for flag, output in outputs.items():
         if output is None:
             continue
-        for name, given in inputs.items():
-            if given is not None and _is_same_file(Path(output), given):
-                raise click.UsageError(f"{flag} would overwrite {given}, which is {name}; name another file")
+        for name, path in inputs.items():
+            if path is not None and _is_same_file(Path(output), path):
+                raise click.UsageError(f"{flag} would overwrite {path}, which is {name}; name another file")
         other = written.setdefault(identity(output), flag)
         if other != flag and not is_null(output):
-            raise click.UsageError(f"{other} and {flag} name the same file, {output}; name two")
+            raise click.UsageError(f"{other} and {flag} name the same file, {output}; name two files")
 
 
-def _is_same_file(output: Path, given: Path) -> bool:
+def _is_same_file(output: Path, path: Path) -> bool:
     try:
-        return given.samefile(output)
-    except OSError:  # there is no such file yet
+        return path.samefile(output)
+    except OSError:  # at least one of them does not exist
         return False
 
 
@@ -45,7 +50,7 @@ def _destination(ctx: click.Context, param: click.Parameter, value: str | None) 
 
 
 def address(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, int] | None:
-    """Host and port of a flag HOST:PORT, as click's callback."""
+    """Parse the value HOST:PORT of a flag (a click callback)."""
     try:
         return None if value is None else parse_host_and_port(value)
     except EdgeposeError as error:
@@ -57,17 +62,17 @@ def _other_sinks(ctx: click.Context, param: click.Parameter, values: tuple[str, 
     for value in values:
         name, equals, target = value.partition("=")
         if not equals or not name or name in targets:
-            raise click.BadParameter(f"{value!r} is not NAME=TARGET, or its name is given twice")
+            raise click.BadParameter(f"{value!r} is not NAME=TARGET, or repeats a name")
         targets[name] = target
     return targets
 
 
-overwrite_option = click.option("--overwrite", is_flag=True, help="Replace files that are there already.")
+overwrite_option = click.option("--overwrite", is_flag=True, help="Replace existing files.")
 """The flag --overwrite."""
 
 
 def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds the flags that say where poses go; the command gets them as `outputs: OutputConfig`."""
+    """Add the output flags; the command gets them as `outputs: OutputConfig`."""
     flags = [
         click.option("--csv", metavar="FILE", help="Write poses as CSV; - is standard output."),
         click.option(
@@ -85,7 +90,7 @@ def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--npz", metavar="FILE", help="Write poses as NPZ with the keys of AMASS when the run ends."
         ),
-        click.option("--bvh", metavar="FILE", help="Write poses as BVH, for Blender and the like."),
+        click.option("--bvh", metavar="FILE", help="Write poses as BVH, for Blender and similar programs."),
         click.option(
             "--udp",
             callback=_destination,
@@ -96,21 +101,22 @@ def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
             "--osc",
             callback=address,
             metavar="HOST:PORT",
-            help="Send each pose by the VMC protocol, for VRM avatars; they listen at port 39539 as a rule.",
+            help="Send each pose over OSC (the VMC protocol) to programs that show VRM avatars; most of them "
+            "listen on port 39539.",
         ),
         click.option(
             "--tcp",
             callback=address,
             metavar="HOST:PORT",
-            help="Wait here for viewers that read poses as text, as TransPose's does at port 8888.",
+            help="Listen here for viewers that read poses as text, such as TransPose's on port 8888.",
         ),
-        click.option("--view", is_flag=True, help="Show a figure in the browser, see `edgepose view`."),
+        click.option("--view", is_flag=True, help="Show a figure in the browser; see `edgepose view`."),
         click.option(
             "--height",
             type=float,
             default=1.75,
             show_default=True,
-            help="The wearer's stature, for the bones of --bvh, --osc and --view, metres.",
+            help="The wearer's height, metres, for the bones of --bvh, --osc and --view.",
         ),
         overwrite_option,
         click.option(
@@ -119,7 +125,7 @@ def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
             multiple=True,
             callback=_other_sinks,
             metavar="NAME=TARGET",
-            help="Write to an output that an installed package adds; may be repeated.",
+            help="Write to an output that an installed package adds; repeatable.",
         ),
     ]
     return gathered(command, flags, "outputs", OutputConfig)

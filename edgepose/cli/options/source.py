@@ -1,4 +1,4 @@
-"""Flags that several commands share."""
+"""Flags for the source of samples and for orientation filters."""
 
 from __future__ import annotations
 
@@ -32,27 +32,27 @@ protocol_option = click.option(
     default="auto",
     show_default=True,
     help=f"Wire format: {', '.join(protocol_names())}, or a .toml file that describes text lines. auto "
-    "listens and decides.",
+    "detects it from what arrives.",
 )
 """The flag --protocol."""
 
 sensors_option = click.option(
     "--sensors",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="TOML file that says which port, bus and id is worn where; see docs/guide/sensors.md. Names of "
-    "ports and buses in it need no --port and --can.  [default: ids in the usual order]",
+    help="TOML file that says which port, bus and id is worn where; see docs/guide/sensors.md. Ports and "
+    "buses named in it need no --port or --can.  [default: ids in the usual order]",
 )
 """The flag --sensors."""
 
 
 def source_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds the flags that say where samples come from; the command gets them as `source: SourceConfig`."""
+    """Add the flags for the source of samples; the command gets them as `source: SourceConfig`."""
     flags = [
         click.option(
             "--port",
             metavar="PORT[,PORT...]",
-            help="Serial ports that the sensors send to, such as /dev/ttyUSB0 or COM3. Where each sensor has "
-            f"a port to itself: {', '.join(PLACEMENTS)}, in this order.",
+            help="Serial ports that the sensors send to, such as /dev/ttyUSB0 or COM3. With one port per "
+            f"sensor, give them in the order {', '.join(PLACEMENTS)}.",
         ),
         click.option(
             "--baud",
@@ -62,22 +62,22 @@ def source_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--can",
             metavar="INTERFACE:CHANNEL",
-            help="CAN bus that the sensors send to, as python-can names it: socketcan:can0, "
+            help="CAN bus that the sensors send to, in python-can's notation: socketcan:can0, "
             "slcan:/dev/ttyACM0, pcan:PCAN_USBBUS1.",
         ),
         click.option(
             "--bitrate",
             type=BITS_PER_SECOND,
-            help="Bits per second of the CAN bus; SocketCAN has its own.  [default: the protocol's usual "
-            "speed, or 500000]",
+            help="Bits per second of the CAN bus; with SocketCAN the system sets them.  [default: the "
+            "protocol's usual speed, or 500000]",
         ),
-        click.option("--fd", is_flag=True, help="Take CAN FD frames too."),
+        click.option("--fd", is_flag=True, help="Accept CAN FD frames, too."),
         click.option(
             "--file",
             type=click.Path(path_type=Path),
-            help="Read instead: a recording (.csv, .npz, .mvnx, .pkl of DIP-IMU, .sensors of TotalCapture, a "
-            "folder of MT Manager or x-io), a raw serial capture (.bin, .raw) or a log of a CAN bus (.asc, "
-            ".blf, .log, .mf4, .trc, .csv of python-can).",
+            help="Read a file instead: a recording (.csv, .npz, .mvnx, .pkl of DIP-IMU, .sensors of "
+            "TotalCapture, a folder of MT Manager or x-io), a raw serial capture (.bin, .raw) or a log of a "
+            "CAN bus (.asc, .blf, .log, .mf4, .trc, .csv of python-can).",
         ),
         click.option(
             "--realtime", is_flag=True, help="Replay --file at its own pace instead of as fast as possible."
@@ -89,14 +89,14 @@ def source_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def filter_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds --filter and --no-mag; the command gets them as `filter: str` and `no_mag: bool`."""
-    chosen = click.option(
+    """Add --filter and --no-mag; the command gets them as `filter: str` and `no_mag: bool`."""
+    filter_option = click.option(
         "--filter",
         type=click.Choice(FILTERS),
         default="none",
         show_default=True,
-        help="Make orientations here of gyroscope, accelerometer and, where there is one, magnetometer; "
-        "none: the sensors send them.",
+        help="Compute orientations from gyroscope, accelerometer and, where available, magnetometer. none: "
+        "the sensors send orientations.",
     )
-    no_mag = click.option("--no-mag", is_flag=True, help="Leave magnetometers out of --filter.")
-    return chosen(no_mag(command))
+    no_mag_option = click.option("--no-mag", is_flag=True, help="Do not use magnetometers in --filter.")
+    return filter_option(no_mag_option(command))

@@ -1,4 +1,4 @@
-"""Flags of one wearer of `edgepose run`, or TOML files (`--rig`) with the same names for several."""
+"""Flags of one wearer of `edgepose run`, or TOML files (`--rig`) with the same names for several wearers."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ import click
 from click.core import ParameterSource
 
 from edgepose.cli.conflicts import check_lines
+from edgepose.cli.options.gathered import usage_errors
 from edgepose.cli.options.outputs import address, output_options
 from edgepose.cli.options.source import filter_options, source_options
 from edgepose.config import WearerConfig
 from edgepose.errors import ConfigError
 
 
-def _needed(ctx: click.Context, param: click.Parameter, value: Path | None) -> Path | None:
-    if value is None and not ctx.params.get("rigs"):
+def _required_without_rig(ctx: click.Context, param: click.Parameter, value: Path | None) -> Path | None:
+    if value is None and not ctx.params.get("rig_files"):
         raise click.MissingParameter(ctx=ctx, param=param)
     return value
 
@@ -29,71 +30,69 @@ def _needed(ctx: click.Context, param: click.Parameter, value: Path | None) -> P
 @filter_options
 @click.option(
     "--calibration",
-    callback=_needed,
+    callback=_required_without_rig,
     type=click.Path(path_type=Path),
-    help="Calibration that `edgepose calibrate` wrote.  [required]",
+    help="Calibration file written by `edgepose calibrate`.  [required]",
 )
 @output_options
 @click.option(
     "--control",
     callback=address,
     metavar="HOST:PORT",
-    help="Listen here for datagrams `rezero` and OSC messages /edgepose/rezero; live only.",
+    help="Listen here for the datagram `rezero` or the OSC message /edgepose/rezero; live sources only.",
 )
-def _flags(**words: Any) -> WearerConfig:
-    try:
-        return WearerConfig(**words)
-    except ConfigError as error:
-        raise click.UsageError(str(error)) from None
+def _flags(**values: Any) -> WearerConfig:
+    with usage_errors():
+        return WearerConfig(**values)
 
 
 _KEYS = {param.opts[0].removeprefix("--"): param for param in _flags.params}
 
 
-def rig_options(command: click.Command) -> click.Command:
-    """Adds a wearer's flags and --rig; the command gets them as `rigs: list[WearerConfig]`."""
-    several = click.Option(
-        ["--rig", "rigs"],
+def wearer_options(command: click.Command) -> click.Command:
+    """Add a wearer's flags and --rig; the command gets them as `wearers: list[WearerConfig]`."""
+    rig_option = click.Option(
+        ["--rig", "rig_files"],
         multiple=True,
         is_eager=True,
         metavar="FILE",
         type=click.Path(path_type=Path),
-        help="TOML file with the flags of one wearer, as names; several times for several wearers, who share "
-        "the network. See docs/guide/sensors.md.",
+        help="TOML file whose keys are the flags of one wearer; repeat it for several wearers, who share the "
+        "network. See docs/guide/sensors.md.",
     )
     run = command.callback
     assert run is not None
 
     @functools.wraps(run)
-    def with_rigs(rigs: tuple[Path, ...], **words: Any) -> Any:
-        own = {str(param.name): words.pop(str(param.name)) for param in _flags.params}
-        if not rigs:
+    def with_wearers(rig_files: tuple[Path, ...], **values: Any) -> Any:
+        wearer_values = {str(param.name): values.pop(str(param.name)) for param in _flags.params}
+        if not rig_files:
             assert _flags.callback is not None
-            return run(rigs=[_flags.callback(**own)], **words)
+            return run(wearers=[_flags.callback(**wearer_values)], **values)
         ctx = click.get_current_context()
         for name, param in _KEYS.items():
             if ctx.get_parameter_source(str(param.name)) is ParameterSource.COMMANDLINE:
                 raise click.UsageError(f"--{name} belongs to a wearer: with --rig, put {name} into the file")
-        return run(rigs=read_rigs(rigs), **words)
+        return run(wearers=read_rigs(rig_files), **values)
 
-    command.callback = with_rigs
-    command.params = [*_flags.params, several, *command.params]
+    command.callback = with_wearers
+    command.params = [*_flags.params, rig_option, *command.params]
     return command
 
 
 def read_rigs(paths: Sequence[Path]) -> list[WearerConfig]:
-    """The wearers of some TOML files.
+    """Read the wearers from rig files.
 
     Raises:
-        ConfigError: a file cannot be read, a key or value in it is not valid, or two wearers have one name or
-            line.
+        ConfigError: a file cannot be read, a key or value in it is not valid, or two wearers have the same
+            name or line.
     """
-    rigs = [WearerConfig.from_toml(path) for path in paths]
-    twice = [name for name, count in Counter(rig.name for rig in rigs).items() if count > 1]
-    if twice:
+    wearers = [WearerConfig.from_toml(path) for path in paths]
+    repeated = [name for name, count in Counter(wearer.name for wearer in wearers).items() if count > 1]
+    if repeated:
         raise ConfigError(
-            f"{', '.join(map(str, paths))}: two of them have the name {twice[0]}; give each its own"
+            f"{', '.join(map(str, paths))}: two wearers have the name {repeated[0]}; give each its own"
         )
-    if len(rigs) > 1:
-        check_lines(rigs)
-    return rigs
+    if len(wearers) > 1:
+        check_lines(wearers)
+    return wearers

@@ -1,4 +1,4 @@
-"""Keys pressed on the terminal, read without waiting; the terminal is as before afterwards."""
+"""Keys pressed on the terminal, read without blocking."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ except ImportError:  # Windows
 
 
 class Keys:
-    """Single keys from standard input while it is entered; none where that is no terminal."""
+    """Reads single keys from standard input while it is entered; none if that is not a terminal."""
 
     def __init__(self) -> None:
-        """The terminal is as it was until this is entered."""
+        """Create the reader; `__enter__` changes the terminal's mode."""
         self._before: list[Any] | None = None
 
     def __enter__(self) -> Keys:
-        """Keys come at once and unseen from now on; Ctrl-C stays what it is."""
+        """Deliver keys at once and without echo; Ctrl-C still interrupts."""
         if _usable():
             before = termios.tcgetattr(0)
             now = termios.tcgetattr(0)
@@ -34,7 +34,7 @@ class Keys:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """The terminal is as before."""
+        """Restore the terminal's mode."""
         if self._before is not None and _in_foreground():
             termios.tcsetattr(0, termios.TCSADRAIN, self._before)
 
@@ -44,13 +44,13 @@ class Keys:
         return self._before is not None
 
     def pressed(self) -> str:
-        """The keys pressed since the last call."""
-        # A program in the background that reads from the terminal is stopped by it.
+        """Return the keys pressed since the last call."""
+        # The terminal stops a background program that reads from it.
         if self._before is None or not _in_foreground() or not select.select([0], [], [], 0.0)[0]:
             return ""
         try:
             return os.read(0, 256).decode(errors="ignore")
-        except OSError:  # the terminal has gone
+        except OSError:  # the terminal is gone
             return ""
 
 
@@ -61,5 +61,5 @@ def _usable() -> bool:
 def _in_foreground() -> bool:
     try:
         return os.tcgetpgrp(0) == os.getpgrp()
-    except OSError:  # the terminal has gone
+    except OSError:  # the terminal is gone
         return False

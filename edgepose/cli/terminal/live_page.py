@@ -1,4 +1,4 @@
-"""A page on a terminal that is drawn again and again in place, and goes away when it ends."""
+"""A page that is redrawn in place on a terminal and disappears when it is closed."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ import sys
 from collections.abc import Sequence
 from types import TracebackType
 
-_ENTER, _LEAVE = "\033[?1049h\033[?25l", "\033[?25h\033[?1049l"  # another screen, and no cursor
+_ENTER, _LEAVE = "\033[?1049h\033[?25l", "\033[?25h\033[?1049l"  # alternate screen, hidden cursor
 _HOME, _LINE_END, _REST = "\033[H", "\033[K\r\n", "\033[J"
 
 
 class Page:
-    """The second screen of the terminal on standard output, so that what was there before comes back."""
+    """The alternate screen of the terminal on standard output."""
 
     def __enter__(self) -> Page:
-        """Show the page, empty."""
+        """Show an empty page."""
         self._write(_ENTER)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Show again what was there before."""
+        """Show the previous contents of the terminal again."""
         self._write(_LEAVE)
 
     def draw(self, lines: Sequence[str]) -> None:
-        """Replace what is shown; lines that do not fit on the screen are left out."""
+        """Replace the contents of the page; lines below the bottom of the screen are left out."""
         height = shutil.get_terminal_size().lines
         self._write(_HOME + "".join(line + _LINE_END for line in lines[: height - 1]) + _REST)
 
@@ -37,10 +37,10 @@ class Page:
 
 
 def is_terminal() -> bool:
-    """Whether standard output is a screen that can be drawn on."""
+    """Return whether standard output is a terminal with cursor control."""
     return sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
 
 
 def is_coloured() -> bool:
-    """Whether standard output shows colours and nobody minds (https://no-color.org)."""
+    """Return whether to use colours on standard output (see https://no-color.org)."""
     return is_terminal() and not os.environ.get("NO_COLOR")

@@ -1,7 +1,7 @@
-"""What is written for a person: messages on standard error, results on standard output.
+"""Text for the user: messages on standard error, results on standard output.
 
-Text of files and devices is in both, so all of it goes through here: nothing in it moves the cursor or sets
-the clipboard. A message that nobody can read any more does not end a run.
+Both contain text from files and devices, so all of it is cleaned here: no escape sequence in it can move the
+cursor or set the clipboard. A message that no one reads any more does not end a run.
 """
 
 from __future__ import annotations
@@ -16,31 +16,31 @@ from typing import IO, Any
 import click
 
 _WAIT_MS = 1000
-"""Time that the reader of messages has to take one."""
+"""Longest wait for a slow reader of standard error, milliseconds."""
 
-_status = False  # a line that shows how far a command is stands on the terminal, and the cursor at its end
+_status = False  # whether the cursor stands at the end of a status line
 
 
 def printable(text: str) -> str:
-    """Text of anyone as a terminal may get it: what is not seen becomes "?", but for line breaks and tabs."""
+    """Return text with "?" for all unprintable characters except line breaks and tabs."""
     return "".join(c if c.isprintable() or c in "\n\t" else "?" for c in text)
 
 
 def say(text: str) -> None:
-    """A line for the user, on standard error; it takes the place of a status line."""
+    """Write a message to standard error, over the status line if there is one."""
     global _status
     click.echo(("\r\033[K" if _status else "") + printable(text), err=True)
     _status = False
 
 
 def show(text: str) -> None:
-    """A line of what the command is for, on standard output."""
+    """Write a line of the command's result to standard output."""
     end_status()
     click.echo(printable(text))
 
 
 def status(text: str) -> None:
-    """How far a command is: on a terminal in the place of what it said last, elsewhere as a line."""
+    """Show the progress of a command: on a terminal in one status line, elsewhere as a new line."""
     global _status
     if not has_terminal():
         click.echo(printable(text), err=True)
@@ -51,7 +51,7 @@ def status(text: str) -> None:
 
 
 def end_status() -> None:
-    """Leave the status line, if there is one, as it is, and go on below it."""
+    """Keep the status line, if there is one, and continue below it."""
     global _status
     if _status:
         click.echo(err=True)
@@ -59,13 +59,13 @@ def end_status() -> None:
 
 
 def clear_bar() -> None:
-    """The next message takes the place of click's progress bar, which is drawn again below it."""
+    """Make the next message overwrite click's progress bar, which is then drawn again below it."""
     global _status
     _status = has_terminal()
 
 
 def has_terminal() -> bool:
-    """Whether messages are read on a terminal."""
+    """Return whether messages go to a terminal."""
     return sys.stderr.isatty()
 
 
@@ -75,30 +75,33 @@ class _Handler(logging.Handler):
 
 
 def prepare() -> None:
-    """Once at the start: streams that are closed or go away do no harm from now on; warnings are messages."""
-    _keep_numbers()
+    """Set up the standard streams at the start of the program.
+
+    Streams may be closed at the start or break later, and log records become messages.
+    """
+    _reserve_standard_descriptors()
     if sys.stdout is None:
-        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115 - for the whole program
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115 - open until exit
     if sys.stderr is None:
         sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115
     reconfigure = getattr(sys.stdout, "reconfigure", None)
     if reconfigure is not None:
-        reconfigure(errors="backslashreplace")  # names of files may be no text
+        reconfigure(errors="backslashreplace")  # file names may be undecodable
     sys.stderr = _Messages(sys.stderr)
     logging.basicConfig(handlers=[_Handler()])
 
 
-def _keep_numbers() -> None:
-    """Have something at the numbers of the standard streams: a file that got one would be written into."""
+def _reserve_standard_descriptors() -> None:
+    """Open closed standard descriptors, or the next file opened would get one and receive their output."""
     for number in range(3):
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free descriptor
 
 
 class _Messages:
-    """Standard error that loses what nobody reads: once its reader has gone, it leads nowhere."""
+    """Standard error that drops messages which no one reads, and all of them once its reader is gone."""
 
     def __init__(self, stream: IO[str]) -> None:
         self._stream = stream
@@ -107,14 +110,14 @@ class _Messages:
 
     def write(self, text: str) -> int:
         if self._poll is not None:
-            # A reader that does not read is waited for once, not at each message.
+            # Wait only for the first message that the reader does not take, not for every one.
             self._stuck = not self._poll.poll(0 if self._stuck else _WAIT_MS)
             if self._stuck:
                 return len(text)
         try:
             return self._stream.write(text)
         except OSError:
-            self._lead_nowhere()
+            self._discard()
             return len(text)
 
     def flush(self) -> None:
@@ -123,9 +126,9 @@ class _Messages:
         try:
             self._stream.flush()
         except OSError:
-            self._lead_nowhere()
+            self._discard()
 
-    def _lead_nowhere(self) -> None:
+    def _discard(self) -> None:
         number = os.open(os.devnull, os.O_WRONLY)
         os.dup2(number, self._stream.fileno())
         os.close(number)
@@ -136,11 +139,11 @@ class _Messages:
 
 
 def _pipe_poll(stream: IO[str]) -> select.poll | None:
-    """What tells whether a pipe can take a message; None for what is no pipe."""
+    """Return a poll object that reports whether a pipe accepts writes; None if the stream is not a pipe."""
     try:
         number = stream.fileno()
         mode = os.fstat(number).st_mode
-    except (OSError, ValueError):  # no file of the operating system
+    except (OSError, ValueError):  # the stream has no file descriptor
         return None
     if not (stat.S_ISFIFO(mode) or stat.S_ISSOCK(mode)):
         return None

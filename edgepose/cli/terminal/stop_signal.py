@@ -1,4 +1,4 @@
-"""Signals that end a run as a question that a loop asks, so that nothing is lost in the middle of a step."""
+"""Stop signals as a flag that a loop polls, so that no step is interrupted halfway."""
 
 from __future__ import annotations
 
@@ -7,33 +7,37 @@ from types import FrameType, TracebackType
 from typing import Any
 
 
-def endings() -> list[int]:
-    """Signals that ask a program to end, unless they are ignored, as SIGHUP is under nohup."""
+def stop_signals() -> list[int]:
+    """Return the signals that ask a program to end, without ignored ones such as SIGHUP under nohup."""
     numbers = [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", None)]
     return [number for number in numbers if number is not None and signal.getsignal(number) != signal.SIG_IGN]
 
 
 class StopSignal:
-    """Whether one of these signals has come. A second one interrupts at once, as outside of this."""
+    """Remembers the first stop signal while it is entered; a second one interrupts at once.
+
+    Attributes:
+        asked: whether a stop signal has arrived.
+    """
 
     def __init__(self) -> None:
-        """Signals are as before until it is entered."""
+        """Create the flag; `__enter__` installs the signal handlers."""
         self.asked = False
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> StopSignal:
-        """Note signals from now on."""
-        for number in endings():
-            self._before[number] = signal.signal(number, self._note)
+        """Install the signal handlers."""
+        for number in stop_signals():
+            self._before[number] = signal.signal(number, self._on_signal)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Signals are as before."""
+        """Restore the previous signal handlers."""
         self._restore()
 
-    def _note(self, number: int, frame: FrameType | None) -> None:
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self.asked = True
         self._restore()
 

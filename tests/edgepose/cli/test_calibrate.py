@@ -86,7 +86,7 @@ def test_a_real_recording(tmp_path: Path) -> None:
     out = tmp_path / "calib.json"
     result = run("--file", REAL, "--out", out, "--hold", 2.5, "--body-frame", "heading:0")
     assert result.exit_code == 0, result
-    assert "hold from 40.00 to 42.50 s, the first as still as the stillest." in result.output
+    assert "hold from 40.00 to 42.50 s, the first of the stillest parts." in result.output
     assert f"Wrote {out}." in result.output
     assert result.stderr == ""
     for name in PLACEMENTS:
@@ -164,8 +164,8 @@ def test_warnings_go_to_stderr_and_into_the_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--from", 42], "it has no 4 s from 42 s; it lasts from 40.00 to 42.9"),
-        (["--from", 10, "--hold", 1], "it has no 1 s from 10 s"),
+        (["--from", 42], "it does not contain 4 s from 42 s on; it lasts from 40.00 to 42.9"),
+        (["--from", 10, "--hold", 1], "it does not contain 1 s from 10 s"),
         (["--hold", 60], "no 60 s in which all six sensors reported: they overlap for 3.0 s"),
         (
             ["--heading-reset", REAL, "--hold", 2],
@@ -191,10 +191,10 @@ def test_recordings_that_do_not_do(arguments: list[object], message: str) -> Non
         (["--file", REAL, "--heading-reset", "live"], "--heading-reset live needs --port"),
         (["--port", "x", "--from", 3], "--from needs a recording"),
         (["--port", "x", "--heading-reset", "motion", "--motion", "1:2"], "--motion needs a recording"),
-        (["--file", REAL, "--motion", "1:2"], "--motion goes with --heading-reset motion"),
+        (["--file", REAL, "--motion", "1:2"], "--motion needs --heading-reset motion"),
         (["--file", REAL, "--heading-reset", "motion", "--motion", "2:1"], "'2:1' is not FROM:TO"),
         (["--file", REAL, "--heading-reset", "motion", "--motion", "nan:1"], "'nan:1' is not FROM:TO"),
-        (["--file", REAL, "--heading-reset", "motion", "--pose", "t-pose"], "begins with hanging arms"),
+        (["--file", REAL, "--heading-reset", "motion", "--pose", "t-pose"], "starts with hanging arms"),
         (["--file", REAL, "--heading-reset", "mounting:up"], "an axis is x, y or z"),
         (["--file", REAL, "--filter", "madgwick"], "'madgwick' is not one of 'none', 'kalman', 'vqf'"),
         (["--file", REAL, "--hold", -1], "-1"),
@@ -219,7 +219,7 @@ def test_errors_are_one_line_and_torch_is_not_imported(tmp_path: Path) -> None:
     )
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
-    assert "it has no 4 s from 99 s" in done.stderr
+    assert "it does not contain 4 s from 99 s" in done.stderr
     assert list(tmp_path.iterdir()) == []
 
 
@@ -302,7 +302,7 @@ def test_after_three_repeats_it_gives_up(wearer: Wearer, tmp_path: Path) -> None
     wearer.quats_at = quats
     result = run("--port", wearer.port, "--hold", 0.4, "--countdown", 0, "--out", tmp_path / "calib.json")
     assert error_of(result).startswith("moved during the hold: left_forearm ")
-    assert result.output.count("Once more.") == 3
+    assert result.output.count("Trying again.") == 3
     assert result.output.count("Hold still for") == 4
     assert not (tmp_path / "calib.json").exists()
 
@@ -360,7 +360,7 @@ def test_a_wearer_who_does_not_do_the_exercises(
     words = ("--port", wearer.port, "--hold", 1, "--countdown", 0, "--out", tmp_path / "calib.json")
     result = run(*words, "--heading-reset", "motion")
     assert error_of(result).startswith("no heading from this motion: left_forearm leaned by only 0 deg, ")
-    assert result.output.count("Once more.") == 3
+    assert result.output.count("Trying again.") == 3
 
 
 def test_headings_from_the_mounting_in_a_map(tmp_path: Path) -> None:

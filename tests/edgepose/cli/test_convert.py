@@ -276,7 +276,7 @@ def test_fifty_files_one_of_them_broken_by_two_processes(command, tmp_path):
     result = command("convert", folder, "--to", "npz", "--out", out, "--jobs", 2)
     assert result.returncode == 1
     assert result.stderr.splitlines()[-1] == (
-        "edgepose: 2 of 50 recordings not or not wholly converted; see the table"
+        "edgepose: 2 of 50 recordings not converted, or only in part; see the table"
     )
     assert len(result.stderr.splitlines()) == 51
     lines = result.stdout.splitlines()[1:]

@@ -229,7 +229,7 @@ def test_broken_files_cost_only_themselves(command, tmp_path):
     result = command("convert", folder, "--to", "bvh", "--out", out, "--jobs", 2)
     assert result.returncode == 1
     assert result.stderr.splitlines()[-1] == (
-        "edgepose: 3 of 14 recordings not or not wholly converted; see the table"
+        "edgepose: 3 of 14 recordings not converted, or only in part; see the table"
     )
     said = lines(result.stdout)
     assert list(said.values()).count("ok") == 11

@@ -139,7 +139,10 @@ def test_without_a_filter_the_message_names_it(command, rig, wearer, tmp_path):
     ("words", "says"),
     [
         ((), "headings are arbitrary: add --heading-reset motion, live or mounting"),
-        (("--heading-reset", "RAW"), "headings begin anew in each recording, so another one cannot reset"),
+        (
+            ("--heading-reset", "RAW"),
+            "with arbitrary headings, which another recording cannot reset",
+        ),
         (
             ("--heading-reset", "motion", "--motion", "4:6"),
             "no heading from this motion: left_forearm leaned",

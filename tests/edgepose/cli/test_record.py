@@ -148,7 +148,7 @@ def test_a_sensor_that_is_silent_is_told(tmp_path):
         process = start("record", tmp_path / "walk.npz", "--port", rig.port, "--seconds", 0.5)
         code, errors = end(process)
     assert code == 0
-    assert "warning: nothing came from head" in errors
+    assert "warning: nothing arrived from head" in errors
     assert "head" not in salvage_recording(tmp_path / "walk.npz").sensors
 
 
@@ -391,9 +391,9 @@ def test_nothing_is_overwritten_unasked(command, tmp_path):
     [
         ("walk.csv", 2, "give one source"),
         ("walk.txt --file REAL", 1, "unknown kind of recording; names end in .csv or .npz"),
-        ("walk.bin --file REAL", 2, "takes the bytes of one port"),
-        ("walk.bin --port a,b", 2, "takes the bytes of one port"),
-        ("walk.blf --port a", 2, "takes the frames of a CAN bus"),
+        ("walk.bin --file REAL", 2, "stores the bytes of one port"),
+        ("walk.bin --port a,b", 2, "stores the bytes of one port"),
+        ("walk.blf --port a", 2, "stores the frames of a CAN bus"),
         ("walk.csv --file REAL --seconds 0", 2, "--seconds"),
         ("nowhere/walk.csv --file REAL", 1, "its folder does not exist, create it first"),
         ("walk.csv --port /dev/ttyNOWHERE7", 1, "no such port"),

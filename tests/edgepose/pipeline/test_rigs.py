@@ -147,10 +147,10 @@ def test_a_rig_file_that_is_not_there_or_not_toml(rig, tmp_path):
 
 
 def test_wearers_have_names_and_ports_of_their_own(rig):
-    with pytest.raises(EdgeposeError, match=r"anna\.toml, .*ben\.toml: two of them have the name anna;"):
+    with pytest.raises(EdgeposeError, match=r"anna\.toml, .*ben\.toml: two wearers have the name anna;"):
         read_rigs([rig(), rig("ben", name="anna")])
     first, second = rig(file=None, port="A,B"), rig("ben", file=None, port="B")
-    with pytest.raises(EdgeposeError, match="two of them have the port B; give each its own"):
+    with pytest.raises(EdgeposeError, match="both use the port B; give each its own"):
         read_rigs([first, second])
 
 
@@ -168,18 +168,18 @@ def test_wearers_have_lines_of_their_own(rig, tmp_path):
         sensor_map(tmp_path / f"{i}.toml", 'can = "socketcan:can0"', first)
         for i, first in enumerate((0, 6, 11))
     )
-    bus, nobody = "two of them have the bus socketcan:can0; give each its own, or ids", None
+    bus, nobody = "both use the bus socketcan:can0; give each its own, or ids", None
     for anna, ben, says in (
-        ({"port": "A, B"}, {"port": "B"}, "two of them have the port B"),
-        ({"port": "A,B,C"}, {"sensors": hub}, "two of them have the port B"),
-        ({"sensors": hub}, {"sensors": hub}, "two of them have the port B"),
+        ({"port": "A, B"}, {"port": "B"}, "both use the port B"),
+        ({"port": "A,B,C"}, {"sensors": hub}, "both use the port B"),
+        ({"sensors": hub}, {"sensors": hub}, "both use the port B"),
         ({"port": "A"}, {"sensors": hub}, nobody),
         ({"can": "socketcan:can0"}, {"can": "socketcan:can0"}, bus),
         ({"can": "socketcan:can0"}, {"can": "socketcan:can0", "sensors": low}, bus),
         ({"sensors": high}, {"sensors": high_again}, bus),
         ({"sensors": low}, {"can": "socketcan:can0", "sensors": high}, nobody),
         ({"can": "socketcan:can0"}, {"can": "socketcan:can1"}, nobody),
-        ({"file": "-"}, {"file": "-"}, "two of them have the standard input"),
+        ({"file": "-"}, {"file": "-"}, "both use the standard input"),
     ):
         files = [rig("anna", **{"file": None} | anna), rig("ben", **{"file": None} | ben)]
         if says is nobody:
@@ -214,7 +214,7 @@ def test_several_wearers_write_to_nothing_that_can_stop_them(command, rig, tmp_p
         result = command("run", *words(rig(), rig("ben", **{"csv": None, flag: output})))
         assert result.returncode == 2, result.stderr
         assert f"ben: --{flag} " in result.stderr
-        assert f"{output} is no file on a disk: a slow reader of it would hold up" in result.stderr
+        assert f"{output} is not a file on a disk: a slow reader of it would delay" in result.stderr
     # Where standard output is a file, there is no reader.
     rigs = map(str, words(rig(), rig("ben", csv="-")))
     with (tmp_path / "out.csv").open("w") as out:
@@ -229,7 +229,7 @@ def test_several_wearers_write_to_nothing_that_can_stop_them(command, rig, tmp_p
         ({}, ["--csv", "x.csv"], "--csv belongs to a wearer: with --rig, put csv into the file"),
         ({}, ["--calibration", "c.json"], "--calibration belongs to a wearer"),
         ({}, ["--online", "window"], "--online window runs one wearer; use --online stream for several"),
-        ({"realtime": True}, [], "anna and ben: beside sensors that send, a recording needs"),
+        ({"realtime": True}, [], "anna and ben: a recording beside live sensors needs"),
         ({"csv": "anna.csv"}, [], "anna: --csv and ben: --csv name the same file"),
         ({"csv": "short.npz"}, [], "ben: --csv would overwrite"),
     ],

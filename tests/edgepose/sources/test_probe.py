@@ -51,7 +51,7 @@ def test_what_is_on_ports_and_buses(command, monkeypatch):
     assert says[0].startswith("--protocol native at --baud 115200: id 0 at ")
     assert re.findall(r"id (\d)", says[0]) == ["0", "2", "5"]
     assert says[1].startswith("--protocol witmotion at --baud 115200: id 0 at ")
-    assert says[2] == "nothing comes"
+    assert says[2] == "nothing arrives"
     assert says[3].startswith("--protocol hipnuc-canopen: id 8 at ")
     assert ", id 9 at " in says[3]
 

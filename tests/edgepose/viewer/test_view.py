@@ -419,9 +419,9 @@ def test_a_viewer_ends_with_a_run_that_is_killed(wearer, tmp_path):
 @pytest.mark.parametrize(
     ("words", "code", "says"),
     [
-        ("", 2, "give POSES, a file, or --udp HOST:PORT"),
-        ("poses.csv --udp 127.0.0.1:9000", 2, "give POSES, a file, or --udp HOST:PORT"),
-        ("--udp 127.0.0.1:9000 --reference poses.csv", 2, "--reference needs POSES"),
+        ("", 2, "give a file of POSES, or --udp HOST:PORT"),
+        ("poses.csv --udp 127.0.0.1:9000", 2, "give a file of POSES, or --udp HOST:PORT"),
+        ("--udp 127.0.0.1:9000 --reference poses.csv", 2, "--reference needs a file of POSES"),
         ("nothing.csv", 1, "cannot read poses from nothing.csv"),
         ("poses.csv --reference notes.md", 1, "notes.md is not a file of poses"),
         ("poses.csv --height 175", 1, "height 175 m is not between"),

@@ -1,0 +1,132 @@
+"""The network of a run: its settings, the archive it is stored in, and the engine that runs it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from edgepose.errors import ConfigError
+
+if TYPE_CHECKING:
+    import torch
+
+    from edgepose.config import WearerConfig
+    from edgepose.inference.archive import ArchiveInfo
+    from edgepose.inference.engine import Engine, MultiWearerEngine
+
+FRAMES_PER_STEP = 64
+"""Frames of a recording that the network computes in one step."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkConfig:
+    """The network of a run and how it runs; the fields are flags of `edgepose run`.
+
+    Attributes:
+        model: name of a shipped model, or path of an archive.
+        trust: load the archive even if its checksum is unknown.
+        online: "stream" carries a bidirectional model's forward state from frame to frame; "window" computes
+            a whole window for each frame.
+        past: frames in a window before the present one; None takes the model's own number.
+        future: frames after the present one that are waited for; None takes the model's own number.
+        precision: number format of the weights, one of `edgepose.inference.quantisation.CHOICES`.
+    """
+
+    model: str = "birnn"
+    trust: bool = False
+    online: str = "stream"
+    past: int | None = None
+    future: int | None = None
+    precision: str = "auto"
+
+
+@dataclass(frozen=True)
+class Network:
+    """A network whose archive has been read, but not loaded.
+
+    Attributes:
+        config: the settings it was read with.
+        info: the archive and its metadata.
+        past: frames in a window before the present one.
+        future: frames after the present one that are waited for.
+    """
+
+    config: NetworkConfig
+    info: ArchiveInfo
+    past: int
+    future: int
+
+    @classmethod
+    def read(cls, config: NetworkConfig, wearer_count: int) -> Network:
+        """Read the metadata of an archive and check the settings against it.
+
+        Raises:
+            ModelError: there is no such archive, or it is damaged.
+            ConfigError: the model or the number of wearers does not allow the settings.
+        """
+        from edgepose.inference import archive
+
+        info = archive.read_info(archive.find_archive(config.model))
+        network = cls(
+            config,
+            info,
+            past=info.metadata["past"] if config.past is None else config.past,
+            future=info.metadata["future"] if config.future is None else config.future,
+        )
+        if network.kind == "rnn" and network.future:
+            raise ConfigError(f"{config.model} is unidirectional: --future must be 0")
+        if wearer_count > 1 and network.windowed:
+            raise ConfigError("--online window runs one wearer; use --online stream for several")
+        return network
+
+    @property
+    def kind(self) -> str:
+        """Architecture of the network: "rnn" is unidirectional, "birnn" bidirectional."""
+        return str(self.info.metadata["kind"])
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames per second."""
+        return float(self.info.metadata["rate_hz"])
+
+    @property
+    def windowed(self) -> bool:
+        """Whether a whole window is computed for each frame."""
+        return self.kind != "rnn" and self.config.online == "window"
+
+    def load(
+        self, wearers: Sequence[WearerConfig], notify: Callable[[str], None]
+    ) -> tuple[Engine | MultiWearerEngine, str]:
+        """Load the network, and return an engine for these wearers and the precision in which it runs.
+
+        Args:
+            wearers: one wearer, or several who share the network.
+            notify: called with one message if the precision is slow here or had to be changed.
+
+        Raises:
+            ModelError: the archive is not trusted, or cannot run here.
+        """
+        from edgepose.inference import archive
+        from edgepose.inference.quantisation import quantise_weights
+
+        module = archive.load(self.info, self.config.trust)
+        precision = quantise_weights(module, self.info, self.config.precision, notify)
+        return self._engine(module, wearers, precision), precision
+
+    def _engine(
+        self, module: torch.jit.ScriptModule, wearers: Sequence[WearerConfig], precision: str
+    ) -> Engine | MultiWearerEngine:
+        from edgepose.inference.engine import MultiWearerEngine, StreamEngine, WindowEngine
+
+        # int8 activations share one scale per batch, so batching would change results.
+        batched = precision != "int8"
+        if len(wearers) > 1:
+            return MultiWearerEngine(module, self.past, self.future, len(wearers), not batched)
+        if self.windowed:
+            return WindowEngine(module, self.past, self.future)
+        # No one waits for single poses of a recording, so several frames go into a step.
+        source = wearers[0].source
+        recorded = not source.live and source.file is not None and source.file.is_file()
+        together = recorded and batched and hasattr(module, "stream_many")
+        return StreamEngine(module, self.past, self.future, FRAMES_PER_STEP if together else 1)
