@@ -2,7 +2,7 @@
 
 If a segment kept its orientation in the room, it would rotate against the body of a wearer who turns. Instead
 it keeps its last orientation relative to the pelvis. A lower leg, which does not lean when the wearer bends
-over, only follows the pelvis' heading. A silent pelvis follows the mean heading of the lower legs.
+over, only follows the pelvis' heading. A silent pelvis follows the mean heading change of the lower legs.
 `tools/bench_robustness.py` measures the benefit.
 """
 
