@@ -17,11 +17,16 @@ from typing import NamedTuple
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.npz_amass import write_npz as write_poses_npz
 from edgepose.formats.poses.registry import is_poses, pose_suffixes, salvage_poses
-from edgepose.formats.recordings import xio_session
 from edgepose.formats.recordings.base import recording_from_samples
 from edgepose.formats.recordings.csv import write_csv
 from edgepose.formats.recordings.npz import write_npz
-from edgepose.formats.recordings.registry import find_format, recording_suffixes, salvage_recording
+from edgepose.formats.recordings.registry import (
+    check_no_part,
+    find_format,
+    find_whole,
+    recording_suffixes,
+    salvage_recording,
+)
 from edgepose.imu import ImuSample, Recording
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseSequence
@@ -170,12 +175,13 @@ def _find_recordings(folder: Path, out: Path, endings: tuple[str, ...]) -> Itera
     """Yield the recordings in a folder, except those in the output folder."""
     if find_format(folder) is not None:
         yield folder
-    elif xio_session.is_sensor(folder):
-        raise EdgeposeError(f"{folder}: one sensor of an x-io session; give the folder above it")
+    else:
+        check_no_part(folder)
     for path in folder.iterdir():
+        if find_whole(path) is not None:
+            continue
         if path.is_dir():
-            in_session = xio_session.is_sensor(path)
-            if not in_session and not path.is_symlink() and path.resolve() != out:
+            if not path.is_symlink() and path.resolve() != out:
                 yield from _find_recordings(path, out, endings)
         # Reading a pipe could block forever.
         elif not path.is_fifo() and (path.suffix.lower() in endings or is_can_log(path)):

@@ -57,10 +57,14 @@ class RecordingFormat(FileFormat):
     Attributes:
         read: reads a file, or folder, of the format. Raises EdgeposeError or OSError if nothing is usable.
         is_folder: whether a folder is a recording of the format; None if recordings are files.
+        is_part: whether a file or folder holds one sensor of a recording that is a folder.
+        description: what a recording of the format is called in messages.
     """
 
     read: Callable[[Path, ReadOptions], Recording]
     is_folder: Callable[[Path], bool] | None = None
+    is_part: Callable[[Path], bool] | None = None
+    description: str = "a recording"
 
     def fits(self, path: Path, folder: bool) -> bool:
         """Return whether a file is of the format by its ending, or a folder by its content."""

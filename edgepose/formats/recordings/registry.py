@@ -89,6 +89,29 @@ def find_format(path: Path) -> RecordingFormat | None:
     )
 
 
+def find_whole(path: Path) -> RecordingFormat | None:
+    """Return the format of the recording that a file or folder is one sensor of; None if it is not."""
+    return next(
+        (
+            known
+            for known in all_formats(RecordingFormat, READERS.values())
+            if known.is_part is not None and known.is_part(path)
+        ),
+        None,
+    )
+
+
+def check_no_part(path: Path) -> None:
+    """Check that a file or folder is not just one sensor of a recording.
+
+    Raises:
+        FileFormatError: it is.
+    """
+    whole = find_whole(path)
+    if whole is not None:
+        raise FileFormatError(f"{path}: one sensor of {whole.description}; give the folder above it")
+
+
 def recording_suffixes() -> tuple[str, ...]:
     """Return the endings of recordings that are files."""
     return tuple(
@@ -107,6 +130,9 @@ def _read(path: Path, options: ReadOptions) -> Recording:
                 )
             format = built_in_format(RecordingFormat, READERS["csv"])
         return format.read(path, options)
+    except FileFormatError:
+        check_no_part(path)  # a better reason, if it is one
+        raise
     except (OSError, UnicodeDecodeError) as error:
         raise FileFormatError(
             f"{path}: cannot read it: {getattr(error, 'strerror', None) or error}"

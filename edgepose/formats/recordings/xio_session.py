@@ -158,4 +158,10 @@ def _chunks(lines: Iterable[bytes]) -> Iterator[bytes]:
     yield b"".join(chunk)
 
 
-FORMAT = RecordingFormat((), lambda folder, options: read_session(folder, options.ids), is_session)
+FORMAT = RecordingFormat(
+    (),
+    lambda folder, options: read_session(folder, options.ids),
+    is_folder=is_session,
+    is_part=is_sensor,
+    description="an x-io session",
+)

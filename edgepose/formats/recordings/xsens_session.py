@@ -225,4 +225,10 @@ def _quantities(
     return np.hstack([quat, acc, np.radians(gyr) if is_dot else gyr, mag])
 
 
-FORMAT = RecordingFormat((), lambda folder, options: read_session(folder, options.ids), is_session)
+FORMAT = RecordingFormat(
+    (),
+    lambda folder, options: read_session(folder, options.ids),
+    is_folder=is_session,
+    is_part=is_sensor,
+    description="a session of Xsens sensors",
+)

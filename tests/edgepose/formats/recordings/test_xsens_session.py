@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from edgepose.convert import plan
 from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.base import iter_samples, recording_from_samples
 from edgepose.formats.recordings.registry import read_recording
@@ -246,3 +247,20 @@ def test_decimal_commas_between_commas(tmp_path):
     )
     with pytest.raises(EdgeposeError, match="row 6 has 16 cells for 9 columns: its numbers have decimal"):
         read_recording(folder)
+
+
+def test_a_folder_is_converted_as_one_recording(tmp_path):
+    names = ["PacketCounter", "SampleTimeFine", *ACC, *QUAT]
+    folder = write(
+        tmp_path / "walk",
+        HEAD,
+        names,
+        lambda i, row: [i, i, *row.acc, *row.quat],
+        separator=",",
+        ending=".csv",
+    )
+    assert [job.source for job in plan([tmp_path], "npz", tmp_path / "out")] == [folder]
+    with pytest.raises(
+        EdgeposeError, match="one sensor of a session of Xsens sensors; give the folder above"
+    ):
+        read_recording(folder / "head.csv")
