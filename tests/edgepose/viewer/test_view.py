@@ -459,7 +459,7 @@ def test_a_file_that_does_not_fit_into_memory(tmp_path):
     command = [sys.executable, "-c", SHORT_OF_MEMORY, "view", str(path)]
     result = processes.run(command, text=True, capture_output=True, check=False)
     assert result.returncode == 1
-    assert result.stderr == "edgepose: not enough memory; give it a shorter file\n"
+    assert result.stderr == "edgepose: not enough memory; use a shorter file\n"
 
 
 def test_a_port_that_is_taken(command, tmp_path):
