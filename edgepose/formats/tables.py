@@ -87,7 +87,7 @@ def open_table(path: Path, fits: Callable[[Sequence[str]], bool], wanted: str) -
         for line in lines:
             split = {mark: _trimmed(next(csv.reader([line], delimiter=mark))) for mark in SEPARATORS}
             separator = max(SEPARATORS, key=lambda mark: len(split[mark]))
-            if fits(split[separator]):
+            if split[separator] and fits(split[separator]):
                 names = split[separator]
                 yield Table(head, names, _rows(path, lines, separator, len(names)))
                 return

@@ -183,8 +183,7 @@ def _clock(
         return ticks, 1e-6 if is_dot else 1e-4, 1 << 32
     if found is None or not 0.1 < found < 10_000.0:
         raise FileFormatError(
-            f"{path}: no possible 'Update Rate: ... Hz' in its first lines, and no {_TICKS}; export one of "
-            "them"
+            f"{path}: no valid 'Update Rate: ... Hz' in its first lines, and no {_TICKS}; export one of them"
         )
     return columns[_COUNTER], 1.0 / found, 1 << 16
 
