@@ -274,7 +274,8 @@ def test_heading_reset_reports_tilt_and_refuses_too_much_of_it() -> None:
     np.testing.assert_allclose(reset.error_deg, np.degrees(tilt), atol=1e-6)
     tilt = np.radians([0, 0, 90, 0, 16, 0.0])
     with pytest.raises(
-        EdgeposeError, match=r"pelvis sensor does: left_lower_leg \(90 deg\), head \(16 deg\); lay all six"
+        EdgeposeError,
+        match=r"like the pelvis sensor: left_lower_leg \(90 deg\), head \(16 deg\); lay all six",
     ):
         cal.headings_side_by_side(rig_at_rest(rot.quat_multiply(quats, turns_about_x(tilt))))
 
@@ -543,8 +544,8 @@ def of_head(**changes: Any) -> str:
         (of_head(heading_offset_deg=10**400), "sensor head: 'heading_offset_deg' is not a number"),
         (of_head(heading_offset_deg="5"), "sensor head: 'heading_offset_deg' is not a number"),
         (of_head(heading_offset_deg=KeyError), "sensor head: 'heading_offset_deg' is not a number"),
-        (of_head(residual_deg=-1), "sensor head: 'residual_deg' is not a number from 0 up"),
-        (of_head(residual_deg=True), "sensor head: 'residual_deg' is not a number from 0 up"),
+        (of_head(residual_deg=-1), "sensor head: 'residual_deg' is not a number of at least 0"),
+        (of_head(residual_deg=True), "sensor head: 'residual_deg' is not a number of at least 0"),
         (corrupt(body_from_inertial=[0, 0, 0, 0]), "'body_from_inertial' is not a unit quaternion"),
         (corrupt(pose="sitting"), "pose 'sitting' is none of: straight, t-pose"),
         (corrupt(pose=KeyError), "'pose' is missing or not text"),

@@ -89,7 +89,9 @@ def test_a_known_mounting_gives_every_heading(seed: int) -> None:
 
 def test_a_mounting_that_gravity_denies_is_refused() -> None:
     turned = [*MOUNTING[:4], MOUNTING[4], "x back, z up"]
-    with pytest.raises(EdgeposeError, match=r"^not mounted as the map .* says: pelvis \(90 deg\) off by"):
+    with pytest.raises(
+        EdgeposeError, match=r"^not mounted as the sensor map says, judged by gravity: pelvis \(90 deg\);"
+    ):
         cal.headings_from_mounting(measured(turned, np.zeros(6)), MOUNTING)
 
 
