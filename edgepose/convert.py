@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from edgepose.errors import EdgeposeError
+from edgepose.formats.poses.missing_frames import fill_missing_frames
 from edgepose.formats.poses.npz_amass import write_npz as write_poses_npz
 from edgepose.formats.poses.registry import is_poses, pose_suffixes, salvage_poses
 from edgepose.formats.recordings.base import recording_from_samples
@@ -334,8 +335,14 @@ def convert_poses(
         EdgeposeError: no part of the source is good, or the target cannot be written.
     """
     poses, damage = salvage_poses(source)
+    read = poses
+    if target.suffix != ".csv":  # the others hold no frame numbers, or programs ignore them
+        poses, missing = fill_missing_frames(poses, str(source))
+        if missing:
+            gaps = f"{source}: {missing} frames are missing between its poses; they are interpolated"
+            damage = gaps if damage is None else f"{damage}; {gaps}"
     replace_file(target, lambda path: _write_poses(path, poses, height_m), "poses", overwrite=overwrite)
-    return len(poses.frames), float(poses.time_s[-1] - poses.time_s[0]), damage
+    return len(read.frames), float(read.time_s[-1] - read.time_s[0]), damage
 
 
 def describe(result: Result) -> str:

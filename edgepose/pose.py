@@ -108,15 +108,23 @@ class PoseSequence(NamedTuple):
 
     @property
     def frame_time(self) -> float:
-        """Seconds from one frame to the next; 1/60 if there is only one frame."""
-        steps = np.diff(self.frames)
-        # The median, because time jumps where all sensors were silent for long.
-        return float(np.median(np.diff(self.time_s) / steps)) if len(steps) else 1.0 / 60.0
+        """Seconds from one frame number to the next; 1/60 if there is only one pose."""
+        frames, seconds = np.diff(self.frames), np.diff(self.time_s)
+        if not len(frames):
+            return 1.0 / 60.0
+        # The mean, because times may be rounded; without jumps, where all sensors were silent for long.
+        regular = seconds <= 1.5 * np.median(seconds / frames) * frames
+        return float(seconds[regular].sum() / frames[regular].sum())
+
+    @property
+    def frame_step(self) -> int:
+        """Largest number of frames that divides every step from pose to pose; 1 for a single pose."""
+        return max(1, int(np.gcd.reduce(np.diff(self.frames))))
 
     @property
     def rate(self) -> float:
-        """Frames per second; 60 if there is only one frame."""
-        return tidy_rate(self.frame_time)
+        """Poses per second if none is missing; 60 if there is only one pose."""
+        return tidy_rate(self.frame_time * self.frame_step)
 
     def pose_frames(self) -> Iterator[PoseFrame]:
         """Yield the poses one by one, as sinks take them; their `std` is NaN, because it is not kept here."""

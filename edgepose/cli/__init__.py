@@ -15,9 +15,11 @@ from typing import NoReturn
 import click
 
 from edgepose import __version__
+from edgepose.cli.repeated_options import refuse_repeats
 from edgepose.cli.terminal.messages import prepare, say
 from edgepose.cli.terminal.stop_signal import stop_signals
 from edgepose.errors import as_edgepose_error
+from edgepose.utils.similar_names import similar_names
 
 COMMANDS = (
     "bench",
@@ -52,6 +54,21 @@ class LazyGroup(click.Group):
         for point in entry_points(group="edgepose.commands", name=cmd_name):
             return point.load()
         return None
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command of the first argument, and check that no option of it is given twice."""
+        try:
+            name, command, rest = super().resolve_command(ctx, args)
+        except click.UsageError as error:
+            similar = similar_names(args[0], self.list_commands(ctx))
+            hint = f" Did you mean {similar}?" if similar else ""
+            raise click.UsageError(error.message + hint, error.ctx) from None
+        if command is not None and not ctx.resilient_parsing:
+            inner = click.Context(command, info_name=name, parent=ctx, **command.context_settings)
+            refuse_repeats(command, inner, rest)
+        return name, command, rest
 
 
 @click.group(

@@ -1,0 +1,12 @@
+"""Suggestions for names that were mistyped."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+def similar_names(name: str, names: Iterable[str]) -> str:
+    """Return the known names that are similar to one, such as "'check' or 'convert'"; or an empty text."""
+    from difflib import get_close_matches
+
+    return " or ".join(repr(near) for near in get_close_matches(name, list(names), n=2))

@@ -1,0 +1,98 @@
+"""Files of poses with rounded times and without some of their rows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+from edgepose.convert import convert_poses
+from edgepose.errors import EdgeposeError
+from edgepose.formats.bvh import read_bvh
+from edgepose.formats.poses.registry import read_poses
+from edgepose.placements import PLACEMENTS
+from edgepose.pose import PoseFrame
+from edgepose.sinks.csv import CsvSink
+
+COUNT = 240
+TURNS = Rotation.from_rotvec(np.cumsum(np.full((COUNT, 3), [0.02, -0.01, 0.03]), axis=0))
+
+
+def write(path: Path, frames: range | list[int], digits: int = 9) -> Path:
+    """Poses at 60 Hz, all joints turning alike, of which only some frames are written."""
+    with CsvSink(path) as sink:
+        for i in frames:
+            rotations = np.tile(TURNS[i].as_matrix(), (24, 1, 1)).astype(np.float32)
+            sink.write(PoseFrame(i, round(i / 60.0, digits), rotations, np.zeros(24), None))
+    return path
+
+
+def frame_time(path: Path) -> tuple[int, float]:
+    tree = read_bvh(path)
+    return len(tree.rotations), 1.0 / tree.rate
+
+
+@pytest.mark.parametrize("digits", [9, 3, 2])
+def test_rounded_times(tmp_path, digits):
+    poses = read_poses(write(tmp_path / "a.csv", range(COUNT), digits))
+    assert poses.rate == pytest.approx(60.0, rel=1e-3)
+    convert_poses(tmp_path / "a.csv", tmp_path / "a.bvh", 1.75)
+    count, seconds = frame_time(tmp_path / "a.bvh")
+    assert count == COUNT
+    assert seconds == pytest.approx(1.0 / 60.0, rel=1e-3)
+
+
+def test_a_pause_does_not_count(tmp_path):
+    with CsvSink(tmp_path / "a.csv") as sink:
+        for i in range(COUNT):
+            sink.write(
+                PoseFrame(
+                    i,
+                    i / 60.0 + 100.0 * (i > 100),
+                    np.tile(np.eye(3, dtype=np.float32), (24, 1, 1)),
+                    np.zeros(24),
+                )
+            )
+    assert read_poses(tmp_path / "a.csv").rate == 60.0
+
+
+def test_every_second_row(tmp_path):
+    write(tmp_path / "a.csv", range(0, COUNT, 2))
+    assert read_poses(tmp_path / "a.csv").rate == 30.0
+    _, _, damage = convert_poses(tmp_path / "a.csv", tmp_path / "a.bvh", 1.75)
+    assert damage is None
+    assert frame_time(tmp_path / "a.bvh") == (COUNT // 2, pytest.approx(1.0 / 30.0))
+    convert_poses(tmp_path / "a.csv", tmp_path / "a.npz", 1.75)
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert arrays["mocap_framerate"] == 30.0
+
+
+@pytest.mark.parametrize("ending", ["bvh", "npz"])
+def test_lost_rows(tmp_path, ending):
+    kept = [i for i in range(COUNT) if i % 7 and not 100 < i < 110] + [COUNT]
+    kept = [i for i in kept if i < COUNT]
+    write(tmp_path / "a.csv", kept)
+    count, seconds, damage = convert_poses(tmp_path / "a.csv", tmp_path / f"a.{ending}", 1.75)
+    missing = kept[-1] - kept[0] + 1 - len(kept)
+    assert (count, damage) == (
+        len(kept),
+        f"{tmp_path / 'a.csv'}: {missing} frames are missing between its poses; they are interpolated",
+    )
+    poses = read_poses(tmp_path / f"a.{ending}")
+    assert len(poses.frames) == len(kept) + missing
+    assert poses.rate == 60.0
+    wanted = Slerp(kept, TURNS[kept])(np.arange(kept[0], kept[-1] + 1))
+    np.testing.assert_allclose(poses.rotations[:, 5], wanted.as_matrix(), atol=1e-4)
+    assert seconds == pytest.approx((kept[-1] - kept[0]) / 60.0)
+    if ending == "npz":
+        assert [held == frozenset(PLACEMENTS) for held in poses.held] == [
+            i not in kept for i in range(kept[0], kept[-1] + 1)
+        ]
+
+
+def test_numbers_far_apart(tmp_path):
+    write(tmp_path / "a.csv", [0, 1, 2, 200])
+    with pytest.raises(EdgeposeError, match="197 frames are missing between its 4 poses"):
+        convert_poses(tmp_path / "a.csv", tmp_path / "a.bvh", 1.75)
