@@ -7,6 +7,7 @@ from pathlib import Path
 
 from edgepose.errors import FileFormatError
 from edgepose.formats.recordings.base import ReadOptions, RecordingFormat
+from edgepose.formats.recordings.time_checks import check_times
 from edgepose.formats.registered import all_formats, built_in_format
 from edgepose.imu import Recording
 from edgepose.placements import PLACEMENTS
@@ -129,7 +130,11 @@ def _read(path: Path, options: ReadOptions) -> Recording:
                     "that holds the files or folders of all sensors"
                 )
             format = built_in_format(RecordingFormat, READERS["csv"])
-        return format.read(path, options)
+        recording = format.read(path, options)
+        if not recording.sensors:
+            raise FileFormatError(recording.damage or f"{path}: no samples")
+        check_times(recording, str(path))
+        return recording
     except FileFormatError:
         check_no_part(path)  # a better reason, if it is one
         raise
