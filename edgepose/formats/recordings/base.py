@@ -200,9 +200,7 @@ class SampleTable:
 
         times, values = rows[:, 0], rows[:, 1:]
         check(np.isnan(times), "has no time")
-        check(
-            ~(np.abs(times) < _MAX_TIME_S), "has a time that is too large for seconds; is it in milliseconds?"
-        )
+        check(~(np.abs(times) < _MAX_TIME_S), "has a time too large for seconds; is it in milliseconds?")
         check(
             (np.abs(values) < _MAX_VALUE).sum(axis=1) + empty != values.shape[1],
             "has a number that is NaN or absurd",

@@ -136,7 +136,8 @@ def _read(path: Path, options: ReadOptions) -> Recording:
         check_times(recording, str(path))
         return recording
     except FileFormatError:
-        check_no_part(path)  # a better reason, if it is one
+        if path.is_file():
+            check_no_part(path)  # a better reason, if it is one
         raise
     except (OSError, UnicodeDecodeError) as error:
         raise FileFormatError(
