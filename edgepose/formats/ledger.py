@@ -13,10 +13,10 @@ class Ledger:
         count: how many they are.
     """
 
-    def __init__(self, name: str) -> None:
-        """Start with nothing left out of a file of this name."""
+    def __init__(self, name: str, unit: str = "row") -> None:
+        """Start with nothing left out of a file of this name, which consists of rows or other units."""
         self.count = 0
-        self._name = name
+        self._name, self._unit = name, unit
         self._first: tuple[int, str] | None = None
 
     def leave_out(self, row: int, problem: str) -> None:
@@ -35,4 +35,6 @@ class Ledger:
         if self._first is None:
             return None
         row, problem = self._first
-        return f"{self._name}: {self.count} bad rows left out, the first: row {row} {problem}"
+        return (
+            f"{self._name}: {self.count} bad {self._unit}s left out, the first: {self._unit} {row} {problem}"
+        )

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import TracebackType
 
 from edgepose.errors import EdgeposeError
+from edgepose.formats.ledger import Ledger
 from edgepose.formats.recordings.base import iter_samples
 from edgepose.formats.recordings.raw_capture import read_capture
 from edgepose.formats.recordings.registry import (
@@ -31,10 +32,15 @@ CAPTURES = (".bin", ".raw")
 CAN_LOGS = (".asc", ".blf", ".log", ".mf4", ".trc", ".db")
 """Endings of logs that python-can reads, besides .csv."""
 
-ChunkReader = Callable[[Path], Iterator[tuple[str, float, Chunk | None]]]
+ChunkReader = Callable[[Path, Ledger], Iterator[tuple[str, float, Chunk | None]]]
 """Yields the chunks of a file: name of the line, time in seconds, and data; None for data that is bad."""
 
 _SLICE_S = 0.01  # length of a batch
+
+SET_BACK_S = 0.5
+"""A log's times that go back by more are those of a clock that was set back, seconds."""
+
+_FEW = 5  # frames whose times are wrong, rather than the clock
 
 
 class RecordingSource:
@@ -132,6 +138,8 @@ class LogSource:
         self._make_decoder = make_decoder
         self._decoders: dict[str, LineDecoder] = {}
         self._bad = 0
+        self._ledger = Ledger(str(path), "line")
+        self._set_back_s = 0.0
 
     @property
     def counters(self) -> SourceCounters:
@@ -156,10 +164,16 @@ class LogSource:
 
     @property
     def damage(self) -> str | None:
-        """Number of impossible frames; partial packets do not count: a log may start and end anywhere."""
-        if not self._bad:
-            return None
-        return f"{self._path}: ignored {self._bad} frames with an impossible time or id"
+        """What is wrong with the file; partial packets do not count: a log may start and end anywhere."""
+        problems = [self._ledger.damage()]
+        if self._bad:
+            problems.append(f"{self._path}: ignored {self._bad} frames with an impossible time or id")
+        if self._set_back_s:
+            problems.append(
+                f"{self._path}: its clock was set back by {self._set_back_s:.1f} s on the way; the times "
+                "after that are moved on by as much"
+            )
+        return "; ".join(filter(None, problems)) or None
 
     def __enter__(self) -> LogSource:
         """Check that the file can be read.
@@ -190,10 +204,13 @@ class LogSource:
             raise EdgeposeError(f"{self._path}: {self._problem()}")
 
     def _samples(self) -> Iterator[ImuSample]:
-        for name, time_s, chunk in self._read_chunks(self._path):
+        steady = _SteadyTime()
+        for name, arrival_s, chunk in self._read_chunks(self._path, self._ledger):
             if chunk is None:
                 self._bad += 1
                 continue
+            time_s = steady.corrected(arrival_s)
+            self._set_back_s = steady.set_back_s
             decoder = self._decoders.get(name)
             if decoder is None:
                 decoder = self._decoders[name] = self._make_decoder(name)
@@ -202,6 +219,8 @@ class LogSource:
             yield from decoder.finish()
 
     def _problem(self) -> str:
+        if not self._decoders and (damage := self._ledger.damage()):
+            return f"not a log of frames ({damage})"
         decoders = self._decoders.values()
         unknown = sorted({sensor for decoder in decoders for sensor in decoder.unknown_ids})
         if unknown:
@@ -236,7 +255,7 @@ def open_file(
         return RecordingSource(path, realtime, lenient, blocking, ids)
     named = None if protocol == "auto" else protocol_named(protocol)
     if is_can_log(path) and (named is None or named.transport == "can"):
-        from edgepose.sources.can_bus import read_log
+        from edgepose.sources.can_log import read_log
 
         protocols = candidate_protocols(protocol, "can", live=False)
         make_decoder = _decoder_factory(path, protocols, sensor_map, _log_clock)
@@ -324,9 +343,41 @@ def _capture_clock(name: str) -> Callable[[int], Clock]:
     return make
 
 
-def _read_capture(path: Path) -> Iterator[tuple[str, float, bytes]]:
+def _read_capture(path: Path, ledger: Ledger) -> Iterator[tuple[str, float, bytes]]:
     for arrival_s, data in read_capture(path):
         yield "", nan if arrival_s is None else arrival_s, data
+
+
+class _SteadyTime:
+    """Arrival times of a log that do not go back, although its clock has been set back.
+
+    Attributes:
+        set_back_s: by how much it was set back so far, seconds.
+    """
+
+    def __init__(self) -> None:
+        """Start before the first time."""
+        self.set_back_s = 0.0
+        self._last_s = -inf
+        self._before_jump_s = -inf
+        self._since_jump = 0
+
+    def corrected(self, time_s: float) -> float:
+        """Return a time, moved on if it is far before the one before it; NaN stays NaN."""
+        time_s += self.set_back_s
+        if time_s < self._last_s - SET_BACK_S:
+            if self._since_jump < _FEW and time_s >= self._before_jump_s - SET_BACK_S:
+                self._last_s = time_s  # the few before it had a wrong time, far ahead
+            else:
+                self.set_back_s += self._last_s - time_s
+                time_s = self._last_s
+        self._since_jump += 1
+        if time_s > self._last_s + SET_BACK_S:
+            self._before_jump_s, self._since_jump = self._last_s, 0
+        # Lines of several buses may be slightly out of order.
+        if time_s > self._last_s:
+            self._last_s = time_s
+        return time_s
 
 
 def _batches(

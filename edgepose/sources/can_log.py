@@ -1,0 +1,237 @@
+"""Logs of CAN buses, through python-can's readers: a damaged line or frame costs only itself."""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+import logging
+import re
+import sqlite3
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple, TextIO, cast
+
+import can
+
+from edgepose.errors import FileFormatError
+from edgepose.formats.ledger import Ledger
+
+# python-can warns about every vendor library and every clock that is not installed.
+logging.getLogger("can").setLevel(logging.CRITICAL)
+
+_LATEST_S = 1e11  # 5000 years of Unix time
+_BLF_OBJECT, _BLF_HEAD = b"LOBJ", struct.Struct("<4sHHII")
+_MAX_LINE = 4096
+
+_SCREEN = re.compile(
+    r"\s*(?:\((?P<time>\d+\.\d+)\))?\s+(?P<bus>\w+)\s+(?P<id>[0-9A-Fa-f]{3,8})\s+\[(?P<size>\d+)\]"
+    r"(?P<data>(?:\s+[0-9A-Fa-f]{2})*)\s*(?:'.*)?"
+)
+"""A line that candump shows on the screen; python-can reads those that candump -l writes to a file."""
+
+_ASC_FRAME = re.compile(r"\s*\d+\.\d+\s+(?:CANFD\s+)?\d+\s.*\b[RT]x\b")
+_ASC_TIME = re.compile(r"(\s*)(\d+\.\d+)(\s.*)", re.DOTALL)
+
+Frame = tuple[str, float, list[can.Message] | None]
+
+
+class _BlfReader(can.BLFReader):
+    """A BLF reader that stops at an object whose stated size is below its header's: python-can would loop."""
+
+    def _parse_data(self, data: bytes) -> Iterator[can.Message]:
+        end = _find_empty_object(data)
+        yield from super()._parse_data(data if end is None else data[:end])
+        if end is not None:
+            raise ValueError("damaged: an object in it has no length")
+
+
+def _find_empty_object(data: bytes) -> int | None:
+    """Return the offset of the first object without a length in a BLF container; None if there is none."""
+    at = data.find(_BLF_OBJECT, 0, 8)
+    while at >= 0 and at + _BLF_HEAD.size <= len(data):
+        size = _BLF_HEAD.unpack_from(data, at)[3]
+        if size < _BLF_HEAD.size:
+            return at
+        at = data.find(_BLF_OBJECT, at + size, at + size + 8)
+    return None
+
+
+def _check_table(path: Path) -> None:
+    """Raise ValueError unless the messages of an SQLite log are a table.
+
+    A view can be endless, and SQLite cannot be interrupted by a signal while it computes one.
+    """
+    with contextlib.closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as log:
+        row = log.execute("SELECT type, sql FROM sqlite_master WHERE name = 'messages'").fetchone()
+    if row is None or row[0] != "table" or not str(row[1]).upper().lstrip().startswith("CREATE TABLE"):
+        raise ValueError("it has no table of messages")
+
+
+class _Lines:
+    """Lines of a text log, counted, none longer than a frame's can be."""
+
+    read = write = None  # python-can takes an object with these for an open file
+
+    def __init__(self, file: TextIO) -> None:
+        self.number = 0
+        self._file = file
+
+    def __iter__(self) -> _Lines:
+        return self
+
+    def __next__(self) -> str:
+        line = self._file.readline(_MAX_LINE)
+        if not line:
+            raise StopIteration
+        self.number += 1
+        while len(line) == _MAX_LINE and not line.endswith("\n"):
+            line = self._file.readline(_MAX_LINE)  # the rest of a line of no log
+        return line
+
+    def close(self) -> None:
+        self._file.close()
+
+
+class _CandumpLines(_Lines):
+    """Lines of a candump log; those of candump's screen become lines of its files."""
+
+    def __next__(self) -> str:
+        line = super().__next__()
+        if self.number == 1 and line.startswith("***BUSMASTER"):
+            raise FileFormatError("logs of BUSMASTER cannot be read: save it as .asc or .blf")
+        shown = _SCREEN.fullmatch(line)
+        if shown is None:
+            return line
+        if shown["time"] is None:
+            raise FileFormatError("candump has shown it on the screen, without times: log with candump -l")
+        return f"({shown['time']}) {shown['bus']} {shown['id']}#{''.join(shown['data'].split())}\n"
+
+
+class _AscLines(_Lines):
+    """Lines of an ASC log with times from its start, even if the file counts them from line to line."""
+
+    def __init__(self, file: TextIO, ledger: Ledger) -> None:
+        super().__init__(file)
+        self.has_frame = False  # in the present line, and no message of it has come
+        self._ledger = ledger
+        self._relative = False
+        self._time_s = 0.0
+
+    def __next__(self) -> str:
+        if self.has_frame:
+            self._ledger.leave_out(self.number, "is not a whole frame")
+        self.has_frame = False
+        line = super().__next__()
+        if line.lower().startswith("base "):
+            self._relative = "timestamps relative" in " ".join(line.lower().split())
+        self.has_frame = _ASC_FRAME.match(line) is not None
+        timed = _ASC_TIME.fullmatch(line) if self._relative else None
+        if timed is None:
+            return line
+        self._time_s += float(timed[2])
+        return f"{timed[1]}{self._time_s:.6f}{timed[3]}"
+
+
+class _AscReader(can.ASCReader):
+    """An ASC reader that can go on after a bad line, and then does not look for the header again."""
+
+    _in_header = True
+
+    def _extract_header(self) -> None:
+        if self._in_header:
+            super()._extract_header()
+        self._in_header = False
+
+
+class _TextLog(NamedTuple):
+    """A text log.
+
+    Attributes:
+        reader: python-can's; it can be iterated again after an error, from the next line on.
+        lines: what it reads.
+    """
+
+    reader: Any
+    lines: _Lines
+
+
+def _open_text(path: Path, ledger: Ledger) -> _TextLog | None:
+    """Open a log of lines each of which is a frame; None if it is of another kind."""
+    endings = [ending.lower() for ending in path.suffixes if ending.lower() != ".gz"]
+    if endings[-1:] not in ([".log"], [".asc"]):
+        return None
+    opened = gzip.open if path.suffix.lower() == ".gz" else open
+    file = cast(TextIO, opened(path, "rt", encoding="utf-8", errors="replace"))
+    if endings[-1] == ".log":
+        lines: _Lines = _CandumpLines(file)
+        return _TextLog(can.CanutilsLogReader(cast(TextIO, lines)), lines)
+    lines = _AscLines(file, ledger)
+    return _TextLog(_AscReader(cast(TextIO, lines)), lines)
+
+
+def _messages(path: Path, ledger: Ledger) -> Iterator[can.Message]:
+    """Yield the messages of a log; count the lines that are left out."""
+    log = _open_text(path, ledger)
+    if log is None:
+        if path.suffix.lower() == ".db":
+            _check_table(path)
+        with _BlfReader(path) if path.suffix.lower() == ".blf" else can.LogReader(path) as reader:
+            yield from reader
+        return
+    with contextlib.closing(log.lines):
+        while True:
+            before = log.lines.number
+            try:
+                for message in log.reader:
+                    if isinstance(log.lines, _AscLines):
+                        log.lines.has_frame = False
+                    yield message
+                return
+            except (ValueError, IndexError, KeyError, AttributeError):  # of a line that is not a frame
+                if log.lines.number == before:
+                    raise
+                ledger.leave_out(log.lines.number, "is not a frame")
+                if isinstance(log.lines, _AscLines):
+                    log.lines.has_frame = False
+
+
+def _is_good(message: can.Message) -> bool:
+    """Whether a frame's time and id are possible; logs are untrusted files, and python-can does not check."""
+    return (
+        isinstance(message.timestamp, int | float)
+        and abs(message.timestamp) < _LATEST_S
+        and isinstance(message.arbitration_id, int)
+        and 0 <= message.arbitration_id < 1 << 29
+    )
+
+
+def read_log(path: Path, ledger: Ledger) -> Iterator[Frame]:
+    """Yield channel, time in seconds and message of each frame of a log, in the file's order.
+
+    The message is None if its time or id is impossible.
+
+    Args:
+        path: the log.
+        ledger: counts the lines of a text log that are left out.
+
+    Raises:
+        FileFormatError: the log cannot be read, from its start or to its end.
+    """
+    try:
+        for message in _messages(path, ledger):
+            if message.is_error_frame or message.is_remote_frame:
+                continue
+            channel = "" if message.channel is None else str(message.channel)
+            if _is_good(message):
+                yield channel, message.timestamp, [message]
+            else:
+                yield channel, 0.0, None
+    except FileFormatError as error:
+        raise FileFormatError(f"{path}: {error}") from None
+    except OSError as error:
+        raise FileFormatError(f"{path}: cannot read it: {error.strerror or error}") from None
+    # python-can's readers raise arbitrary exceptions for damaged files.
+    except Exception as error:
+        text = (str(error).splitlines() or [""])[0] or type(error).__name__
+        raise FileFormatError(f"{path}: cannot read it as a log of a CAN bus: {text}") from None

@@ -1,0 +1,173 @@
+"""Logs of CAN buses as other programs, other settings and accidents leave them."""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Callable
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+from edgepose.errors import EdgeposeError
+from edgepose.sources import open_source
+from firmware_protocols import native_can
+from firmware_protocols.sample import Sample
+
+FRAMES, SENSORS = 300, 6
+START_S = 1_700_000_000.0
+
+
+def messages() -> list[can.Message]:
+    """Frames of six devices, 100 samples a second each."""
+    protocol = native_can.PROTOCOL
+    encode = protocol.encoder()
+    result = []
+    for k in range(FRAMES):
+        for i, sensor in enumerate(protocol.ids):
+            sample = Sample(sensor, 10_000 * k, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 9.81), (0.0, 0.0, 0.0))
+            for j, (can_id, data, extended, _) in enumerate(encode(sample, k)):
+                time_s = START_S + 0.01 * k + 0.001 * i + 0.0001 * j
+                result.append(can.Message(time_s, can_id, extended, data=data, channel="can0"))
+    return result
+
+
+def lines_of(sent: list[can.Message]) -> list[str]:
+    """As candump -l writes them."""
+    return [f"({m.timestamp:.6f}) can0 {m.arbitration_id:03X}#{m.data.hex().upper()}\n" for m in sent]
+
+
+def shown(sent: list[can.Message]) -> list[str]:
+    """As candump -ta shows them."""
+    return [
+        f" ({m.timestamp:.6f})  can0  {m.arbitration_id:03X}   [{m.dlc}]  {m.data.hex(' ').upper()}\n"
+        for m in sent
+    ]
+
+
+def asc(sent: list[can.Message], relative: bool) -> list[str]:
+    """As Vector's tools write them, with the events that they add."""
+    form = "relative" if relative else "absolute"
+    head = [
+        "date Tue Nov 14 10:13:20.000 pm 2023\n",
+        f"base hex  timestamps {form}\n",
+        "internal events logged\n",
+    ]
+    lines = ["Begin Triggerblock Tue Nov 14 10:13:20.000 pm 2023\n", "   0.000000 Start of measurement\n"]
+    last = 0.0
+    for i, m in enumerate(sent):
+        now = m.timestamp - START_S
+        if i % 40 == 20:  # an event between two frames has a time, too
+            time_s = now - 1e-4 - last if relative else now - 1e-4
+            lines.append(f"{time_s:11.6f} 1  Statistic: D 0 R 0 XD 0 XR 0 E 0 O 0 B 0.00%\n")
+            last = now - 1e-4
+        time_s = now - last if relative else now
+        lines.append(
+            f"{time_s:11.6f} 1  {m.arbitration_id:X}             Rx   d {m.dlc} {m.data.hex(' ').upper()}\n"
+        )
+        last = now
+    return [*head, *lines, "End TriggerBlock\n"]
+
+
+def read(path: Path) -> tuple[dict[int, list[float]], str | None]:
+    """Times of the samples by placement, and what is wrong with the file."""
+    times: dict[int, list[float]] = {}
+    with open_source(file=path, protocol="native-can") as source:
+        for batch in source:
+            for sample in batch.samples:
+                times.setdefault(sample.sensor, []).append(sample.time_s)
+        return times, source.damage
+
+
+def check_whole(times: dict[int, list[float]], missing: int = 0) -> None:
+    assert sorted(times) == list(range(SENSORS))
+    for each in times.values():
+        assert FRAMES - missing <= len(each) <= FRAMES
+        steps = np.diff(each)
+        assert np.median(steps) == pytest.approx(0.01, abs=2e-4)
+        assert each[-1] - each[0] == pytest.approx(0.01 * (FRAMES - 1), abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("name", "form"),
+    [
+        ("a.log", lines_of),
+        ("a.log.gz", lines_of),
+        ("a.log", shown),
+        ("a.asc", lambda sent: asc(sent, False)),
+        ("a.asc", lambda sent: asc(sent, True)),
+        ("a.asc.gz", lambda sent: asc(sent, True)),
+    ],
+)
+def test_every_form_of_a_log(tmp_path, name, form: Callable[[list[can.Message]], list[str]]):
+    text = "".join(form(messages()))
+    path = tmp_path / name
+    path.write_bytes(gzip.compress(text.encode()) if name.endswith(".gz") else text.encode())
+    times, damage = read(path)
+    assert damage is None
+    check_whole(times)
+
+
+@pytest.mark.parametrize("back_s", [1.5, 7200.0])
+@pytest.mark.parametrize("form", [lines_of, lambda sent: asc(sent, False)])
+def test_a_clock_that_is_set_back(tmp_path, back_s, form):
+    sent = messages()
+    for message in sent[len(sent) // 2 :]:
+        message.timestamp -= back_s if form is lines_of else 1.2
+    path = tmp_path / ("a.log" if form is lines_of else "a.asc")
+    path.write_text("".join(form(sent)))
+    times, damage = read(path)
+    shown_s = f"{back_s if form is lines_of else 1.2:.1f}"
+    assert damage.startswith(f"{path}: its clock was set back by {shown_s} s on the way; the times after")
+    check_whole(times)
+
+
+BAD = {
+    "half a line": "(1700000001.5000) can0 4(1700000001.500200) can0 440#1400FEFFFEFF0000\n",
+    "zeros": "\0" * 10_000 + "\n",
+    "no number": "(17000000xx.500000) can0 400#00\n",
+    "not UTF-8": "(\ufffd) \ufffd\n",
+    "empty data": "(1700000001.5) can0\n",
+    "an odd digit": "(1700000001.5) can0 400#0\n",
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_line_costs_only_itself(tmp_path, name):
+    lines = lines_of(messages())
+    lines.insert(1000, BAD[name])
+    path = tmp_path / "a.log"
+    path.write_text("".join(lines))
+    times, damage = read(path)
+    check_whole(times)
+    if name != "an odd digit":  # which is a frame of no sensor
+        assert damage == f"{path}: 1 bad lines left out, the first: line 1001 is not a frame"
+
+
+@pytest.mark.parametrize(
+    "bad", ["   1.555000 1  4x0             Rx   d 8 00\n", "   1.555000 1  400  Rx   d 8 00 zz\n"]
+)
+def test_a_bad_line_of_an_asc_log(tmp_path, bad):
+    lines = asc(messages(), False)
+    lines.insert(1000, bad)
+    path = tmp_path / "a.asc"
+    path.write_text("".join(lines))
+    times, damage = read(path)
+    check_whole(times)
+    assert damage.startswith(f"{path}: 1 bad lines left out, the first: line 1001 is not a")
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("***BUSMASTER Ver 3.2.2***\n***PROTOCOL CAN***\n", "logs of BUSMASTER cannot be read: save it as"),
+        ("  can0  400   [8]  E2 03 20 00 5F 00 00 00\n", "without times: log with candump -l"),
+        ("what\nis\nthis\n", "not a log of frames .*3 bad lines left out, the first: line 1 is not a frame"),
+    ],
+)
+def test_what_is_not_a_log(tmp_path, text, says):
+    path = tmp_path / "a.log"
+    path.write_text(text)
+    with pytest.raises(EdgeposeError, match=says):
+        read(path)
