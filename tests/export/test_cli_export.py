@@ -59,6 +59,13 @@ def fails(*arguments):
     return str(caught.value)
 
 
+def with_config(train: tuple[object, ...], config: Path) -> list[object]:
+    """The words of a training with another config."""
+    words = list(train)
+    words[words.index("--config") + 1] = config
+    return words
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """The whole chain, once: recordings, a run of a few steps, an archive with its card."""
@@ -339,7 +346,7 @@ def test_mean_weights_of_checkpoints(made, tmp_path):
     for got, wanted in zip(module(*still), expected(*still), strict=True):
         torch.testing.assert_close(got, wanted)
     (tmp_path / "wide.toml").write_text(CONFIG.replace("hidden = 8", "hidden = 9"))
-    edgepose(*train, "--config", tmp_path / "wide.toml", "--out", tmp_path / "other", "--steps", 1)
+    edgepose(*with_config(train, tmp_path / "wide.toml"), "--out", tmp_path / "other", "--steps", 1)
     refused = fails("export", first, tmp_path / "other" / "checkpoint.pt", "--out", tmp_path / "x.pt")
     assert "other/checkpoint.pt: cannot be averaged with" in refused
     twice = CliRunner().invoke(cli, ["export", str(first), str(first), "--out", str(tmp_path / "x.pt")])
@@ -385,7 +392,7 @@ def test_means_keep_licences_and_refuse_strangers(made):
 def test_errors_are_one_line(made, tmp_path):
     _, _, train = made
     (tmp_path / "bad.toml").write_text("steps = 'many'\n")
-    arguments = [*map(str, train), "--out", str(tmp_path / "run"), "--config", str(tmp_path / "bad.toml")]
+    arguments = [*map(str, with_config(train, tmp_path / "bad.toml")), "--out", str(tmp_path / "run")]
     done = processes.run(
         [sys.executable, "-m", "edgepose", *arguments], capture_output=True, text=True, check=False
     )

@@ -132,7 +132,7 @@ def _read(path: Path, options: ReadOptions) -> Recording:
             format = built_in_format(RecordingFormat, READERS["csv"])
         recording = format.read(path, options)
         if not recording.sensors:
-            raise FileFormatError(recording.damage or f"{path}: no samples")
+            raise FileFormatError(recording.damage or f"{path}: the recording has no samples")
         check_times(recording, str(path))
         return recording
     except FileFormatError:

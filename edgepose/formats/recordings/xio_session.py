@@ -89,6 +89,8 @@ def by_placement(folder: Path, sensors: Sequence[Path], ids: Mapping[int, str] |
                 f"{folder}: {result[placement].name!r} and {sensor.name!r} are both {placement}; rename one"
             )
         result[placement] = sensor
+    if not sensors:
+        raise FileFormatError(f"{folder}: no sensor in this folder")
     if not result:
         how = f"in the names of its {'folders' if sensors[0].is_dir() else 'files'}"
         how = how if ids is None else "with a serial number of --sensors"

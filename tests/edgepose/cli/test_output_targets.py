@@ -331,6 +331,8 @@ def test_a_run_that_does_not_begin_costs_no_take(wearer, files, tmp_path, monkey
         for name in ("take.csv", "take.bvh", "take.npz"):
             (tmp_path / name).write_bytes(OLD)
     words = [str(word) for word in running("--csv")(wearer, files, Path("take.csv"))]
+    if flags[0] in words:
+        words[words.index(flags[0]) + 1], flags = flags[1], []
     given = [] if "--bvh" in flags else ["--bvh", "take.bvh"]
     assert says in fails([*words, "--npz", "take.npz", *given, "--overwrite", *flags])
     left = {path.name: path.read_bytes() for path in tmp_path.iterdir()}

@@ -17,6 +17,7 @@ from edgepose.formats.recordings.xio_session import read_session
 COUNT = 50
 TURNS = Rotation.from_rotvec(np.cumsum(np.full((COUNT, 3), [0.01, -0.02, 0.03]), axis=0))
 NAME = "left forearm"
+FILES = {"Q": "Quaternion.csv", "R": "RotationMatrix.csv", "A": "EulerAngles.csv"}
 
 MESSAGES: dict[str, Callable[[Rotation], np.ndarray]] = {
     "Q": lambda r: r.as_quat()[[3, 0, 1, 2]],
@@ -47,6 +48,10 @@ def logged(folder: Path, letters: str) -> Path:
     connection.close()
     del logger
     (sensor,) = (folder / "log").iterdir()
+    files = [sensor / name for name in ("Inertial.csv", *(FILES[letter] for letter in letters))]
+    while not all(path.exists() and path.read_text().count("\n") == COUNT + 1 for path in files):
+        assert time.monotonic() < until
+        time.sleep(0.05)
     sensor.rename(folder / "log" / NAME)
     return folder / "log"
 
