@@ -147,6 +147,8 @@ def _movement(name: str, s: SensorHold, quat: Array, spread: float) -> str | Non
 def _gravity(hold: Hold, quats: list[Array]) -> tuple[Array, list[str]]:
     """Return mean specific forces in I (6, 3), m/s^2, and warnings about their size; raise if not upwards."""
     force, warnings, wrong = np.full((len(PLACEMENTS), 3), np.nan), [], []
+    tilted: dict[str, float] = {}
+    fitting: dict[str, list[str]] = {}
     for i, (name, s, quat) in enumerate(zip(PLACEMENTS, hold, quats, strict=True)):
         measured = np.isfinite(s.acc).all(axis=-1)
         if not measured.any():
@@ -154,6 +156,7 @@ def _gravity(hold: Hold, quats: list[Array]) -> tuple[Array, list[str]]:
             continue
         acc, quat = s.acc[measured], quat[measured]
         force[i] = rot.quat_rotate(quat, acc).mean(axis=0)
+        fitting[name] = fitting_conventions(quat, acc)
         size = float(np.linalg.norm(force[i]))
         at_rest = _rms(np.linalg.norm(acc, axis=-1))
         if at_rest < 0.5:
@@ -161,11 +164,18 @@ def _gravity(hold: Hold, quats: list[Array]) -> tuple[Array, list[str]]:
                 f"{name} measures {at_rest:.2f} m/s^2 (gravity is already removed; send specific force)"
             )
         elif tilt_deg(force[i]) > GRAVITY_TILT_LIMIT_DEG:
-            wrong.append(f"{name} {tilt_deg(force[i]):.0f} deg off ({diagnose_gravity_direction(quat, acc)})")
+            tilted[name] = tilt_deg(force[i])
         elif abs(size / GRAVITY - 1.0) > GRAVITY_SCALE_LIMIT:
             warnings.append(
                 f"{name} measures {size:.2f} m/s^2 at rest, not {GRAVITY:.2f}: check its units and scale"
             )
+    # Devices of one rig have one convention, although another one may fit a single sensor by chance.
+    shared = [
+        why for why in next(iter(fitting.values()), []) if all(why in each for each in fitting.values())
+    ]
+    for name, tilt in tilted.items():
+        why = next(iter(shared or fitting[name]), "no usual convention fits")
+        wrong.append(f"{name} {tilt:.0f} deg off ({why})")
     if wrong:
         raise CalibrationError(
             f"at rest the acceleration in the inertial frame must point up along +Z: {', '.join(wrong)}; "
@@ -174,8 +184,13 @@ def _gravity(hold: Hold, quats: list[Array]) -> tuple[Array, list[str]]:
     return force, warnings
 
 
-def diagnose_gravity_direction(quat: Array, acc: Array) -> str:
-    """Guess from one hold which convention a device uses instead of ours."""
+def fitting_conventions(quat: Array, acc: Array) -> list[str]:
+    """Return the conventions, other than ours, in which gravity would point the right way in one hold.
+
+    Args:
+        quat: (n, 4) quaternions of one sensor.
+        acc: (n, 3) specific forces, m/s^2.
+    """
     guesses: list[tuple[str, Array]] = [
         ("looks negated: acceleration instead of specific force, or Z down", -rot.quat_rotate(quat, acc)),
         (
@@ -191,7 +206,9 @@ def diagnose_gravity_direction(quat: Array, acc: Array) -> str:
             rot.quat_rotate(quat, acc)[:, [2, 0, 1]],
         ),
     ]
-    return next(
-        (why for why, f in guesses if tilt_deg(f.mean(axis=0)) < GRAVITY_TILT_LIMIT_DEG),
-        "no usual convention fits",
-    )
+    return [why for why, f in guesses if tilt_deg(f.mean(axis=0)) < GRAVITY_TILT_LIMIT_DEG]
+
+
+def diagnose_gravity_direction(quat: Array, acc: Array) -> str:
+    """Guess from one hold which convention a device uses instead of ours."""
+    return next(iter(fitting_conventions(quat, acc)), "no usual convention fits")

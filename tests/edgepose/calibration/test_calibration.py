@@ -621,3 +621,23 @@ def test_a_real_wearer_standing_straight() -> None:
     assert np.degrees(rot.geodesic_angle(r_tb, cal.POSES["straight"])).max() < 2.0
     # Scale errors of the accelerometers are up to 3 %.
     assert np.linalg.norm(a_t.mean(axis=0), axis=-1).max() < 0.35
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda s: s._replace(quat=s.quat[:, [1, 2, 3, 0]]), "looks like x, y, z, w"),
+        (lambda s: s._replace(quat=s.quat * [1.0, -1.0, -1.0, -1.0]), "looks like an inverse"),
+        (lambda s: s._replace(acc=-s.acc), "looks negated"),
+    ],
+)
+def test_one_convention_of_all_sensors(change, says):
+    """By chance, other conventions fit single sensors, too."""
+    recording = read_recording(Path(__file__).parents[2] / "data" / "imu" / "six-sites-3s.npz")
+    sensors = {name: change(data) for name, data in recording.sensors.items()}
+    hold = cal.hold_from_recording(recording._replace(sensors=sensors))
+    start_s = min(data.time_s[0] for data in recording.sensors.values())
+    with pytest.raises(EdgeposeError) as caught:
+        cal.check_hold(cal.trim(hold, start_s + 0.1, start_s + 1.1))
+    text = str(caught.value)
+    assert text.count("deg off (") == text.count(says) >= 4

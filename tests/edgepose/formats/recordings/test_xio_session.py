@@ -1,8 +1,7 @@
-"""Sessions that x-io's own library has logged, of what a simulated device sends."""
+"""Sessions of x-io sensors, written here in the layout of x-io's own logger."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,7 +16,8 @@ from edgepose.formats.recordings.xio_session import read_session
 COUNT = 50
 TURNS = Rotation.from_rotvec(np.cumsum(np.full((COUNT, 3), [0.01, -0.02, 0.03]), axis=0))
 NAME = "left forearm"
-FILES = {"Q": "Quaternion.csv", "R": "RotationMatrix.csv", "A": "EulerAngles.csv"}
+INERTIAL = (1.0, 2.0, 3.0, 0.0, 0.0, 1.0)
+FILES = {"I": "Inertial.csv", "Q": "Quaternion.csv", "R": "RotationMatrix.csv", "A": "EulerAngles.csv"}
 
 MESSAGES: dict[str, Callable[[Rotation], np.ndarray]] = {
     "Q": lambda r: r.as_quat()[[3, 0, 1, 2]],
@@ -26,33 +26,26 @@ MESSAGES: dict[str, Callable[[Rotation], np.ndarray]] = {
 }
 
 
+HEADS = {
+    "I": "Gyroscope X (deg/s),Gyroscope Y (deg/s),Gyroscope Z (deg/s),"
+    "Accelerometer X (g),Accelerometer Y (g),Accelerometer Z (g)",
+    "Q": "W,X,Y,Z",
+    "R": "XX,XY,XZ,YX,YY,YZ,ZX,ZY,ZZ",
+    "A": "Roll (deg),Pitch (deg),Yaw (deg)",
+}
+"""Columns as ximu3.DataLogger writes them, after the time."""
+
+
 def logged(folder: Path, letters: str) -> Path:
-    """The folder that the library makes of messages with these letters, and inertial ones."""
-    library = pytest.importorskip("ximu3")
-    stream = b'{"ping":{"interface":"USB","deviceName":"left forearm","serialNumber":"64F61CB3"}}\r\n'
-    for i, turn in enumerate(TURNS):
-        messages = {"I": np.array([1.0, 2.0, 3.0, 0.0, 0.0, 1.0])} | {
-            letter: MESSAGES[letter](turn) for letter in letters
-        }
-        for letter, values in messages.items():
-            cells = ",".join(f"{value:.6f}" for value in values)
-            stream += f"{letter},{1_000_000 + 10_000 * i},{cells}\r\n".encode()
-    (folder / "a.ximu3").write_bytes(stream)
-    connection = library.Connection(library.FileConnectionConfig(str(folder / "a.ximu3")))
-    logger = library.DataLogger(str(folder), "log", [connection])
-    connection.open()
-    until = time.monotonic() + 20.0
-    while connection.get_statistics().message_total < (1 + len(letters)) * COUNT:
-        assert time.monotonic() < until
-        time.sleep(0.05)
-    connection.close()
-    del logger
-    (sensor,) = (folder / "log").iterdir()
-    files = [sensor / name for name in ("Inertial.csv", *(FILES[letter] for letter in letters))]
-    while not all(path.exists() and path.read_text().count("\n") == COUNT + 1 for path in files):
-        assert time.monotonic() < until
-        time.sleep(0.05)
-    sensor.rename(folder / "log" / NAME)
+    """A session with the files of messages with these letters, and of inertial ones."""
+    sensor = folder / "log" / NAME
+    sensor.mkdir(parents=True)
+    for letter in f"I{letters}":
+        lines = [f"Timestamp (us),{HEADS[letter]}"]
+        for i, turn in enumerate(TURNS):
+            values = INERTIAL if letter == "I" else MESSAGES[letter](turn)
+            lines.append(",".join([str(1_000_000 + 10_000 * i), *(f"{value:.6f}" for value in values)]))
+        (sensor / FILES[letter]).write_text("\n".join(lines) + "\n")
     return folder / "log"
 
 
