@@ -21,20 +21,24 @@ from edgepose.cli.terminal.stop_signal import stop_signals
 from edgepose.errors import as_edgepose_error
 from edgepose.utils.similar_names import similar_names
 
-COMMANDS = (
-    "bench",
-    "calibrate",
-    "check",
-    "convert",
-    "devices",
-    "models",
-    "record",
-    "report",
-    "run",
-    "solve",
-    "view",
-)
-"""Commands of this package; other packages add theirs through the entry-point group `edgepose.commands`."""
+COMMANDS = {
+    "bench": "Measure accuracy and speed.",
+    "calibrate": "Find out how the sensors sit on the wearer.",
+    "check": "Find out what is wrong with a rig.",
+    "convert": "Convert recordings, captures and poses.",
+    "devices": "List serial ports and CAN interfaces.",
+    "models": "List model archives, show their cards.",
+    "record": "Record what the sensors send.",
+    "report": "Make a page with the angles, steps and sensors of poses.",
+    "run": "Turn sensor data into poses.",
+    "solve": "Find the poses of a whole recording, without a network.",
+    "view": "Show poses as a figure in the browser.",
+}
+"""Commands of this package with their descriptions in the list of commands.
+
+Their modules are imported when they are used. Other packages add commands through the entry-point group
+`edgepose.commands`.
+"""
 
 
 class LazyGroup(click.Group):
@@ -43,6 +47,18 @@ class LazyGroup(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of all commands without importing any."""
         return sorted({*COMMANDS, *(point.name for point in entry_points(group="edgepose.commands"))})
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List all commands, without importing those of this package."""
+        names = self.list_commands(ctx)
+        limit = formatter.width - 6 - max(map(len, names))
+        rows = [(name, COMMANDS.get(name) or self._listed_as(ctx, name, limit)) for name in names]
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
+
+    def _listed_as(self, ctx: click.Context, name: str, limit: int) -> str:
+        command = self.get_command(ctx, name)
+        return "" if command is None else command.get_short_help_str(limit)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import and return a command; None if there is none of that name."""

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from edgepose.benchmarks.filter_comparison import Score
 
 
-@click.group(short_help="Measure accuracy and speed.", invoke_without_command=True)
+@click.group(invoke_without_command=True)
 @click.option(
     "--model",
     "models",

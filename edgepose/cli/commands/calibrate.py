@@ -125,7 +125,7 @@ def _plan_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return gathered(command, _PLAN_FLAGS, "plan", CalibrationPlan)
 
 
-@click.command(short_help="Find out how the sensors sit on the wearer.")
+@click.command()
 @source_options
 @filter_options
 @click.option(

@@ -59,7 +59,7 @@ class State(NamedTuple):
         return sum(finding.problem for _, finding in self.sensors)
 
 
-@click.command(short_help="Find out what is wrong with a rig.")
+@click.command()
 @source_options
 @click.option(
     "--seconds",

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from edgepose.convert import Job, Result
 
 
-@click.command(short_help="Convert recordings, captures and poses.")
+@click.command()
 @click.argument(
     "inputs", nargs=-1, required=True, metavar="IN...", type=click.Path(path_type=Path, allow_dash=True)
 )

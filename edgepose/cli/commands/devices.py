@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from edgepose.sources.probe import ProbeResult
 
 
-@click.command(short_help="List serial ports and CAN interfaces.")
+@click.command()
 @click.argument("names", nargs=-1, metavar="[PORT|INTERFACE:CHANNEL]...")
 @click.option(
     "--probe",

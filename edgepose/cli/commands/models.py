@@ -11,7 +11,7 @@ from edgepose.cli.terminal.messages import show
 from edgepose.inference import archive
 
 
-@click.command(short_help="List model archives, show their cards.")
+@click.command()
 @click.argument("names", nargs=-1, metavar="[NAME|PATH]...")
 @click.option(
     "--trust",

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from edgepose.sources import Source
 
 
-@click.command(short_help="Record what the sensors send.")
+@click.command()
 @click.argument("out")
 @source_options
 @click.option(

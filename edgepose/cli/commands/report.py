@@ -12,7 +12,7 @@ from edgepose.cli.terminal.messages import show
 from edgepose.utils.output_targets import check_output
 
 
-@click.command(short_help="Make a page with the angles, steps and sensors of poses.")
+@click.command()
 @click.argument("poses", type=click.Path(path_type=Path))
 @click.option(
     "--out",

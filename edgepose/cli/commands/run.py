@@ -27,7 +27,7 @@ BEHIND_S = 1.0
 
 
 @wearer_options
-@click.command(short_help="Turn sensor data into poses.")
+@click.command()
 @network_options
 def run(wearers: list[WearerConfig], settings: NetworkConfig) -> None:
     """Turn packets or a recording into poses until the source ends or Ctrl-C.

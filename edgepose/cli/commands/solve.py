@@ -184,7 +184,7 @@ def _output_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return gathered(command, flags, "outputs", SolveOutputs)
 
 
-@click.command(short_help="Find the poses of a whole recording, without a network.")
+@click.command()
 @click.argument("recording", metavar="IN", type=click.Path(path_type=Path))
 @click.option(
     "--calibration",

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from edgepose.viewer.viewer import Viewer
 
 
-@click.command(short_help="Show poses as a figure in the browser.")
+@click.command()
 @click.argument("poses", required=False, metavar="[POSES]")
 @click.option(
     "--udp", metavar="HOST:PORT", help="Show poses that `edgepose run --udp` sends here, as they arrive."
