@@ -196,7 +196,7 @@ def _read(source: SourceConfig, orient: OrientationStage) -> tuple[Hold, str | N
     path = source.file
     assert path is not None
     if is_recording(path):
-        recording = read_recording(path, _serial_numbers(source.sensors))
+        recording = read_recording(path, _serial_numbers(source.sensors), salvage=True)
         everything = (
             calibration.hold_from_recording(recording)
             if orient.passes

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from math import inf, isnan, nan
 from pathlib import Path
 from types import TracebackType
@@ -59,12 +60,12 @@ class RecordingSource:
         Args:
             path: the file, or the folder of a session.
             realtime: deliver it at its own pace.
-            lenient: accept the good rows of any sensors; otherwise all six sensors and no bad row.
+            lenient: accept any sensors; otherwise all six are needed.
             blocking: see `open_source`.
             ids: placements by serial number, see `read_recording`.
         """
         self._path = path
-        self._read = salvage_recording if lenient else read_recording
+        self._read = salvage_recording if lenient else partial(read_recording, salvage=True)
         self._realtime, self._blocking, self._ids = realtime, blocking, ids
         self._recording: Recording | None = None
         self._packets = 0

@@ -25,7 +25,9 @@ READERS = {
 """Location of each `RecordingFormat`; modules are imported in this order until one fits a file."""
 
 
-def read_recording(path: Path | str, ids: Mapping[int, str] | None = None) -> Recording:
+def read_recording(
+    path: Path | str, ids: Mapping[int, str] | None = None, *, salvage: bool = False
+) -> Recording:
     """Read a recording of all six sensors in any format; a file with an unknown ending, and "-", is CSV.
 
     A bad row of CSV or NPZ is an error; in other programs' formats it is left out and reported in `damage`.
@@ -33,11 +35,12 @@ def read_recording(path: Path | str, ids: Mapping[int, str] | None = None) -> Re
     Args:
         path: file, or folder of a session.
         ids: placements by serial number, for sessions whose file or folder names contain no placements.
+        salvage: leave bad rows of CSV and NPZ out, too.
 
     Raises:
         FileFormatError: it cannot be read, or is not a recording of all six sensors.
     """
-    recording = _read(Path(path), ReadOptions(ids=ids))
+    recording = _read(Path(path), ReadOptions(ids=ids, salvage=salvage))
     missing = missing_sensors(recording)
     if missing:
         damage = f" ({recording.damage})" if recording.damage else ""

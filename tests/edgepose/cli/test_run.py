@@ -558,3 +558,28 @@ def test_an_empty_capture(command, wearer, tmp_path):
     )
     assert result.returncode == 1
     assert f"{file}: no known packet in 0 bytes" in last_line(result.stderr)
+
+
+def test_a_bad_row_costs_only_itself(command, wearer, tmp_path):
+    """The same answer in `check`, `calibrate` and `run`: the others are used, and the row is reported."""
+    path = tmp_path / "walk.csv"
+    write_csv(path, read_recording(wearer.recording))
+    lines = path.read_text().splitlines(keepends=True)
+    lines[3600] = ",".join(["nan" if i == 2 else cell for i, cell in enumerate(lines[3600].split(","))])
+    path.write_text("".join(lines))
+    says = f"{path}: 1 bad rows left out, the first: row "
+    result = command(
+        *("run", "--file", path, "--calibration", wearer.calibration, "--model", "rnn"),
+        *("--csv", tmp_path / "poses.csv"),
+    )
+    assert result.returncode == 1
+    assert f"edgepose: {says}" in result.stderr
+    assert len(whole(tmp_path / "poses.csv")[0]) == 720
+    result = command("check", "--file", path)
+    assert f"warning: {says}" in result.stderr
+    result = command(
+        *("calibrate", "--file", path, "--body-frame", "heading:0", "--from", 1, "--hold", 3),
+        *("--out", tmp_path / "calibration.json"),
+    )
+    assert result.returncode == 0
+    assert f"warning: {says}" in result.stdout + result.stderr
