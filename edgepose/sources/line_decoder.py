@@ -36,6 +36,7 @@ class LineDecoder:
         protocol: the line's protocol; None until it is known.
         first_s: arrival of the first chunk.
         amount: bytes or frames received so far.
+        untimed: samples left out because neither they nor their arrival have a time.
     """
 
     def __init__(
@@ -59,6 +60,7 @@ class LineDecoder:
         self.protocol: Protocol | None = None
         self.first_s: float | None = None
         self.amount = 0
+        self.untimed = 0
         self._arrival_s = 0.0
         self._detector: Detector | None = Detector(name, protocols)
         self._make_placements = placements
@@ -152,6 +154,9 @@ class LineDecoder:
                 if placement is None:
                     continue
             time_s = self._clock(placement, time_us, arrival_s)
+            if time_s != time_s:
+                self.untimed += 1
+                continue
             result.append(ImuSample(placement, time_s, quat, acc, gyr, mag))
         if self._decoder.infos:
             self._check_frames(self._decoder.infos)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from math import inf, isnan, nan
+from math import isnan, nan
 from pathlib import Path
 from types import TracebackType
 
@@ -19,11 +18,13 @@ from edgepose.formats.recordings.registry import (
     recording_suffixes,
     salvage_recording,
 )
-from edgepose.imu import ImuSample, Recording
-from edgepose.sources import Batch, Batches, Device, Source, SourceCounters, sum_counters
+from edgepose.imu import Recording
+from edgepose.sources import Batch, Batches, Device, Source, SourceCounters
 from edgepose.sources.clock_sync import CaptureClock, DeviceClock, HostClocks
 from edgepose.sources.line_decoder import Clock, LineDecoder, PlacementById
-from edgepose.sources.protocol_detection import Chunk, candidate_protocols, protocol_named
+from edgepose.sources.log_source import LogSource
+from edgepose.sources.pacing import paced_batches
+from edgepose.sources.protocol_detection import candidate_protocols, protocol_named
 from edgepose.sources.sensor_map import SensorMap, default_places
 from firmware_protocols.registry import Protocol
 
@@ -32,16 +33,6 @@ CAPTURES = (".bin", ".raw")
 
 CAN_LOGS = (".asc", ".blf", ".log", ".mf4", ".trc", ".db")
 """Endings of logs that python-can reads, besides .csv."""
-
-ChunkReader = Callable[[Path, Ledger], Iterator[tuple[str, float, Chunk | None]]]
-"""Yields the chunks of a file: name of the line, time in seconds, and data; None for data that is bad."""
-
-_SLICE_S = 0.01  # length of a batch
-
-SET_BACK_S = 0.5
-"""A log's times that go back by more are those of a clock that was set back, seconds."""
-
-_FEW = 5  # frames whose times are wrong, rather than the clock
 
 
 class RecordingSource:
@@ -108,132 +99,9 @@ class RecordingSource:
         """Yield all samples in time order, a hundredth of a second at a time."""
         assert self._recording is not None, "the source has not been entered"
         rows = iter_samples(self._recording)
-        for now_s, batch, late_s in _batches(rows, self._realtime, self._blocking):
+        for now_s, batch, late_s in paced_batches(rows, self._realtime, self._blocking):
             self._packets += len(batch)
             yield Batch(now_s, batch, backlog_s=late_s)
-
-
-class LogSource:
-    """A file with the undecoded data of a serial port or of CAN buses."""
-
-    def __init__(
-        self,
-        path: Path,
-        realtime: bool,
-        read_chunks: ChunkReader,
-        make_decoder: Callable[[str], LineDecoder],
-        blocking: bool = True,
-    ) -> None:
-        """Store the settings; iteration opens the file.
-
-        Args:
-            path: the file.
-            realtime: deliver it at its own pace.
-            read_chunks: reads the file.
-            make_decoder: makes the decoder of a line, given its name.
-            blocking: see `open_source`.
-        """
-        self._path = path
-        self._realtime, self._blocking = realtime, blocking
-        self._read_chunks = read_chunks
-        self._make_decoder = make_decoder
-        self._decoders: dict[str, LineDecoder] = {}
-        self._bad = 0
-        self._ledger = Ledger(str(path), "line")
-        self._set_back_s = 0.0
-
-    @property
-    def counters(self) -> SourceCounters:
-        """Counts of the packets decoded so far."""
-        return sum_counters(
-            [SourceCounters(bad=self._bad), *(decoder.counters for decoder in self._decoders.values())]
-        )
-
-    @property
-    def clocks(self) -> Mapping[int, DeviceClock]:
-        """Always empty: most logs have no arrival times to compare device clocks with."""
-        return {}
-
-    @property
-    def devices(self) -> Mapping[int, Device]:
-        """Devices that have sent samples so far, by placement."""
-        return {
-            placement: device._replace(line=None)
-            for decoder in self._decoders.values()
-            for placement, device in decoder.devices.items()
-        }
-
-    @property
-    def damage(self) -> str | None:
-        """What is wrong with the file; partial packets do not count: a log may start and end anywhere."""
-        problems = [self._ledger.damage()]
-        if self._bad:
-            problems.append(f"{self._path}: ignored {self._bad} frames with an impossible time or id")
-        if self._set_back_s:
-            problems.append(
-                f"{self._path}: its clock was set back by {self._set_back_s:.1f} s on the way; the times "
-                "after that are moved on by as much"
-            )
-        return "; ".join(filter(None, problems)) or None
-
-    def __enter__(self) -> LogSource:
-        """Check that the file can be read.
-
-        Raises:
-            EdgeposeError: it cannot be read.
-        """
-        try:
-            with self._path.open("rb"):
-                return self
-        except OSError as error:
-            raise EdgeposeError(f"{self._path}: cannot read it: {error.strerror}") from None
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Nothing is open."""
-
-    def __iter__(self) -> Batches:
-        """Yield all samples in the order of the file.
-
-        Raises:
-            EdgeposeError: the file cannot be read to its end, or there is no packet in it.
-        """
-        for now_s, batch, late_s in _batches(self._samples(), self._realtime, self._blocking):
-            yield Batch(now_s, batch, backlog_s=late_s)
-        if not self.counters.packets:
-            raise EdgeposeError(f"{self._path}: {self._problem()}")
-
-    def _samples(self) -> Iterator[ImuSample]:
-        steady = _SteadyTime()
-        for name, arrival_s, chunk in self._read_chunks(self._path, self._ledger):
-            if chunk is None:
-                self._bad += 1
-                continue
-            time_s = steady.corrected(arrival_s)
-            self._set_back_s = steady.set_back_s
-            decoder = self._decoders.get(name)
-            if decoder is None:
-                decoder = self._decoders[name] = self._make_decoder(name)
-            yield from decoder.feed(chunk, time_s)
-        for decoder in self._decoders.values():
-            yield from decoder.finish()
-
-    def _problem(self) -> str:
-        if not self._decoders and (damage := self._ledger.damage()):
-            return f"not a log of frames ({damage})"
-        decoders = self._decoders.values()
-        unknown = sorted({sensor for decoder in decoders for sensor in decoder.unknown_ids})
-        if unknown:
-            expected = next(decoder.ids for decoder in decoders if decoder.unknown_ids)
-            return (
-                f"packets come only from sensor ids {', '.join(map(str, unknown))}, but the expected ids are "
-                f"{expected}; assign ids to placements with --sensors"
-            )
-        protocols = {decoder.protocol.name for decoder in decoders if decoder.protocol is not None}
-        kind = " or ".join(sorted(protocols)) or "known"
-        amount = sum(decoder.amount for decoder in decoders)
-        return f"no {kind} packet in {amount} bytes or frames; is it a raw capture? if so, check --protocol"
 
 
 def open_file(
@@ -300,7 +168,7 @@ def _decoder_factory(
     path: Path,
     protocols: Sequence[Protocol],
     sensor_map: SensorMap | None,
-    clock: Callable[[str], Callable[[int], Clock]],
+    clock: Callable[[int], Clock],
 ) -> Callable[[str], LineDecoder]:
     """Return a function that makes the decoder of one of a file's lines, given the line's name."""
     placement_owner: dict[int, str] = {}
@@ -314,103 +182,31 @@ def _decoder_factory(
             # A capture does not name its port.
             return sensor_map.places(name) if name else sensor_map.all_places()
 
-        return LineDecoder(full_name, protocols, placements, clock(full_name), placement_owner)
+        return LineDecoder(full_name, protocols, placements, clock, placement_owner)
 
     return make
 
 
-def _log_clock(name: str) -> Callable[[int], Clock]:
-    return lambda wrap_us: HostClocks(wrap_us).time
+def _log_clock(wrap_us: int) -> Clock:
+    return HostClocks(wrap_us).time
 
 
-def _capture_clock(name: str) -> Callable[[int], Clock]:
-    """Return a factory of clocks: host time where arrivals are known, device time elsewhere."""
+def _capture_clock(wrap_us: int) -> Clock:
+    """Return a clock of a capture: host time where arrivals are known, device time elsewhere."""
+    capture, host = CaptureClock(wrap_us), HostClocks(wrap_us)
+    last_s: dict[int, float] = {}
 
-    def make(wrap_us: int) -> Clock:
-        capture, host = CaptureClock(wrap_us), HostClocks(wrap_us)
+    def time_of(sensor: int, t_us: int | None, arrival_s: float) -> float:
+        if not isnan(arrival_s):
+            return host.time(sensor, t_us, arrival_s)
+        # Devices may send a part of their measurements in packets without a time.
+        if t_us is not None:
+            last_s[sensor] = capture.time(sensor, t_us)
+        return last_s.get(sensor, nan)
 
-        def time_of(sensor: int, t_us: int | None, arrival_s: float) -> float:
-            if not isnan(arrival_s):
-                return host.time(sensor, t_us, arrival_s)
-            if t_us is None:
-                raise EdgeposeError(
-                    f"{name}: neither its packets nor the capture hold times; "
-                    "make captures with edgepose record, or switch on the device's time"
-                )
-            return capture.time(sensor, t_us)
-
-        return time_of
-
-    return make
+    return time_of
 
 
 def _read_capture(path: Path, ledger: Ledger) -> Iterator[tuple[str, float, bytes]]:
     for arrival_s, data in read_capture(path):
         yield "", nan if arrival_s is None else arrival_s, data
-
-
-class _SteadyTime:
-    """Arrival times of a log that do not go back, although its clock has been set back.
-
-    Attributes:
-        set_back_s: by how much it was set back so far, seconds.
-    """
-
-    def __init__(self) -> None:
-        """Start before the first time."""
-        self.set_back_s = 0.0
-        self._last_s = -inf
-        self._before_jump_s = -inf
-        self._since_jump = 0
-
-    def corrected(self, time_s: float) -> float:
-        """Return a time, moved on if it is far before the one before it; NaN stays NaN."""
-        time_s += self.set_back_s
-        if time_s < self._last_s - SET_BACK_S:
-            if self._since_jump < _FEW and time_s >= self._before_jump_s - SET_BACK_S:
-                self._last_s = time_s  # the few before it had a wrong time, far ahead
-            else:
-                self.set_back_s += self._last_s - time_s
-                time_s = self._last_s
-        self._since_jump += 1
-        if time_s > self._last_s + SET_BACK_S:
-            self._before_jump_s, self._since_jump = self._last_s, 0
-        # Lines of several buses may be slightly out of order.
-        if time_s > self._last_s:
-            self._last_s = time_s
-        return time_s
-
-
-def _batches(
-    rows: Iterator[ImuSample], realtime: bool, blocking: bool
-) -> Iterator[tuple[float, list[ImuSample], float]]:
-    """Yield samples in slices of time: the time up to which all are delivered, the samples, the delay.
-
-    In real time, that time runs on with the clock; otherwise it is that of the newest sample. Until a slice
-    is due, empty ones are yielded unless `blocking`.
-    """
-    now_s = end_s = -inf
-    batch: list[ImuSample] = []
-    offset_s = 0.0
-
-    def late_s() -> float:
-        return max(0.0, time.monotonic() + offset_s - end_s) if realtime else 0.0
-
-    for sample in rows:
-        if end_s == -inf:
-            now_s, end_s = sample.time_s, sample.time_s + _SLICE_S
-            offset_s = sample.time_s - time.monotonic()
-        while sample.time_s >= end_s:
-            if realtime:
-                while not blocking and end_s - offset_s > time.monotonic():
-                    yield now_s, [], 0.0
-                time.sleep(max(0.0, end_s - offset_s - time.monotonic()))
-                now_s = end_s
-            yield now_s, batch, late_s()
-            batch = []
-            # Outside real time, a pause in the samples is skipped.
-            end_s = end_s + _SLICE_S if realtime else sample.time_s + _SLICE_S
-        batch.append(sample)
-        now_s = max(now_s, sample.time_s)
-    if batch:
-        yield now_s, batch, late_s()

@@ -235,7 +235,7 @@ def holds_poses(path: Path) -> bool:
 
 def _starts_as_poses(start: bytes) -> bool:
     # A pipe may have delivered only a few bytes so far; recordings start with different ones.
-    start = start.removeprefix(b"\xef\xbb\xbf")[: len(_HEADER)]
+    start = start.removeprefix(b"\xef\xbb\xbf").replace(b'"', b"")[: len(_HEADER)]
     return start != b"" and _HEADER.startswith(start)
 
 

@@ -136,6 +136,11 @@ def _read(path: Path, options: ReadOptions) -> Recording:
         recording = format.read(path, options)
         if not recording.sensors:
             raise FileFormatError(recording.damage or f"{path}: the recording has no samples")
+        if all(all(quantity is None for quantity in data[1:]) for data in recording.sensors.values()):
+            raise FileFormatError(
+                f"{path}: its sensors have neither orientations nor accelerations that can be read; export "
+                "them too"
+            )
         check_times(recording, str(path))
         return recording
     except FileFormatError:

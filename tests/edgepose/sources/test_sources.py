@@ -20,6 +20,7 @@ from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import open_source
 from edgepose.sources.protocol_detection import protocol_named
+from firmware_protocols import mip
 from firmware_protocols.native import encode, encode_info
 from firmware_protocols.native_packet import Info, Packet
 from firmware_protocols.registry import PROTOCOLS
@@ -672,3 +673,24 @@ def test_options():
     with pytest.raises(EdgeposeError, match="protocol native-can is for CAN buses; use it with --can"):
         open_source(port="a", protocol="native-can")
     assert len(PLACEMENTS) == 6
+
+
+@pytest.mark.parametrize("untimed_first", [0, 3])
+def test_packets_without_a_time_between_those_with_one(tmp_path, untimed_first):
+    """A device that sends its magnetometer in packets of their own, in a capture of another program."""
+    quat, vector = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 9.81)
+    wire = mip.encode(Sample(0, None, None, None, None, (0.2, 0.0, 0.4))) * untimed_first
+    for k in range(100):
+        wire += mip.encode(Sample(0, 1_000_000 + 10_000 * k, quat, vector, (0.0, 0.0, 0.1)))
+        wire += mip.encode(Sample(0, None, None, None, None, (0.2, 0.0, 0.4)))
+    (tmp_path / "a.bin").write_bytes(wire)
+    (tmp_path / "map.toml").write_text("pelvis = { id = 0 }\n")
+    with open_source(file=tmp_path / "a.bin", protocol="mip", sensors=tmp_path / "map.toml") as source:
+        got = [sample for batch in source for sample in batch.samples]
+        damage = source.damage
+    assert [sample.time_s - got[0].time_s for sample in got] == pytest.approx(
+        np.repeat(0.01 * np.arange(100), 2), abs=1e-6
+    )
+    assert [sample.mag is None for sample in got] == [True, False] * 100
+    expected = f"{tmp_path / 'a.bin'}: left out {untimed_first} samples before the first time"
+    assert damage == (expected if untimed_first else None)

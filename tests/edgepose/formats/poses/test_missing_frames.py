@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from edgepose.convert import convert_poses
+from edgepose.convert import Job, convert, convert_poses
 from edgepose.errors import EdgeposeError
 from edgepose.formats.bvh import read_bvh
 from edgepose.formats.poses.registry import read_poses
@@ -96,3 +96,12 @@ def test_numbers_far_apart(tmp_path):
     write(tmp_path / "a.csv", [0, 1, 2, 200])
     with pytest.raises(EdgeposeError, match="197 frames are missing between its 4 poses"):
         convert_poses(tmp_path / "a.csv", tmp_path / "a.bvh", 1.75)
+
+
+def test_quotes_around_the_names_of_columns(tmp_path):
+    """As R writes them: `convert` takes it for poses, too, and not for a recording."""
+    path = write(tmp_path / "a.csv", range(COUNT))
+    header, rest = path.read_text().split("\n", 1)
+    path.write_text(",".join(f'"{name}"' for name in header.split(",")) + "\n" + rest)
+    result = convert(Job(path, tmp_path / "b.npz"))
+    assert (result.problem, result.samples) == (None, COUNT)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from edgepose.calibration import GRAVITY
 from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.mvnx import LABELS, read_mvnx
-from edgepose.formats.recordings.registry import read_recording
+from edgepose.formats.recordings.registry import read_recording, salvage_recording
 from edgepose.imu import Recording
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import quat_rotate
@@ -281,3 +281,20 @@ def test_any_damage_is_told_in_one_line(tmp_path_factory, data):
     for sensor in found.sensors.values():
         assert np.isfinite(sensor.time_s).all()
         assert (np.diff(sensor.time_s) >= 0).all()
+
+
+def test_sensors_that_measure_nothing_that_is_read(tmp_path):
+    """Free acceleration without the orientation that turns it into the sensor's frame."""
+    path = tmp_path / "a.mvnx"
+    path.write_text(
+        '<mvnx version="4"><subject frameRate="60"><sensors><sensor label="Pelvis"/></sensors><frames>'
+        + "".join(
+            f'<frame time="{17 * i}" type="normal"><sensorFreeAcceleration>0 0 1</sensorFreeAcceleration></frame>'
+            for i in range(30)
+        )
+        + "</frames></subject></mvnx>"
+    )
+    with pytest.raises(
+        EdgeposeError, match=r"neither orientations nor accelerations that can be read; export"
+    ):
+        salvage_recording(path)
