@@ -684,7 +684,8 @@ def test_packets_without_a_time_between_those_with_one(tmp_path, untimed_first):
         wire += mip.encode(Sample(0, 1_000_000 + 10_000 * k, quat, vector, (0.0, 0.0, 0.1)))
         wire += mip.encode(Sample(0, None, None, None, None, (0.2, 0.0, 0.4)))
     (tmp_path / "a.bin").write_bytes(wire)
-    (tmp_path / "map.toml").write_text("pelvis = { id = 0 }\n")
+    others = "".join(f"{name} = {{ id = {i + 1} }}\n" for i, name in enumerate(PLACEMENTS[:-1]))
+    (tmp_path / "map.toml").write_text(f"{others}pelvis = {{ id = 0 }}\n")
     with open_source(file=tmp_path / "a.bin", protocol="mip", sensors=tmp_path / "map.toml") as source:
         got = [sample for batch in source for sample in batch.samples]
         damage = source.damage

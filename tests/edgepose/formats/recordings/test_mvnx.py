@@ -289,12 +289,11 @@ def test_sensors_that_measure_nothing_that_is_read(tmp_path):
     path.write_text(
         '<mvnx version="4"><subject frameRate="60"><sensors><sensor label="Pelvis"/></sensors><frames>'
         + "".join(
-            f'<frame time="{17 * i}" type="normal"><sensorFreeAcceleration>0 0 1</sensorFreeAcceleration></frame>'
+            f'<frame time="{17 * i}" type="normal">'
+            "<sensorFreeAcceleration>0 0 1</sensorFreeAcceleration></frame>"
             for i in range(30)
         )
         + "</frames></subject></mvnx>"
     )
-    with pytest.raises(
-        EdgeposeError, match=r"neither orientations nor accelerations that can be read; export"
-    ):
+    with pytest.raises(EdgeposeError, match="neither orientations nor accelerations that can be"):
         salvage_recording(path)
