@@ -33,6 +33,7 @@ MAX_SAMPLES = 20_000_000
 _MAX_VALUE = 1e6  # no sensor measures more, in any of the units
 _MAX_TIME_S = 1e11
 _CHUNK = 4096
+_RESTART_S = 1.0  # rows in the wrong order are nearer
 
 
 class ReadOptions(NamedTuple):
@@ -213,6 +214,8 @@ class SampleTable:
         norm = np.linalg.norm(values[:, :4], axis=1)
         check(np.abs(norm - 1.0) > 0.1, "has a quaternion that is not of unit length")
         reached = np.maximum.accumulate(np.concatenate([[before], np.where(good, times, -inf)]))[:-1]
+        back = good & (times < reached - _RESTART_S)
+        check(back, "goes back in time by more than a second; if it was restarted there, split the recording")
         check(good & (times < reached), "goes back in time; sort the rows by time_s")
         if not good.all():
             rows, norm = rows[good], norm[good]

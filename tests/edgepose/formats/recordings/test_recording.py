@@ -344,3 +344,21 @@ def test_array_header_that_promises_too_much(tmp_path):
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("t.npy", header.getvalue())
     error(path)
+
+
+def test_a_sensor_that_was_restarted(tmp_path):
+    """Its rows after that cannot be dated; sorting them would mix the two halves."""
+    recording = read_recording(REAL)
+    head = recording.sensors["head"]
+    time_s = head.time_s.copy()
+    time_s[200:] -= 1.9
+    recording.sensors["head"] = head._replace(time_s=time_s)
+    write_npz(tmp_path / "a.npz", recording)
+    with pytest.raises(
+        EdgeposeError, match="row 200: head goes back in time by more than a second; if"
+    ):
+        read_recording(tmp_path / "a.npz")
+    salvaged = read_recording(tmp_path / "a.npz", salvage=True)
+    assert salvaged.damage.startswith(f"{tmp_path / 'a.npz'}: ")
+    assert 200 <= len(salvaged.sensors["head"].time_s) < len(time_s)
+    assert len(salvaged.sensors["pelvis"].time_s) == len(time_s)
