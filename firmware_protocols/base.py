@@ -71,6 +71,8 @@ class Protocol:
             devices have ids on their line, the id is `sample.sensor`. None if the format can only be decoded.
         ids: default ids of six devices on one line; empty if there are no usual ones.
         single_device: whether a device usually has a line to itself.
+        common_heading: whether the orientations of several devices have one heading; without it, each starts
+            with a heading of its own.
         request: for devices that send only on request: returns the request for one sample of the device with
             an id, and the length of the answer in bytes.
     """
@@ -83,6 +85,7 @@ class Protocol:
     encoder: Callable[[], Encode] | None
     ids: Sequence[int] = ()
     single_device: bool = False
+    common_heading: bool = True
     request: Callable[[int], tuple[bytes, int]] | None = None
 
     @property

@@ -137,4 +137,5 @@ PROTOCOL = Protocol(
     decoder=Bno08xDecoder,
     encoder=lambda: encode,
     single_device=True,
+    common_heading=False,
 )

@@ -135,4 +135,5 @@ PROTOCOL = Protocol(
     decoder=HaritoraxDecoder,
     encoder=uncounted(encode),
     ids=range(6),
+    common_heading=False,
 )

@@ -7,7 +7,7 @@ are in radians, except those whose names end in `_deg`, which are for people to 
 from edgepose.calibration.body_frame import body_from_inertial, check_body_frame
 from edgepose.calibration.checks import GRAVITY, HoldSummary, MovedError, check_hold
 from edgepose.calibration.functional import EXERCISE_S, ROUTINE, WeakMotionError, headings_from_motion
-from edgepose.calibration.headings import (
+from edgepose.calibration.heading_reset import (
     HeadingReset,
     headings_from_axis,
     headings_from_mounting,

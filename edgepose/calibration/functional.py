@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edgepose import rotations as rot
-from edgepose.calibration.headings import HeadingReset
+from edgepose.calibration.heading_reset import HeadingReset
 from edgepose.calibration.static_pose import Hold, check_reported
 from edgepose.errors import CalibrationError
 from edgepose.placements import PLACEMENTS

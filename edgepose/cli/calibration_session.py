@@ -19,6 +19,7 @@ from edgepose.formats.recordings.registry import read_recording
 from edgepose.orientation.stage import OrientationStage
 from edgepose.sources import Device, open_source
 from edgepose.sources.replay import is_recording
+from firmware_protocols.registry import PROTOCOLS
 
 ROUTINE_S = 30.0
 """Length of the motion that is taken from a recording without --motion, seconds."""
@@ -104,7 +105,7 @@ def measure_live(
             wait_for_enter(batches, say)
         summary = record_hold(batches, plan.pose, plan.countdown_s, plan.hold_s, say, calibration.check_hold)
         # Checked only now, because magnetometers may be slower than the other sensors.
-        _check_north(orient, plan)
+        _check_north(orient, plan, opened.devices)
         if plan.heading_reset == "motion":
             upright = summary.orientation
             reset = record_motion(
@@ -123,7 +124,7 @@ def measure_recorded(
     """
     reset = _side_by_side(source, plan, orient, say)
     everything, damage, devices = _read(source, orient)
-    _check_north(orient, plan)
+    _check_north(orient, plan, devices)
     still, start_s = _window(source.name, (everything, damage), plan.from_s, plan.hold_s, say)
     if plan.from_s is None:
         say("If the wearer stood in the pose at another time, give its start with --from.")
@@ -174,8 +175,14 @@ def _mounted(plan: CalibrationPlan, summary: HoldSummary) -> HeadingReset | None
     return calibration.headings_from_axis(summary.orientation, axis)
 
 
-def _check_north(orient: OrientationStage, plan: CalibrationPlan) -> None:
-    """Raise EdgeposeError if a filter started with arbitrary headings and no heading reset aligns them."""
+def _check_north(orient: OrientationStage, plan: CalibrationPlan, devices: Mapping[int, Device]) -> None:
+    """Raise EdgeposeError if a filter, or devices, started with arbitrary headings that no reset aligns."""
+    own = sorted({device.protocol for device in devices.values() if not _has_common_heading(device.protocol)})
+    if own and orient.passes and plan.heading_reset is None:
+        raise EdgeposeError(
+            f"sensors of {', '.join(own)} have no common heading: "
+            "add --heading-reset motion, live or mounting"
+        )
     if orient.mixed:
         raise EdgeposeError(
             "some sensors have a magnetometer and others do not: their headings would differ; add --no-mag"
@@ -186,6 +193,11 @@ def _check_north(orient: OrientationStage, plan: CalibrationPlan) -> None:
             "without a magnetometer in each sensor the filter's headings are arbitrary: "
             "add --heading-reset motion, live or mounting"
         )
+
+
+def _has_common_heading(protocol: str) -> bool:
+    # Formats of text lines that the user describes are not in the table.
+    return protocol not in PROTOCOLS or PROTOCOLS[protocol].common_heading
 
 
 # --- recordings ---------------------------------------------------------------------------------------------

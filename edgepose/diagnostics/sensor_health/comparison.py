@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from edgepose.calibration.fit import POSE_TILT_DEG, fit_pose, from_median
-from edgepose.calibration.headings import RESET_TILT_LIMIT_DEG, headings_from_pose, turn_about_z
+from edgepose.calibration.heading_reset import RESET_TILT_LIMIT_DEG, headings_from_pose, turn_about_z
 from edgepose.calibration.sensor_to_segment import Calibration
 from edgepose.diagnostics.sensor_health.columns import FEWEST
 from edgepose.diagnostics.sensor_health.repeats import FROZEN_S, is_constant, newest_values
