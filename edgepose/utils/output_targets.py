@@ -21,7 +21,7 @@ ENDINGS = frozenset(
     (
         *(".csv", ".npz", ".bvh", ".json", ".html", ".htm", ".png", ".pdf", ".svg", ".pt", ".md", ".toml"),
         *(".bin", ".raw", ".times", ".asc", ".blf", ".log", ".mf4", ".trc", ".db", ".mvnx", ".pkl"),
-        *(".sensors", ".asf", ".amc", ".py"),
+        *(".sensors", ".zip", ".asf", ".amc", ".py"),
     )
 )
 """Endings of files that edgepose reads or writes: a file of another kind is never overwritten."""

@@ -22,11 +22,14 @@ from edgepose.cli.commands.calibrate import calibrate
 from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.base import recording_from_samples
 from edgepose.formats.recordings.csv import write_csv
+from edgepose.formats.recordings.raw_capture import times_header, times_path, times_row
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import ImuSample
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose_export.synthesis.heading_routine import ASIDE_DEG, exercises
 from firmware_protocols import native, native_packet
+from firmware_protocols.registry import PROTOCOLS
+from firmware_protocols.sample import Sample
 from tests.support import processes
 from tests.support.ports import Port, Sender
 
@@ -449,3 +452,22 @@ def test_movements_that_are_not_in_the_recording(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "walk.csv", lambda t: worn(np.tile(np.eye(3), (6, 1, 1))))
     words = ("--heading-reset", "motion", "--motion", "500:520", "--out", tmp_path / "c.json")
     assert "with --motion FROM:TO" in error_of(run("--file", path, "--hold", 1, *words))
+
+
+@pytest.mark.parametrize("words", [(), ("--heading-reset", "mounting:z")])
+def test_devices_without_a_common_heading(tmp_path: Path, words: tuple[str, ...]) -> None:
+    """They need a reset, although they send orientations."""
+    rig = tmp_path / "walk.bin"
+    encode = PROTOCOLS["haritorax"].encoder()
+    wire, end = b"", []
+    for k in range(300):
+        for sensor in range(6):
+            wire += encode(Sample(sensor, None, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 9.81), None), k)
+        end.append(len(wire))
+    rig.write_bytes(wire)
+    noted = times_header({}) + "".join(times_row(1.7e9 + 0.01 * k, at) for k, at in enumerate(end))
+    times_path(rig).write_text(noted)
+    result = run("--file", rig, "--protocol", "haritorax", "--out", tmp_path / "c.json", *words)
+    says = "sensors of haritorax have no common heading: add --heading-reset motion, live or mounting"
+    text = str(result.exception) + result.output
+    assert (says in text) == (not words)

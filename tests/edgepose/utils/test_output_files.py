@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 
 from edgepose.errors import EdgeposeError
+from edgepose.formats.poses.registry import pose_suffixes
+from edgepose.formats.recordings.registry import recording_suffixes
 from edgepose.pose import PoseFrame
 from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.npz import NpzSink
+from edgepose.sources.replay import CAN_LOGS, CAPTURES
 from edgepose.utils.durable_files import replace_file, write_whole
 from edgepose.utils.growing_files import GrowingFile
-from edgepose.utils.output_targets import descriptor, find_target, has_reader
+from edgepose.utils.output_targets import ENDINGS, descriptor, find_target, has_reader
 
 OLD = b"what was there before\n"
 
@@ -103,3 +106,7 @@ def test_an_error_of_a_writer_leaves_the_old_file(tmp_path):
     with pytest.raises(ValueError, match="no more"):
         replace_file(tmp_path / "a", write, "text", overwrite=True)
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [OLD]
+
+
+def test_no_output_has_the_ending_of_a_file_that_is_read():
+    assert {*recording_suffixes(), *pose_suffixes(), *CAPTURES, *CAN_LOGS} <= ENDINGS
