@@ -12,7 +12,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from typing import Any
 
 import numpy as np
@@ -331,6 +331,15 @@ def _grounded_positions(poses: PoseSequence, body: Body) -> Array | None:
     return poses.translation - [poses.translation[0, 0], lowest, poses.translation[0, 2]]
 
 
+def free_port(host: str, first: int, count: int = 20) -> int:
+    """Return the first port from `first` on that can be used; `first` if none of `count` can."""
+    for port in range(first, first + count):
+        with suppress(EdgeposeError):
+            _check_free(host, port)
+            return port
+    return first
+
+
 def _check_free(host: str, port: int) -> None:
     """Raise if the port cannot be used; viser would silently take the next free one."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -338,6 +347,7 @@ def _check_free(host: str, port: int) -> None:
         socket.create_server((host, port), family=family).close()
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or error
+        flag = "--host" if isinstance(error, socket.gaierror | UnicodeError) else "--port"
         raise EdgeposeError(
-            f"cannot show poses at {host} port {port}: {reason}; choose another --port"
+            f"cannot show poses at {host} port {port}: {reason}; choose another {flag}"
         ) from error

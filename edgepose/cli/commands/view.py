@@ -74,7 +74,7 @@ def view(
         stop = stack.enter_context(StopSignal())
         if udp is not None:
             receiver = stack.enter_context(_listen(udp))
-            viewer = stack.enter_context(closing(_open(host, port, body)))
+            viewer = stack.enter_context(closing(_open(host, port, body, with_parent)))
             viewer.follow(receiver, lambda: stop.asked or (with_parent and os.getppid() != parent))
         else:
             sequence = read_poses(str(poses))
@@ -83,12 +83,14 @@ def view(
             viewer.play(sequence, reference_sequence, lambda: stop.asked)
 
 
-def _open(host: str, port: int, body: Body) -> Viewer:
-    from edgepose.viewer.viewer import Viewer
+def _open(host: str, port: int, body: Body, for_run: bool = False) -> Viewer:
+    """Open the page; for `edgepose run`, which has no flag for its port, on the next one that is free."""
+    from edgepose.viewer.viewer import Viewer, free_port
 
+    port = free_port(host, port) if for_run else port
     viewer = Viewer(host, port, body)
     name = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
-    say(f"open http://{name}:{port} in a browser; Ctrl-C ends the view")
+    say(f"open http://{name}:{port} in a browser" + ("" if for_run else "; Ctrl-C ends the view"))
     return viewer
 
 

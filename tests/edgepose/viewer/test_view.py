@@ -34,6 +34,7 @@ from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.udp import UdpSink, decode, encode_binary, encode_json
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics
+from edgepose.viewer import viewer as viewer_module
 from edgepose.viewer.body_mesh import TIPS, build, ground
 from edgepose.viewer.viewer import UdpPoseStream, Viewer, plain, sensor_table
 from tests.support import processes
@@ -486,3 +487,24 @@ def test_documented_commands_are_understood():
     assert len(documented) >= 3
     for words in documented:
         cli.get_command(click.Context(cli), "view").make_context("view", words.split())
+
+
+def test_a_port_in_use_moves_the_page_of_a_run():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert port < viewer_module.free_port("127.0.0.1", port) < port + 20
+    assert viewer_module.free_port("127.0.0.1", port) == port
+    assert viewer_module.free_port("nosuch.invalid", 8080) == 8080
+
+
+def test_an_address_that_is_none(command):
+    result = command(
+        "view", "tests/data/none.csv", "--host", "nosuch.invalid", "--udp", f"127.0.0.1:{free_port()}"
+    )
+    assert result.returncode == 2
+    result = command("view", "--host", "nosuch.invalid", "--udp", f"127.0.0.1:{free_port()}")
+    assert result.returncode == 1
+    assert "cannot show poses at nosuch.invalid port 8080" in result.stderr
+    assert result.stderr.endswith("; choose another --host\n")
