@@ -347,7 +347,8 @@ def _check_free(host: str, port: int) -> None:
         socket.create_server((host, port), family=family).close()
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or error
-        flag = "--host" if isinstance(error, socket.gaierror | UnicodeError) else "--port"
+        # Errors of name resolution have negative numbers.
+        flag = "--port" if isinstance(error, OSError) and (error.errno or -1) > 0 else "--host"
         raise EdgeposeError(
             f"cannot show poses at {host} port {port}: {reason}; choose another {flag}"
         ) from error
