@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -31,15 +33,19 @@ def devices(names: tuple[str, ...], probe: bool) -> None:
       edgepose devices --probe
       edgepose devices --probe /dev/ttyUSB0 slcan:/dev/ttyACM0
     """
+    names = tuple(name for text in names for name in text.split(",") if name)  # as --port names several
     ports = dict.fromkeys((name for name in names if not _is_bus(name)), "") if names else _ports()
     buses = [name for name in names if _is_bus(name)] if names else None
+    failed: list[str] = []
     if ports or not names:
         show("Serial ports (edgepose run --port NAME):")
         width = max(map(len, ports), default=0)
         for name, description in ports.items():
-            show(f"  {name.ljust(width)}  {description}".rstrip())
+            absent = bool(names) and not probe and not Path(name).exists() and name not in _ports()
+            failed += [name] * absent
+            show(f"  {name.ljust(width)}  {'no such port' if absent else description}".rstrip())
             if probe:
-                show(f"    {_probe_port(name)}")
+                show(f"    {_probe(name, _probe_port, failed)}")
         if not ports:
             show(
                 "  none found; connect the sensors, and check that the driver is loaded and that you may "
@@ -52,9 +58,11 @@ def devices(names: tuple[str, ...], probe: bool) -> None:
         for name in buses:
             show(f"  {name}")
             if probe:
-                show(f"    {_probe_bus(name)}")
+                show(f"    {_probe(name, _probe_bus, failed)}")
         if not buses:
             show("  none found; adapters on a serial port are named slcan:PORT")
+    if names and failed:
+        raise EdgeposeError(f"cannot listen to {', '.join(failed)}")
 
 
 def _is_bus(name: str) -> bool:
@@ -85,30 +93,28 @@ def _buses() -> list[str]:
     return [f"{config['interface']}:{config['channel']}" for config in found]
 
 
+def _probe(name: str, probe: Callable[[str], str], failed: list[str]) -> str:
+    """Return what was found on a line, or why it cannot be probed; then the line is added to `failed`."""
+    if sys.stderr.isatty():
+        say(f"listening to {name} ...")
+    try:
+        return probe(name)
+    except EdgeposeError as error:
+        failed.append(name)
+        return str(error)
+
+
 def _probe_port(name: str) -> str:
     from edgepose.sources.probe import probe_port
 
-    _say_listening(name)
-    try:
-        finding, baud = probe_port(name)
-    except EdgeposeError as error:
-        return str(error)
+    finding, baud = probe_port(name)
     return _describe(finding, "bytes", f" at --baud {baud}")
 
 
 def _probe_bus(name: str) -> str:
     from edgepose.sources.probe import probe_bus
 
-    _say_listening(name)
-    try:
-        return _describe(probe_bus(name), "frames", "")
-    except EdgeposeError as error:
-        return str(error)
-
-
-def _say_listening(name: str) -> None:
-    if sys.stderr.isatty():
-        say(f"listening to {name} ...")
+    return _describe(probe_bus(name), "frames", "")
 
 
 def _describe(finding: ProbeResult, unit: str, speed: str) -> str:

@@ -79,7 +79,8 @@ def test_what_cannot_be_opened(command):
     with pytest.raises(EdgeposeError, match="no CAN interface"):
         probe_bus("nonsense:0")
     result = command("devices", "--probe", "/dev/nowhere7", "socketcan:nowhere7")
-    assert result.returncode == 0, result.stderr
+    assert result.returncode == 1
+    assert result.stderr == "edgepose: cannot listen to /dev/nowhere7, socketcan:nowhere7\n"
     assert "/dev/nowhere7: no such port" in result.stdout
     assert "socketcan:nowhere7: cannot open it" in result.stdout
 
@@ -89,3 +90,12 @@ def test_devices_without_names(command):
     assert result.returncode == 0
     assert "Serial ports (edgepose run --port NAME):" in result.stdout
     assert "CAN interfaces (edgepose run --can NAME):" in result.stdout
+
+
+@pytest.mark.parametrize("probe", [(), ("--probe",)])
+def test_ports_that_are_not_there(command, probe):
+    result = command("devices", *probe, "/dev/ttyNONE,/dev/ttyNEVER", "/dev/null")
+    assert result.returncode == 1
+    assert result.stdout.count("no such port") == 2
+    assert "/dev/ttyNONE,/dev/ttyNEVER" not in result.stdout
+    assert "edgepose: cannot listen to /dev/ttyNONE, /dev/ttyNEVER" in result.stderr
