@@ -54,7 +54,7 @@ class StreamDecoder(Receiver):
     """
 
     _START: ClassVar[re.Pattern[bytes]]
-    """Pattern of the start of a frame; at the end of the data, it must match the first byte alone."""
+    """Pattern of the start of a frame; at the end of the data, it must match every beginning of it."""
 
     _PADDING: ClassVar[bytes] = b""
     """Bytes that are allowed between frames."""

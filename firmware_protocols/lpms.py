@@ -9,8 +9,8 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterable
-from math import isfinite
 
+from firmware_protocols._numbers import number, vector
 from firmware_protocols._stream import StreamDecoder
 from firmware_protocols.base import Protocol, uncounted
 from firmware_protocols.sample import STANDARD_G, Quaternion, Sample, Vector3, unit_quaternion
@@ -120,17 +120,15 @@ class LpmsDecoder(StreamDecoder):
         mag = self._vector(v, "mag", 1.0)
         temperature = None
         at = self._index_of.get("temperature")
-        if at is not None and isfinite(v[at]):
-            temperature = v[at] * self._scale["temperature"]
+        if at is not None:
+            temperature = number(v[at] * self._scale["temperature"])
         self._emit(Sample(sensor, v[0] * TICK_US, quat, acc, gyr, mag, temperature), samples)
 
     def _vector(self, v: tuple[float, ...], name: str, unit: float) -> Vector3 | None:
         at = self._index_of.get(name)
         if at is None:
             return None
-        s = self._scale[name] * unit
-        x, y, z = v[at] * s, v[at + 1] * s, v[at + 2] * s
-        return (x, y, z) if isfinite(x + y + z) else None
+        return vector(v[at : at + 3], self._scale[name] * unit)
 
 
 def encode(sample: Sample, fields: Iterable[str] = USUAL_FIELDS, floats: bool = True) -> bytes:

@@ -161,6 +161,27 @@ def test_nothing_too_large_to_go_on_with(name):
         assert sample.temperature is None or abs(sample.temperature) <= LARGEST
 
 
+@pytest.mark.parametrize("name", [name for name, protocol in PROTOCOLS.items() if protocol.encoder])
+@pytest.mark.parametrize("quantity", ["acc", "gyr", "mag"])
+def test_nothing_too_large_in_any_format(name, quantity):
+    """As far as it can be sent."""
+    protocol = PROTOCOLS[name]
+    huge = STILL._replace(**{quantity: (1e30, 0.0, 0.0)})
+    try:
+        wire = [protocol.encode(huge, k) for k in range(3)]
+    except (ValueError, OverflowError, struct.error):
+        return
+    decoder = protocol.decoder()
+    samples = []
+    for packet in wire:
+        pieces = [(packet,)] if protocol.transport == "bytes" else [frame[:3] for frame in packet]
+        for piece in pieces:
+            samples += decoder.feed(*piece)
+    for sample in samples + decoder.flush():
+        for values in sample[2:6]:
+            assert values is None or max(map(abs, values)) <= LARGEST
+
+
 def test_the_smallest_numbers_are_numbers():
     tiny = STILL._replace(acc=(5e-324, -1e-310, 1e-45))
     (sample,) = xsens.XbusDecoder().feed(xsens.encode_mtdata2(tiny, 0, number_format="f64"))
