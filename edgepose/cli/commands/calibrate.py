@@ -265,13 +265,13 @@ def _check_writable(out: str, overwrite: bool) -> None:
 
 def _table(result: Calibration, measured: Measured) -> str:
     summary, reset = measured.summary, measured.reset
-    lines = ["sensor           samples  residual deg  |force| m/s^2  heading deg  its error  sits"]
+    lines = ["sensor          samples  residual deg  m/s^2 heading its error  sits"]
     for i, (name, sits) in enumerate(zip(PLACEMENTS, calibration.mounting(result), strict=True)):
         force = float(np.linalg.norm(summary.force[i]))
         heading = "-" if reset is None else f"{math.degrees(reset.offset[i]):.1f}"
         error = "-" if reset is None else f"{reset.error_deg[i]:.1f}"
         lines.append(
-            f"{name:16}{summary.samples[i]:8d}{result.residual_deg[i]:14.2f}"
-            f"{'-' if math.isnan(force) else f'{force:.2f}':>15}{heading:>13}{error:>11}  {sits}"
+            f"{name:16}{summary.samples[i]:7d}{result.residual_deg[i]:14.2f}"
+            f"{'-' if math.isnan(force) else f'{force:.2f}':>7}{heading:>8}{error:>10}  {sits}"
         )
     return "\n".join(lines)

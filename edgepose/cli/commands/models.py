@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import textwrap
 from pathlib import Path
 
 import click
@@ -36,6 +37,10 @@ def models(names: tuple[str, ...], trust: bool) -> None:
         _show(archive.trust(path) if trust else archive.read_info(path))
 
 
+_WIDTH = 80
+"""Columns of a terminal."""
+
+
 def _list() -> None:
     rows = [("name", "kind", "units", "frames", "size", "trained on")]
     for path in archive.bundled_archives():
@@ -50,8 +55,11 @@ def _list() -> None:
             (path.stem, about["kind"], str(about["hidden"]), frames, size, about["training"]["summary"])
         )
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    indent = sum(widths[:-1]) + 2 * len(widths[:-1])
     for row in rows:
-        show("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+        cells = [cell.ljust(width) for cell, width in zip(row[:-1], widths[:-1], strict=True)]
+        first, *rest = textwrap.wrap(row[-1], _WIDTH - indent) or [""]
+        show("\n".join(["  ".join([*cells, first]).rstrip(), *(" " * indent + line for line in rest)]))
 
 
 def _show(info: archive.ArchiveInfo) -> None:
