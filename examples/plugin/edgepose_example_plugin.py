@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import math
 
-from edgepose.pose import PoseFrame
-from edgepose.sinks.base import Sink, SinkContext
+from edgepose import PoseFrame, Sink
+from edgepose.sinks.base import SinkContext
+from edgepose.utils.durable_files import write_whole
+from edgepose.utils.output_targets import check_output
 from firmware_protocols.base import Decoder, Protocol
 from firmware_protocols.sample import Counters, Sample
 
@@ -57,22 +59,31 @@ PROTOCOL = Protocol(
 
 
 class CountSink(Sink):
-    """Writes the number of poses to a file at the end."""
+    """Writes the number of poses to a file at the end; after a failure, or without poses, nothing."""
 
-    def __init__(self, path: str) -> None:
-        """Count from zero."""
-        self._path, self._count = path, 0
+    def __init__(self, path: str, overwrite: bool) -> None:
+        """Count from zero; raise EdgeposeError if the file cannot be written or must not be replaced."""
+        check_output(path, "the count", (".txt",), overwrite)
+        self._path, self._overwrite = path, overwrite
+        self._count, self._closed = 0, False
 
     def write(self, pose: PoseFrame) -> None:
         """Count a pose."""
         self._count += 1
 
     def close(self) -> None:
-        """Write the count; a second call writes the same."""
-        with open(self._path, "w", encoding="utf-8") as file:  # noqa: PTH123
-            file.write(f"{self._count}\n")
+        """Write the count; a second call does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        if self._count:
+            write_whole(self._path, f"{self._count}\n", "the count", overwrite=self._overwrite)
+
+    def discard(self) -> None:
+        """Close without writing."""
+        self._closed = True
 
 
 def open_count(target: str, context: SinkContext) -> Sink:
     """Open a `CountSink`: the entry point for `--sink example-count=FILE`."""
-    return CountSink(target)
+    return CountSink(target, context.overwrite)

@@ -271,6 +271,21 @@ def test_unidirectional(made, tmp_path):
     assert "unidirectional" in wrong.output
 
 
+def test_evaluate_of_a_kind_without_an_entry(made, write_archive, tmp_path, monkeypatch):
+    """A kind of network that `evaluate` does not know by name is measured as a stream, and has no window."""
+    monkeypatch.setattr(archive, "KINDS", (*archive.KINDS, "gru"))
+    path = write_archive(tmp_path / "other.pt", kind="gru")
+    data = ("--trust", "--data", str(made[0] / "recordings"), "--part", "cmu-02")
+    words = ["evaluate", "--model", str(path), *data]
+    said = CliRunner().invoke(cli, words, catch_exceptions=False)
+    assert said.exit_code == 0, said.output
+    assert "online, stream (2 future)" in said.stdout
+    for flags in (["--past", "3"], ["--online", "window"], ["--heat-map", str(tmp_path / "map.png")]):
+        wrong = CliRunner().invoke(cli, [*words, *flags])
+        assert wrong.exit_code == 2
+        assert "is a network of the kind 'gru'" in wrong.output
+
+
 def test_synthesize_options(tmp_path):
     out = tmp_path / "out"
     edgepose(

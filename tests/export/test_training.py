@@ -278,6 +278,19 @@ def test_own_recordings_without_a_validation_part(files, tmp_path):
     assert [[path.stem for path in part] for part in (train, validation)] == [["a"], ["03_01"]]
 
 
+def test_recordings_that_are_all_held_out(tmp_path):
+    """The message says that names decide, and to which parts the recordings belong."""
+    with pytest.raises(EdgeposeError, match="no recordings; make them with edgepose synthesize"):
+        training_paths(tmp_path)
+    for name in ("07_01", "08_02", "03_01"):
+        (tmp_path / f"{name}.npz").touch()
+    message = (
+        r"no recording of the part 'train': the names .*splits\.toml.* validation \(1\), cmu-walk-run \(2\)"
+    )
+    with pytest.raises(EdgeposeError, match=message):
+        training_paths(tmp_path)
+
+
 def changed(files, path, **arrays):
     with np.load(files / "01_01.npz") as data:
         np.savez(path, **({name: data[name] for name in data.files} | arrays))

@@ -23,6 +23,7 @@ NO_WINDOW = {
     "feed-forward": "sees a fixed number of frames",
     "wavenet": "sees a fixed number of frames",
 }
+"""Why networks of a kind have no window, for messages; only "birnn" has one."""
 
 HEAT_MAP_FRAMES = [0, 1, 5, 10, 20, 50, 100, 200]
 """Past and future frames of DIP's figure 6."""
@@ -168,7 +169,7 @@ def _model(
     if about["kind"] != "birnn":
         if future or past or set(modes) - {"stream", "offline"}:
             raise click.UsageError(
-                f"{name} {NO_WINDOW[about['kind']]} and has no window; use --online stream"
+                f"{name} {_no_window(about['kind'])} and has no window; use --online stream"
             )
     else:
         about["past"] = about["past"] if past is None else past
@@ -178,6 +179,10 @@ def _model(
     else:
         chosen = [mode for mode in modes_of(about) if not modes or mode.name in modes]
     return _Model(path.stem, about, module, chosen)
+
+
+def _no_window(kind: str) -> str:
+    return NO_WINDOW.get(kind, f"is a network of the kind {kind!r}")
 
 
 def _row_name(models: list[_Model], model: _Model, mode: Mode) -> str:
@@ -228,7 +233,7 @@ def _heat_map(
 ) -> None:
     if model.metadata["kind"] != "birnn":
         raise click.UsageError(
-            f"{model.name} {NO_WINDOW[model.metadata['kind']]}; a heat map needs a bidirectional model"
+            f"{model.name} {_no_window(model.metadata['kind'])}; a heat map needs a bidirectional model"
         )
     from edgepose_export.cli.progress import labelled
     from edgepose_export.evaluation import plots

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from itertools import accumulate
 from pathlib import Path
@@ -19,7 +20,7 @@ from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import PARENTS, forward_kinematics
 from edgepose.utils.safe_npz import BROKEN, open_npz
 from edgepose_export.synthesis.virtual_imus import INERTIAL_FROM_BODY
-from edgepose_export.training.splits import part_of
+from edgepose_export.training.splits import SPLITS, part_of
 
 SEATED = ".seated"
 """End of the names of takes with legs made by `edgepose_export.synthesis.sitting`."""
@@ -95,15 +96,17 @@ def take_paths(folder: Path, part: str) -> list[Path]:
     Raises:
         EdgeposeError: there is no such file.
     """
-    paths = sorted(
-        (p for p in folder.rglob("*.npz") if part in ("all", part_of(p.stem))), key=lambda p: p.stem
+    takes = sorted(folder.rglob("*.npz"), key=lambda path: path.stem)
+    paths = [path for path in takes if part in ("all", part_of(path.stem))]
+    if paths:
+        return paths
+    if not takes:
+        raise EdgeposeError(f"{folder}: no recordings; make them with edgepose synthesize --out {folder}")
+    counts = Counter(part_of(path.stem) for path in takes)
+    raise EdgeposeError(
+        f"{folder}: no recording of the part {part!r}: the names of recordings decide their part (see "
+        f"{SPLITS}), and those here belong to {', '.join(f'{name} ({counts[name]})' for name in counts)}"
     )
-    if not paths:
-        raise EdgeposeError(
-            f"{folder}: no {'recordings' if part == 'all' else f'recording of the part {part!r}'}; "
-            f"make them with edgepose synthesize --out {folder}"
-        )
-    return paths
 
 
 def training_paths(folder: Path) -> tuple[list[Path], list[Path]]:

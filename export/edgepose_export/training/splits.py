@@ -11,7 +11,10 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-_RULES = tomllib.loads((Path(__file__).parent / "splits.toml").read_text(encoding="utf-8"))
+SPLITS = Path(__file__).parent / "splits.toml"
+"""The rules of the split."""
+
+_RULES = tomllib.loads(SPLITS.read_text(encoding="utf-8"))
 
 HELD_OUT = tuple(_RULES["held-out"])
 """Parts of the split that are never used in training."""
