@@ -366,12 +366,13 @@ def test_kill_at_ten_instants(name, wearer, files, tmp_path):
     ending, words = COMMANDS[name]
     out = tmp_path / f"take{ending}"
     command = [sys.executable, "-m", "edgepose", *map(str, words(wearer, files, out)), "--overwrite"]
-    for _ in range(2):  # the first one may wait for libraries to be read from the disk
+    took_s = 1e3
+    for _ in range(3):  # the shortest: other programs may have delayed one
         start_s = time.monotonic()
         processes.run(command, check=True, capture_output=True)
-        took_s = time.monotonic() - start_s
+        took_s = min(took_s, time.monotonic() - start_s)
     new = 0
-    for instant in np.linspace(0.1, 1.1, 10):
+    for instant in np.linspace(0.05, 1.1, 10):
         out.write_bytes(OLD)
         process = processes.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         time.sleep(instant * took_s)
