@@ -5,11 +5,13 @@ if [ "$(cat .venv/installed 2>/dev/null)" != "$stamp" ]; then
   python=${PYTHON:-python3}
   echo "Creating a virtual environment in .venv with edgepose and its dependencies."
   constraints=constraints.txt site_packages=
-  # The PyTorch of this Python, if pyproject.toml allows its version.
+  # The PyTorch of this Python, if pyproject.toml allows its version. An environment that is made inside of another
+  # one does not see the packages of that.
   found=$("$python" -c '
 import platform
+import sys
 from importlib.metadata import version
-found = version("torch")
+found = version("torch") if sys.prefix == sys.base_prefix else ""
 newest = (2, 9) if platform.machine() == "aarch64" else (2, 13)
 print(found if (2, 4) <= tuple(map(int, found.split(".")[:2])) <= newest else "")' 2>/dev/null) || found=
   if [ "$found" ]; then
