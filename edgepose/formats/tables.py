@@ -20,12 +20,10 @@ from numpy.typing import NDArray
 
 from edgepose.errors import FileFormatError
 from edgepose.formats.ledger import Ledger
+from edgepose.utils.counted_lines import MAX_LINE, CountedLines
 
 HEAD_LINES = 50
 """Lines in which the names of the columns have to come."""
-
-MAX_LINE = 4096
-"""Longest line, characters."""
 
 SEPARATORS = "\t;,|"
 
@@ -98,23 +96,16 @@ def open_table(path: Path, fits: Callable[[Sequence[str]], bool], wanted: str) -
         raise FileFormatError(f"{path}: starts with {first[:40]!r}, not with {wanted!r}")
 
 
-class _Lines:
-    """Lines of a text file, counted; the csv module joins those of a quoted line break."""
+class _Lines(CountedLines):
+    """Lines of a table; the csv module joins those of a quoted line break."""
 
     def __init__(self, path: Path, file: TextIO) -> None:
-        self.number, self.ended = 0, True
-        self._path, self._file = path, file
-
-    def __iter__(self) -> _Lines:
-        return self
+        super().__init__(file)
+        self._path = path
 
     def __next__(self) -> str:
-        line = self._file.readline(MAX_LINE)
-        if not line:
-            raise StopIteration
-        self.number += 1
-        self.ended = line.endswith(("\n", "\r"))
-        if len(line) == MAX_LINE:
+        line = super().__next__()
+        if self.too_long:
             raise FileFormatError(
                 f"{self._path}: row {self.number} is longer than {MAX_LINE} characters; is it a table?"
             )

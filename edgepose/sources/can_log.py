@@ -16,13 +16,13 @@ import can
 
 from edgepose.errors import FileFormatError
 from edgepose.formats.ledger import Ledger
+from edgepose.utils.counted_lines import CountedLines
 
 # python-can warns about every vendor library and every clock that is not installed.
 logging.getLogger("can").setLevel(logging.CRITICAL)
 
 _LATEST_S = 1e11  # 5000 years of Unix time
 _BLF_OBJECT, _BLF_HEAD = b"LOBJ", struct.Struct("<4sHHII")
-_MAX_LINE = 4096
 
 _SCREEN = re.compile(
     r"\s*(?:\((?P<time>\d+\.\d+)\))?\s+(?P<bus>\w+)\s+(?P<id>[0-9A-Fa-f]{3,8})\s+\[(?P<size>\d+)\]"
@@ -68,25 +68,16 @@ def _check_table(path: Path) -> None:
         raise ValueError("it has no table of messages")
 
 
-class _Lines:
-    """Lines of a text log, counted, none longer than a frame's can be."""
+class _Lines(CountedLines):
+    """Lines of a text log; of one that is too long, its last piece."""
 
     read = write = None  # python-can takes an object with these for an open file
 
-    def __init__(self, file: TextIO) -> None:
-        self.number = 0
-        self._file = file
-
-    def __iter__(self) -> _Lines:
-        return self
-
     def __next__(self) -> str:
-        line = self._file.readline(_MAX_LINE)
-        if not line:
-            raise StopIteration
-        self.number += 1
-        while len(line) == _MAX_LINE and not line.endswith("\n"):
-            line = self._file.readline(_MAX_LINE)  # the rest of a line of no log
+        line = super().__next__()
+        with contextlib.suppress(StopIteration):  # the file may end with the last piece
+            while self.too_long and not self.ended:
+                line = super().__next__()
         return line
 
     def close(self) -> None:

@@ -181,20 +181,24 @@ def test_a_protocol_of_another_package_that_cannot_be_used_costs_only_itself(ins
         assert why in line
 
 
+def printed_by(script: str) -> str:
+    """Output of a new Python that sees the packages of this one."""
+    return subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+    ).stdout
+
+
 def test_protocols_of_other_packages_are_loaded_only_when_asked_for(install):
     install(["boots = boots_protocol:PROTOCOL"])
     script = (
         "import sys; from firmware_protocols.registry import PROTOCOLS; PROTOCOLS['native']\n"
         "print('boots_protocol' in sys.modules, PROTOCOLS['boots'].description)"
     )
-    result = subprocess.run(
-        [sys.executable, "-c", script],
-        capture_output=True,
-        text=True,
-        check=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-    )
-    assert result.stdout == "False sensors in boots\n"
+    assert printed_by(script) == "False sensors in boots\n"
 
 
 def test_the_help_names_formats_of_other_packages_without_importing_them(install):
@@ -204,11 +208,4 @@ def test_the_help_names_formats_of_other_packages_without_importing_them(install
         "text = CliRunner().invoke(cli, ['check', '--help']).output\n"
         "print('boots' in text, 'boots_protocol' in sys.modules)"
     )
-    result = subprocess.run(
-        [sys.executable, "-c", script],
-        capture_output=True,
-        text=True,
-        check=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-    )
-    assert result.stdout == "True False\n"
+    assert printed_by(script) == "True False\n"

@@ -15,12 +15,12 @@ from edgepose.errors import FileFormatError
 from edgepose.formats.recordings.base import ReadOptions, RecordingFormat, SampleTable, iter_samples, shorten
 from edgepose.imu import ImuSample, Recording
 from edgepose.placements import PLACEMENTS
+from edgepose.utils.counted_lines import MAX_LINE, CountedLines
 
 COLUMNS = "time_s,sensor,qw,qx,qy,qz,ax,ay,az,gx,gy,gz,mx,my,mz"
 """Header of the file."""
 
 _WIDTH = COLUMNS.count(",") + 1
-_MAX_LINE = 4096
 
 
 def metadata_lines(metadata: Mapping[str, str]) -> str:
@@ -71,40 +71,25 @@ def read_csv(path: Path, options: ReadOptions) -> Recording:
     return Recording(sensors, metadata, table.damage() or cut)
 
 
-class _Lines:
-    """Counted lines of a text file, with a limit on their length.
+class _Lines(CountedLines):
+    """Lines of a recording.
 
     Attributes:
-        number: of the current line, from 1.
-        line: the current line.
         unlimited: yield a line that is too long in pieces instead of raising.
     """
 
     def __init__(self, path: Path, file: TextIO) -> None:
-        self._path, self._file = path, file
-        self.number = 0
-        self.line = "\n"
+        super().__init__(file)
+        self._path = path
         self.unlimited = False
 
-    def __iter__(self) -> _Lines:
-        return self
-
     def __next__(self) -> str:
-        line = self._file.readline(_MAX_LINE)
-        if not line:
-            raise StopIteration
-        self.number += not self.cut
-        self.line = line
-        if len(self.line) == _MAX_LINE and not self.unlimited:
+        line = super().__next__()
+        if self.too_long and not self.unlimited:
             raise FileFormatError(
-                f"{self._path}: row {self.number} is longer than {_MAX_LINE} characters; is it a CSV file?"
+                f"{self._path}: row {self.number} is longer than {MAX_LINE} characters; is it a CSV file?"
             )
-        return self.line
-
-    @property
-    def cut(self) -> bool:
-        """Whether the current line is the last one and has no line end."""
-        return not self.line.endswith(("\n", "\r"))
+        return line
 
 
 def _read_metadata(path: Path, lines: _Lines) -> dict[str, str]:
@@ -134,13 +119,13 @@ def _read_rows(
             if cells is None:
                 return table, None
             if cells:
-                sensor, numbers = _parse_row(cells, lines.cut, names)
+                sensor, numbers = _parse_row(cells, not lines.ended, names)
                 table.add(sensor, lines.number, numbers, cells.count(""))
         except csv.Error as error:
             table.reject(f"row {lines.number}: {error}")
         except ValueError as error:
             # The pieces of a line that is too long have no line end either.
-            if not lines.cut or len(lines.line) == _MAX_LINE:
+            if lines.ended or lines.too_long:
                 table.reject(f"row {lines.number} {error}")
                 continue
             return table, (

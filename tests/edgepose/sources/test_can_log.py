@@ -126,6 +126,7 @@ def test_a_clock_that_is_set_back(tmp_path, back_s, form):
 BAD = {
     "half a line": "(1700000001.5000) can0 4(1700000001.500200) can0 440#1400FEFFFEFF0000\n",
     "zeros": "\0" * 10_000 + "\n",
+    "two pieces": "\0" * 8191 + "\n",
     "no number": "(17000000xx.500000) can0 400#00\n",
     "not UTF-8": "(\ufffd) \ufffd\n",
     "empty data": "(1700000001.5) can0\n",
@@ -171,3 +172,11 @@ def test_what_is_not_a_log(tmp_path, text, says):
     path.write_text(text)
     with pytest.raises(EdgeposeError, match=says):
         read(path)
+
+
+def test_zeros_at_the_end_of_a_log(tmp_path):
+    path = tmp_path / "a.log"
+    path.write_text("".join(lines_of(messages())) + "\0" * 8192)
+    times, damage = read(path)
+    check_whole(times)
+    assert damage == f"{path}: 1 bad lines left out, the first: line 5401 is not a frame"
