@@ -82,11 +82,14 @@ class OpenWearer:
         with prefix_errors(self._config.name):
             self._sinks = open_outputs(stack, self._config.outputs, rate, stopped)
 
-    def pipeline(self, rate: float, several: bool, on_pose: Callable[[RunSummary], None]) -> WearerPipeline:
+    def pipeline(
+        self, rate: float, future: int, several: bool, on_pose: Callable[[RunSummary], None]
+    ) -> WearerPipeline:
         """Build the pipeline from samples to outputs.
 
         Args:
             rate: frames per second.
+            future: the network's look-ahead, frames.
             several: align the ticks of live wearers, so that their poses can be compared and batched.
             on_pose: called after each pose.
         """
@@ -106,6 +109,7 @@ class OpenWearer:
             on_pose,
             MisfitDetector(self._calibration, self._other_devices),
             self.notify,
+            future / rate if source.live else None,
         )
 
     def _other_devices(self) -> str | None:
@@ -123,6 +127,8 @@ class OpenWearer:
             f"packets  {counts.packets} good, {counts.lost} lost, {counts.bad} bad; "
             f"{pipeline.clock.dropped} samples too late or duplicate"
         )
+        if pipeline.skipped:
+            self.notify(f"skipped  {pipeline.skipped} poses at live outputs: they came too late")
         if pipeline.clock.restarts:
             self.notify(
                 f"clock    restarted {pipeline.clock.restarts} times, "

@@ -238,9 +238,12 @@ class FrameSynchronizer:
             if tick_s > end_s:
                 break
             for sensor in self._sensors:
-                if sensor.newest_s < tick_s and now_s < tick_s + (
-                    sensor.wait_s if now_s - sensor.newest_s <= STALE_S else 0.0
-                ):
+                if sensor.newest_s >= tick_s:
+                    continue
+                if now_s - sensor.newest_s <= STALE_S:
+                    if now_s < tick_s + sensor.wait_s:
+                        return result
+                elif max(now_s, self._newest_s) < tick_s:
                     return result
             result.append(self._frame(tick_s, now_s))
             self._index += 1

@@ -42,7 +42,7 @@ def open_wearers(
 def run_wearers(
     opened: Sequence[OpenWearer],
     engine: Engine | MultiWearerEngine,
-    rate_hz: float,
+    network: Network,
     live: bool,
     stopped: Callable[[], bool],
     on_progress: Callable[[RunSummary], None],
@@ -52,7 +52,7 @@ def run_wearers(
     Args:
         opened: wearers with open outputs.
         engine: for as many wearers.
-        rate_hz: frames per second.
+        network: the wearers' network.
         live: whether samples arrive at their own pace.
         stopped: whether the run is to end.
         on_progress: called with the counts so far: after each pose of a single wearer, or after each round of
@@ -60,7 +60,7 @@ def run_wearers(
     """
     several = isinstance(engine, MultiWearerEngine)
     on_pose = _ignore if several else on_progress
-    pipelines = [wearer.pipeline(rate_hz, several, on_pose) for wearer in opened]
+    pipelines = [wearer.pipeline(network.rate_hz, network.future, several, on_pose) for wearer in opened]
     # All objects alive now stay alive; a full collection that visits them would delay a frame by 0.1 s.
     gc.collect()
     gc.freeze()

@@ -19,6 +19,7 @@ from edgepose.inference.engine import EngineInput, EngineOutput
 from edgepose.pipeline.dropout import extrapolate_dropouts
 from edgepose.pipeline.dropout_monitor import DropoutMonitor
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
+from edgepose.pipeline.pose_writer import PoseWriter
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseFrame
 from edgepose.sinks.base import Sink
@@ -90,6 +91,7 @@ class WearerPipeline:
         on_pose: Callable[[RunSummary], None] = lambda summary: None,
         misfits: MisfitDetector | None = None,
         warn: Callable[[str], None] = lambda text: None,
+        look_ahead_s: float | None = None,
     ) -> None:
         """Join the stages.
 
@@ -101,21 +103,27 @@ class WearerPipeline:
             notify: called with one message per sensor that drops out or comes back.
             on_pose: called after each pose has been written.
             misfits: checks whether the calibration fits the wearer.
-            warn: called with one message per finding of `misfits`.
+            warn: called with one message per finding of `misfits`, and about poses that live outputs skip.
+            look_ahead_s: time by which poses come later than their frames, seconds, if samples come at their
+                own pace; see `PoseWriter`.
         """
         self.summary, self.clock = RunSummary(), clock
         self.arrived = self._started = time.perf_counter()
         self._headings, self._sinks, self._orient, self._notify = headings, sinks, orient, notify
         self._on_pose, self._misfits, self._warn = on_pose, misfits, warn
+        self._writer = PoseWriter(sinks, look_ahead_s, warn)
         self._dropouts = DropoutMonitor()
+        self._source_s = 0.0  # time on the source's clock at 0 of the clock of `arrived`
         self._bones: NDArray[np.float64] | None = None  # those of the previous frame
 
     def process(self, batch: Batch) -> Iterator[EngineInput]:
         """Return the network inputs of the frames that are ready after a batch."""
         self.summary.backlog_s = batch.backlog_s
         self.arrived = time.perf_counter() - batch.backlog_s
+        arrival_s = batch.now_s + batch.ahead_s
+        self._source_s = arrival_s - self.arrived
         if batch.samples:
-            self.clock.push(self._orient(batch.samples), batch.now_s)
+            self.clock.push(self._orient(batch.samples), arrival_s)
         return self._engine_inputs(self.clock.frames(batch.now_s))
 
     def flush(self) -> Iterator[EngineInput]:
@@ -130,9 +138,8 @@ class WearerPipeline:
         summary = self.summary
         for output in outputs:
             frame: ImuFrame = output.frame
-            pose = pose_frame(output)
-            for sink in self._sinks:
-                sink.write(pose)
+            age_s = time.perf_counter() + self._source_s - frame.time_s
+            self._writer.write(pose_frame(output), age_s)
             summary.warming_up += output.warming_up
             if frame.held.any():
                 summary.held += 1
@@ -140,6 +147,11 @@ class WearerPipeline:
                     summary.held_by_sensor[i] += 1
             summary.sent(time.perf_counter() - arrived)
             self._on_pose(summary)
+
+    @property
+    def skipped(self) -> int:
+        """Number of poses that were too old for live outputs."""
+        return self._writer.skipped
 
     def end(self, error: EdgeposeError | None = None) -> None:
         """End the run; only the first error is kept."""

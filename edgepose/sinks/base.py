@@ -7,7 +7,7 @@ from collections.abc import Callable
 from importlib import import_module
 from importlib.metadata import entry_points
 from types import TracebackType
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 from edgepose.errors import ConfigError
 from edgepose.pose import PoseFrame
@@ -17,7 +17,13 @@ Self = TypeVar("Self", bound="Sink")
 
 
 class Sink(ABC):
-    """An output of poses, open from its construction until `close`; use it in a `with` statement."""
+    """An output of poses, open from its construction until `close`; use it in a `with` statement.
+
+    Attributes:
+        live: the receiver shows poses as they come, so that old ones are of no use; files keep all.
+    """
+
+    live: ClassVar[bool] = False
 
     def start(self) -> None:  # noqa: B027 - most outputs have nothing to do
         """Begin the run: from now on files may appear.

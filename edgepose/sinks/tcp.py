@@ -41,6 +41,8 @@ class TcpSink(Sink):
     a partial one.
     """
 
+    live = True
+
     def __init__(self, host: str, port: int) -> None:
         """Listen on an address of this machine.
 

@@ -102,6 +102,7 @@ class DatagramSink(Sink):
     A run does not depend on a listener: datagrams that could not be sent are counted in `unsent`.
     """
 
+    live = True
     NAME = "udp"
 
     def __init__(self, host: str, port: int) -> None:

@@ -25,6 +25,8 @@ def check_viewer() -> None:
 class ViewSink(Sink):
     """Starts `edgepose view` and sends it each pose as a datagram; the viewer shows the newest one."""
 
+    live = True
+
     def __init__(self, height_m: float) -> None:
         """Start the viewer, which prints the address of its page on standard error.
 

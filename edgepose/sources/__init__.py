@@ -31,12 +31,15 @@ class Batch(NamedTuple):
             files.
         backlog_s: longest time that the batch may have waited before it was read, seconds; 0 for files unless
             they are replayed at their own pace.
+        ahead_s: time by which the newest samples came after `now_s`, seconds: another line may hold older
+            ones that have not been read.
     """
 
     now_s: float
     samples: list[ImuSample]
     raw: Sequence[tuple[float, Any]] = ()
     backlog_s: float = 0.0
+    ahead_s: float = 0.0
 
 
 Batches = Generator[Batch, None, None]

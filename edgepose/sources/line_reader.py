@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Sequence
+from math import inf
 from queue import SimpleQueue
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from edgepose.errors import DeviceError, EdgeposeError
 from edgepose.sources.clock_sync import HostClocks
@@ -21,6 +22,9 @@ BACKLOG_S = 0.5
 
 REOPEN_S = 0.5
 """Time between two attempts to open a line that has disappeared, seconds."""
+
+FULL_READS = 32
+"""Reads in a row that may leave data on a line; no system buffers more, so a longer series is a flood."""
 
 _SETTLE_S = 0.1
 """Shortest time spent discarding: data that the system has buffered comes in several pieces."""
@@ -71,6 +75,23 @@ class LineSpec(NamedTuple):
     check: tuple[str, str]
 
 
+class Arrival(NamedTuple):
+    """Data that came over a line, or the news that none did.
+
+    Attributes:
+        line: the line.
+        time_s: time at which it was read, on the source's clock, seconds.
+        data: bytes or messages, empty if nothing came; or the error that ended the line's thread.
+        read_s: time up to which everything that came over the line has been read, seconds: `inf` while it is
+            disconnected, `-inf` if more is waiting.
+    """
+
+    line: LineReader
+    time_s: float
+    data: Any
+    read_s: float
+
+
 class LineReader:
     """Reads one line, and reopens it after a disconnect.
 
@@ -92,7 +113,7 @@ class LineReader:
         spec: LineSpec,
         transport: Transport,
         placement_owner: dict[int, str],
-        queue: SimpleQueue,
+        queue: SimpleQueue[Arrival],
         now: Callable[[], float],
         blocking: bool,
     ) -> None:
@@ -102,7 +123,7 @@ class LineReader:
             spec: the line.
             transport: the open line, closed by this reader.
             placement_owner: see `LineDecoder`.
-            queue: gets (reader, arrival time, data) from the thread, or the error that ended it as the data.
+            queue: gets an `Arrival` from the thread after each read.
             now: the source's clock, seconds.
             blocking: see `edgepose.sources.open_source`.
         """
@@ -117,6 +138,7 @@ class LineReader:
         self._now = now
         self._blocking = blocking
         self._poll: Callable[[], tuple[Chunk, bool]] | None = None  # None while the thread reads
+        self._full_reads = 0  # in a row
         self._stop = threading.Event()
         self._thread = self._thread_from(self._drain)
 
@@ -131,17 +153,23 @@ class LineReader:
         """Start the thread that empties the line and then reads it."""
         self._thread.start()
 
-    def poll(self) -> tuple[Chunk, bool]:
-        """Return the data waiting on the line and whether more may follow; nothing while the thread reads."""
+    def poll(self) -> Arrival | None:
+        """Return the data waiting on the line; None while the thread reads."""
         if self._poll is None:
-            return b"", False
+            return None
         try:
-            return self._poll()
+            chunk, more = self._poll()
         except LineDisconnectedError:
             self._poll = None
             self._thread = self._thread_from(self._reopen)
             self._thread.start()
-            return b"", False
+            return None
+        return self._arrival(chunk, more)
+
+    def _arrival(self, chunk: Chunk, more: bool) -> Arrival:
+        self._full_reads = self._full_reads + 1 if more else 0
+        now_s = self._now()
+        return Arrival(self, now_s, chunk, -inf if 0 < self._full_reads <= FULL_READS else now_s)
 
     def _run(self, first: Callable[[], None]) -> None:
         try:
@@ -152,13 +180,12 @@ class LineReader:
                     self._poll = self.transport.waiting
                     return
                 try:
-                    chunk, _ = self.transport.read()
-                    if chunk:
-                        self._queue.put((self, self._now(), chunk))
+                    chunk, more = self.transport.read()
+                    self._queue.put(self._arrival(chunk, more))
                 except LineDisconnectedError:
                     self._reopen()
         except BaseException as error:  # raised again in the thread that iterates over the source
-            self._queue.put((self, self._now(), _reading_error(self.spec, error)))
+            self._queue.put(Arrival(self, self._now(), _reading_error(self.spec, error), -inf))
 
     def _drain(self) -> None:
         # Data buffered before the line was opened is of unknown age, and full buffers have lost parts of it.
@@ -175,6 +202,7 @@ class LineReader:
         assert self.transport is not None
         self.transport.close()
         self.transport = None
+        self._queue.put(Arrival(self, disconnected_s, b"", inf))
         _log.warning("%s: disconnected; the run continues and waits for it", self.spec.name)
         while not self._stop.wait(REOPEN_S):
             try:

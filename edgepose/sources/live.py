@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import cache
 from math import inf
@@ -17,15 +17,12 @@ from edgepose.imu import ImuSample
 from edgepose.sources import POLL_S, Batch, Batches, Device, SourceCounters, sum_counters
 from edgepose.sources.clock_sync import DeviceClock
 from edgepose.sources.line_checks import check_start, warn_about_clock_resets
-from edgepose.sources.line_reader import LineReader, LineSpec
+from edgepose.sources.line_reader import Arrival, LineReader, LineSpec
 
 _log = logging.getLogger(__name__)
 
-FULL_POLLS = 32
-"""Polls in a row that may leave data on a line; no system buffers more, so a longer series is a flood."""
-
-Arrival = tuple[LineReader, float, Any]
-"""A line, the time at which data came over it, and the data: a chunk, or the error that ended its thread."""
+UNREAD_S = 1.0
+"""Longest time for which a line that reports nothing delays the frames, seconds: its driver may be stuck."""
 
 
 class _Arrivals(NamedTuple):
@@ -34,12 +31,38 @@ class _Arrivals(NamedTuple):
     Attributes:
         arrivals: the data, in order of arrival.
         since_s: the earliest time at which data may have come that was only seen now.
-        emptied: no more data is known to be waiting.
     """
 
     arrivals: list[Arrival]
     since_s: float
-    emptied: bool
+
+
+class _ReadTime:
+    """Time up to which all lines have been read.
+
+    On a busy machine a thread may get no turn to read its line, although data is waiting there. Whether a
+    sample is missing is therefore judged by what the lines report, not by the time that has passed.
+    """
+
+    def __init__(self, lines: Sequence[LineReader], now_s: float) -> None:
+        """Wait for no line before its first report; the present is now_s on the source's clock, seconds."""
+        self._read_s = dict.fromkeys(lines, inf)
+        self._quiet_s = dict.fromkeys(lines, 0.0)  # without a report although this thread had its turns
+        self._called_s = self._result = now_s
+
+    def update(self, arrivals: Iterable[Arrival], now_s: float) -> float:
+        """Return the time up to which everything that came has been read, seconds; it never goes back."""
+        passed_s = min(now_s - self._called_s, POLL_S)
+        self._called_s = now_s
+        for line in self._quiet_s:
+            self._quiet_s[line] += passed_s
+        for line, _, _, read_s in arrivals:
+            self._quiet_s[line] = 0.0
+            if read_s > -inf:
+                self._read_s[line] = read_s
+        lines = [line for line, quiet_s in self._quiet_s.items() if quiet_s <= UNREAD_S]
+        self._result = max(self._result, min([now_s, *(self._read_s[line] for line in lines)]))
+        return self._result
 
 
 class LiveSource:
@@ -62,7 +85,7 @@ class LiveSource:
         self._lenient = lenient
         self._specs = specs
         self._lines: list[LineReader] = []
-        self._queue: SimpleQueue = SimpleQueue()
+        self._queue: SimpleQueue[Arrival] = SimpleQueue()
         self._open = ExitStack()
 
     @property
@@ -123,17 +146,16 @@ class LiveSource:
             DeviceError: nothing usable comes at the start, or a line cannot be read.
         """
         start_s = checked_s = now_s = _now()
+        read = _ReadTime(self._lines, start_s)
         for line in self._lines:
             line.start()
         try:
-            arrivals_of_batches = self._wait_for_data() if self._blocking else self._poll_lines()
-            for arrivals, since_s, emptied in arrivals_of_batches:
+            for arrivals, since_s in self._wait_for_data() if self._blocking else self._poll_lines():
                 samples, raw, error = _decode_arrivals(arrivals)
-                # On a machine that is behind, what has not been taken from queue or line is not missing yet.
-                if emptied:
-                    now_s = max(now_s, *(arrival_s for _, arrival_s, _ in arrivals)) if arrivals else _now()
+                arrival_s = max(now_s, *(arrival.time_s for arrival in arrivals)) if arrivals else _now()
+                now_s = read.update(arrivals, arrival_s)
                 if raw or error is None:
-                    yield Batch(now_s, samples, raw, _now() - min(now_s, since_s))
+                    yield Batch(now_s, samples, raw, _now() - min(arrival_s, since_s), arrival_s - now_s)
                 if error is not None:
                     raise error
                 for line in self._lines:
@@ -153,21 +175,16 @@ class LiveSource:
                 arrivals = [self._queue.get(timeout=POLL_S)]
             except Empty:
                 arrivals = []
-            yield _Arrivals(arrivals, inf, True)
+            yield _Arrivals(arrivals, inf)
 
     def _poll_lines(self) -> Iterator[_Arrivals]:
         """Yield everything that has come since the last batch, without waiting."""
-        since_s, full = _now(), 0
+        since_s = _now()
         while True:
-            poll_s, left = _now(), False
-            arrivals: list[Arrival] = [self._queue.get() for _ in range(self._queue.qsize())]
-            for line in self._lines:
-                chunk, more = line.poll()
-                left |= more
-                if chunk:
-                    arrivals.append((line, _now(), chunk))
-            full = full + 1 if left else 0
-            yield _Arrivals(arrivals, since_s, not left or full > FULL_POLLS)
+            poll_s = _now()
+            arrivals = [self._queue.get() for _ in range(self._queue.qsize())]
+            polled = [line.poll() for line in self._lines]
+            yield _Arrivals(arrivals + [arrival for arrival in polled if arrival is not None], since_s)
             since_s = poll_s
 
     def _check_start(self, line: LineReader, now_s: float, start_s: float) -> None:
@@ -183,14 +200,16 @@ class LiveSource:
 
 
 def _decode_arrivals(
-    arrivals: list[Arrival],
+    arrivals: Iterable[Arrival],
 ) -> tuple[list[ImuSample], list[tuple[float, Any]], BaseException | None]:
     """Return the samples and the raw data of arrivals up to the first error, and that error."""
     samples: list[ImuSample] = []
     raw: list[tuple[float, Any]] = []
-    for line, arrival_s, chunk in arrivals:
+    for line, arrival_s, chunk, _ in arrivals:
         if isinstance(chunk, BaseException):
             return samples, raw, chunk
+        if not chunk:
+            continue
         raw += [(arrival_s, piece) for piece in ([chunk] if isinstance(chunk, bytes) else chunk)]
         try:
             samples += line.decoder.feed(chunk, arrival_s)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import time
 from collections.abc import Callable, Sequence
 from itertools import cycle
 
@@ -23,6 +24,9 @@ _ANSWER_S = 0.02
 
 _FULL = 4095
 """Bytes that the system buffers at a time; if it returns this many, more may follow a moment later."""
+
+_EMPTY_S = 0.002
+"""Wait for the first byte that shows that the system's buffers were empty, seconds."""
 
 _MOST = 1 << 16
 """Most bytes read in one poll, so that a line that never pauses does not block the others."""
@@ -53,19 +57,24 @@ class SerialPort:
         if requests:
             longest = max(len(request) + answer for request, answer in requests)
             self._serial.timeout = _ANSWER_S + longest * 10 / baud
+        self._was_full = False
 
     def read(self) -> tuple[bytes, bool]:
         """See `Transport.read`."""
         data = b""
         try:
-            if self._requests is None:
-                data = self._serial.read(1)
-            else:
+            if self._requests is not None:
                 request, answer = next(self._requests)
                 self._serial.write(request)
                 data = self._serial.read(answer)
+                return data + self._serial.read(self._serial.in_waiting), False
+            start_s = time.monotonic()
+            data = self._serial.read(1)
+            if time.monotonic() - start_s > _EMPTY_S:
+                self._was_full = False
             data += self._serial.read(self._serial.in_waiting)
-            return data, bool(data) and self._requests is None and self._serial.in_waiting > 0
+            self._was_full |= len(data) >= _FULL
+            return data, bool(data) and (self._was_full or self._serial.in_waiting > 0)
         except (OSError, _TerminalError):
             if data:
                 return data, False  # the next read raises

@@ -161,9 +161,10 @@ def _listen(
         return State(0.0 if start_s is None else now_s - start_s, source.counters, sensors)
 
     try:
-        for now_s, samples, *_ in source:
+        for batch in source:
+            now_s = batch.now_s
             start_s = now_s if start_s is None else start_s
-            health.add(samples, now_s if live else math.nan)
+            health.add(batch.samples, now_s + batch.ahead_s if live else math.nan)
             if time.monotonic() - shown_s >= REDRAW_S:
                 watch(state)
                 shown_s = time.monotonic()

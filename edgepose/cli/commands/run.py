@@ -64,7 +64,7 @@ def run(wearers: list[WearerConfig], settings: NetworkConfig) -> None:
         for wearer in opened:
             wearer.open_outputs(stack, network.rate_hz, lambda: stop.asked)
         say(_headline(network, precision, len(wearers), keys.listening))
-        pipelines = run_wearers(opened, engine, network.rate_hz, live, lambda: stop.asked, _progress())
+        pipelines = run_wearers(opened, engine, network, live, lambda: stop.asked, _progress())
     end_status()
     report_wearers(wearers, opened, pipelines, network)
 

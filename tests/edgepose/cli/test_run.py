@@ -354,7 +354,7 @@ def broken_archive(tmp_path):
 
 
 class Rig(Sender):
-    """Six devices on a line; each sends its row of a recording about 100 times a second, with its own count.
+    """Six devices on a line; each sends its row of a recording `rate` times a second, with its own count.
 
     Attributes:
         silent: sensors that are switched off.
@@ -362,9 +362,11 @@ class Rig(Sender):
         noise: sent once, between two packets.
     """
 
-    def __init__(self, recording: Path, wire: Callable[[Packet], bytes] = encode) -> None:
+    def __init__(
+        self, recording: Path, wire: Callable[[Packet], bytes] = encode, rate: float = 100.0
+    ) -> None:
         (self.line,) = ports = (Port(),)
-        super().__init__(*ports)
+        super().__init__(*ports, rate=rate)
         self._wire = wire
         self.port = self.line.name
         self.silent: set[int] = set()
@@ -452,6 +454,33 @@ def test_live_with_damage_on_the_line_a_sensor_that_pauses_and_ctrl_c(wearer, tm
     assert re.search(r"^latency  .* ms median, .* from last packet to pose sent$", errors, re.MULTILINE)
     sent = [json.loads(datagram)["frame"] for datagram in listener.datagrams]
     assert sent == frames.tolist()
+
+
+def test_a_machine_that_stands_still_for_two_seconds(wearer, tmp_path):
+    """No sample is lost or late, and the receiver does not see the backlog."""
+    file = tmp_path / "poses.csv"
+    with (
+        Listener() as listener,
+        Rig(wearer.recording, rate=25.0) as rig,  # two seconds of it fit the buffer of a port
+        live(wearer, rig.port, listener, file) as run,
+    ):
+        listener.wait_for("ok", 30)
+        run.send_signal(signal.SIGSTOP)
+        time.sleep(2.2)
+        run.send_signal(signal.SIGCONT)
+        listener.wait_for("ok", 30)
+        run.send_signal(signal.SIGINT)
+        code, errors = end(run)
+    assert code == 0, errors
+    assert "0 lost, 0 bad; 0 samples too late or duplicate" in errors, errors
+    frames, _, status, _ = whole(file)
+    sent = [json.loads(datagram)["frame"] for datagram in listener.datagrams]
+    skipped = sorted(set(frames.tolist()) - set(sent))
+    assert len(skipped) >= 60  # of 132: those of the last second are sent
+    assert {status[i] for i in skipped} == {"ok"}
+    late = r"^poses are \d\.\d s late; live outputs skip those older than 1 s$"
+    assert re.search(late, errors, re.MULTILINE)
+    assert f"\nskipped  {len(skipped)} poses at live outputs: they came too late\n" in errors
 
 
 def test_live_from_the_simulator_until_sigterm(wearer, tmp_path):

@@ -163,7 +163,7 @@ def test_what_waits_behind_a_full_buffer_is_not_said_to_be_delivered(port):
 
 
 def test_a_line_that_is_never_empty_does_not_stop_the_time(port, monkeypatch):
-    monkeypatch.setattr("edgepose.sources.live.FULL_POLLS", 3)
+    monkeypatch.setattr("edgepose.sources.line_reader.FULL_READS", 3)
     name = port.name
     os.set_blocking(port.master, False)
 
