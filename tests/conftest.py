@@ -1,6 +1,8 @@
 """Small networks and made-up sensor data that several test files need."""
 
+import os
 import signal
+import sys
 from functools import cache
 
 import numpy as np
@@ -14,6 +16,11 @@ from edgepose_export.networks.shape import NetworkShape
 # Tests send Ctrl-C to programs that they start; a shell that starts the tests in the background leaves it
 # ignored, and what they start inherits that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Hundreds of commands import edgepose. Its modules are compiled once, even where the environment forbids to
+# keep that; workers of pytest-xdist and everything that tests start inherit it.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 # The tests' networks are tiny: a second thread would only wait.
 torch.set_num_threads(1)

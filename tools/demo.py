@@ -14,7 +14,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -59,10 +59,12 @@ def edgepose(*words: object) -> list[str]:
 
 
 @contextmanager
-def simulator(recording: Path, protocol: str) -> Iterator[tuple[subprocess.Popen[str], list[str]]]:
+def simulator(
+    recording: Path, protocol: str, flags: Sequence[str] = ()
+) -> Iterator[tuple[subprocess.Popen[str], list[str]]]:
     """Start the simulated sensors, standing still; yield the process and the flags that name its lines."""
     words = [sys.executable, str(Path(__file__).parent / "simulate.py"), str(recording), "--stand"]
-    words += ["--protocol", protocol]
+    words += ["--protocol", protocol, *flags]
     process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     kind = "can" if PROTOCOLS[protocol].transport == "can" else "port"
     try:
