@@ -163,7 +163,8 @@ def _expand(source: Path, out: Path) -> Iterator[tuple[Path, Path]]:
     elif any(mark in str(source) for mark in "*?["):
         # A pattern that the shell has not expanded: it was quoted, or the shell is that of Windows.
         root = Path(source.anchor or ".")
-        found = sorted(root.glob(str(source.relative_to(source.anchor) if source.anchor else source)))
+        pattern = str(source.relative_to(source.anchor) if source.anchor else source)
+        found = sorted(path for path in root.glob(pattern) if not _is_hidden(path) or _is_hidden(source))
         if not found:
             raise EdgeposeError(f"{source}: no file matches this pattern")
         for path in found:
@@ -173,13 +174,13 @@ def _expand(source: Path, out: Path) -> Iterator[tuple[Path, Path]]:
 
 
 def _find_recordings(folder: Path, out: Path, endings: tuple[str, ...]) -> Iterator[Path]:
-    """Yield the recordings in a folder, except those in the output folder."""
+    """Yield the recordings in a folder, except hidden ones and those in the output folder."""
     if find_format(folder) is not None:
         yield folder
     else:
         check_no_part(folder)
     for path in folder.iterdir():
-        if find_whole(path) is not None:
+        if _is_hidden(path) or find_whole(path) is not None:
             continue
         if path.is_dir():
             if not path.is_symlink() and path.resolve() != out:
@@ -187,6 +188,11 @@ def _find_recordings(folder: Path, out: Path, endings: tuple[str, ...]) -> Itera
         # Reading a pipe could block forever.
         elif not path.is_fifo() and (path.suffix.lower() in endings or is_can_log(path)):
             yield path
+
+
+def _is_hidden(path: Path) -> bool:
+    """Return whether a file is a system's own, such as macOS's `._walk.csv` beside `walk.csv`."""
+    return path.name.startswith(".") or path.name.lower() == "thumbs.db"
 
 
 def convert(job: Job, options: Options = _DEFAULTS) -> Result:

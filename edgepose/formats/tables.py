@@ -2,6 +2,7 @@
 
 Columns are separated by tabs, semicolons, commas or bars. Numbers have a decimal point or comma. The text is
 UTF-8 or UTF-16. There may be a byte order mark, a `sep=` line, quotes, and empty cells and rows at the ends.
+Where tables have been joined, the names of the columns and comments come again between the rows.
 """
 
 from __future__ import annotations
@@ -26,6 +27,9 @@ HEAD_LINES = 50
 """Lines in which the names of the columns have to come."""
 
 SEPARATORS = "\t;,|"
+
+COMMENTS = ("#", "//")
+"""Beginnings of lines that are no rows."""
 
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 _BOMS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
@@ -87,7 +91,7 @@ def open_table(path: Path, fits: Callable[[Sequence[str]], bool], wanted: str) -
             separator = max(SEPARATORS, key=lambda mark: len(split[mark]))
             if split[separator] and fits(split[separator]):
                 names = split[separator]
-                yield Table(head, names, _rows(path, lines, separator, len(names)))
+                yield Table(head, names, _rows(path, lines, separator, names))
                 return
             head.append(line.strip())
             if len(head) == HEAD_LINES:
@@ -112,21 +116,26 @@ class _Lines(CountedLines):
         return line
 
 
-def _rows(path: Path, lines: _Lines, separator: str, columns: int) -> Iterator[Row]:
-    # Where commas separate columns, none is in a number.
-    commas = separator != ","
+def _rows(path: Path, lines: _Lines, separator: str, names: list[str]) -> Iterator[Row]:
+    columns = len(names)
     for cells in csv.reader(lines, delimiter=separator, skipinitialspace=True):
-        cells = _trimmed(cells, columns)
-        if not any(cells):
+        cells = tidied(cells, separator, columns)
+        if not any(cells) or cells == names or cells[0].startswith(COMMENTS):
             continue
-        if commas:
-            cells = [cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells]
-        elif len(cells) > columns and len(cells) >= 2 * columns - 2:
+        if separator == "," and len(cells) > columns and len(cells) >= 2 * columns - 2:
             raise FileFormatError(
                 f"{path}: row {lines.number} has {len(cells)} cells for {columns} columns: its numbers have "
                 "decimal commas, and commas separate the columns, too; export it with decimal points"
             )
         yield Row(lines.number, cells, lines.ended)
+
+
+def tidied(cells: list[str], separator: str, columns: int) -> list[str]:
+    """Return the cells of a row without blanks, without empty ones after the columns, with decimal points."""
+    cells = _trimmed(cells, columns)
+    if separator == ",":  # then none is in a number
+        return cells
+    return [cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells]
 
 
 def read_numbers(table: Table, ledger: Ledger) -> tuple[NDArray[np.int_], dict[str, NDArray[np.float64]]]:

@@ -9,7 +9,10 @@ import re
 import sqlite3
 import struct
 from collections.abc import Iterator
+from datetime import datetime
+from itertools import islice, pairwise
 from pathlib import Path
+from statistics import median
 from typing import Any, NamedTuple, TextIO, cast
 
 import can
@@ -25,10 +28,20 @@ _LATEST_S = 1e11  # 5000 years of Unix time
 _BLF_OBJECT, _BLF_HEAD = b"LOBJ", struct.Struct("<4sHHII")
 
 _SCREEN = re.compile(
-    r"\s*(?:\((?P<time>\d+\.\d+)\))?\s+(?P<bus>\w+)\s+(?P<id>[0-9A-Fa-f]{3,8})\s+\[(?P<size>\d+)\]"
+    r"\s*(?P<bus>\w+)(?:\s+[RT]X\s\S\s\S)?\s+(?P<id>[0-9A-Fa-f]{3,8})\s+\[(?P<size>\d+)\]"
     r"(?P<data>(?:\s+[0-9A-Fa-f]{2})*)\s*(?:'.*)?"
 )
-"""A line that candump shows on the screen; python-can reads those that candump -l writes to a file."""
+"""A frame that candump shows on the screen; python-can reads those that candump -l writes to a file."""
+
+_STAMP = re.compile(
+    r"\s*\((?:(?P<date>\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)|(?P<seconds>\d{1,12}))(?P<fraction>\.\d+)\)"
+)
+"""The time of a line of candump, in any of its formats (candump -t)."""
+
+_FIRST_LINES = 200
+"""Lines of a log by which its times are judged."""
+
+_FEW = 2  # steps back of a clock that is set, rather than of times since the line before
 
 _ASC_FRAME = re.compile(r"\s*\d+\.\d+\s+(?:CANFD\s+)?\d+\s.*\b[RT]x\b")
 _ASC_TIME = re.compile(r"(\s*)(\d+\.\d+)(\s.*)", re.DOTALL)
@@ -68,6 +81,13 @@ def _check_table(path: Path) -> None:
         raise ValueError("it has no table of messages")
 
 
+def _check_trace(path: Path) -> None:
+    """Raise FileFormatError for markers of motion capture, whose files have the same ending."""
+    with path.open("rb") as file:
+        if file.read(12) == b"PathFileType":
+            raise FileFormatError("it holds the positions of markers, and no frames of a CAN bus")
+
+
 class _Lines(CountedLines):
     """Lines of a text log; of one that is too long, its last piece."""
 
@@ -85,18 +105,58 @@ class _Lines(CountedLines):
 
 
 class _CandumpLines(_Lines):
-    """Lines of a candump log; those of candump's screen become lines of its files."""
+    """Lines of a candump log with times in seconds; those of candump's screen become lines of its files."""
+
+    def __init__(self, file: TextIO) -> None:
+        super().__init__(file)
+        self._deltas = _are_deltas(_first_times(_Lines(file)))
+        file.seek(0)
+        self._time_s = 0.0
 
     def __next__(self) -> str:
         line = super().__next__()
         if self.number == 1 and line.startswith("***BUSMASTER"):
             raise FileFormatError("logs of BUSMASTER cannot be read: save it as .asc or .blf")
-        shown = _SCREEN.fullmatch(line)
-        if shown is None:
+        stamp = _STAMP.match(line)
+        shown = _SCREEN.fullmatch(line, stamp.end() if stamp else 0)
+        if stamp is None:
+            if shown is not None:
+                raise FileFormatError(
+                    "candump has shown it on the screen, without times: log with candump -l"
+                )
             return line
-        if shown["time"] is None:
-            raise FileFormatError("candump has shown it on the screen, without times: log with candump -l")
-        return f"({shown['time']}) {shown['bus']} {shown['id']}#{''.join(shown['data'].split())}\n"
+        if shown is None and stamp["date"] is None and not self._deltas:
+            return line
+        self._time_s = _seconds(stamp) + (self._time_s if self._deltas else 0.0)
+        frame = (
+            f" {shown['bus']} {shown['id']}#{''.join(shown['data'].split())}\n"
+            if shown
+            else line[stamp.end() :]
+        )
+        return f"({self._time_s:.6f}){frame}"
+
+
+def _first_times(lines: _Lines) -> list[float]:
+    stamps = (_STAMP.match(line) for line in islice(lines, _FIRST_LINES))
+    return [_seconds(stamp) for stamp in stamps if stamp is not None and stamp["seconds"]]
+
+
+def _seconds(stamp: re.Match[str]) -> float:
+    """Return the time of a line; a date's time zone is unknown, so it is taken for UTC.
+
+    Raises:
+        ValueError: no such date.
+    """
+    if stamp["date"] is None:
+        return float(stamp["seconds"] + stamp["fraction"])
+    return datetime.fromisoformat(stamp["date"] + "+00:00").timestamp() + float(stamp["fraction"])
+
+
+def _are_deltas(times: list[float]) -> bool:
+    """Return whether times are those since the line before, which go up and down but do not grow."""
+    back = sum(after < before for before, after in pairwise(times))
+    quarter = len(times) // 4
+    return back > _FEW and median(times[-quarter:]) <= max(times[:quarter])
 
 
 class _AscLines(_Lines):
@@ -167,6 +227,8 @@ def _messages(path: Path, ledger: Ledger) -> Iterator[can.Message]:
     if log is None:
         if path.suffix.lower() == ".db":
             _check_table(path)
+        if path.suffix.lower() == ".trc":
+            _check_trace(path)
         with _BlfReader(path) if path.suffix.lower() == ".blf" else can.LogReader(path) as reader:
             yield from reader
         return

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from math import isnan, nan
@@ -33,6 +35,23 @@ CAPTURES = (".bin", ".raw")
 
 CAN_LOGS = (".asc", ".blf", ".log", ".mf4", ".trc", ".db")
 """Endings of logs that python-can reads, besides .csv."""
+
+_SAVE = "write its samples as .csv or .npz, as docs/guide/recordings.md describes"
+
+FOREIGN = {
+    ".mtb": "MT Manager's own format; export it as text, one file a sensor, and give the folder",
+    ".mvn": "MVN's own format; export it as .mvnx, with the data of the sensors",
+    ".mat": f"a file of MATLAB; {_SAVE}",
+    ".h5": f"an HDF5 file; {_SAVE}",
+    ".hdf5": f"an HDF5 file; {_SAVE}",
+    ".xlsx": f"a workbook; save the sheet as .csv, or {_SAVE}",
+    ".sto": f"a file of OpenSim, which holds no accelerations; {_SAVE}",
+    ".mot": "joint angles of OpenSim, not data of sensors",
+    ".c3d": "positions of markers, not data of sensors",
+    ".fbx": "an animation, not data of sensors",
+    ".gz": "packed with gzip; unpack it first",
+}
+"""What files of other programs are, by their ending, and what to do with them."""
 
 
 class RecordingSource:
@@ -135,6 +154,8 @@ def open_file(
         return LogSource(path, realtime, _read_capture, make_decoder, blocking)
     if not path.suffix and not path.exists():
         raise EdgeposeError(f"{path}: no such file or folder")
+    if path.suffix.lower() in FOREIGN:
+        raise EdgeposeError(f"{path}: {FOREIGN[path.suffix.lower()]}")
     raise EdgeposeError(
         f"{path}: unknown kind of file; recordings end in {', '.join(recording_suffixes())}, logs of CAN "
         f"buses in {', '.join(CAN_LOGS)}, raw serial captures in {' or '.join(CAPTURES)} (or anything else, "
@@ -155,12 +176,13 @@ def is_recording(path: Path) -> bool:
 def is_can_log(path: Path) -> bool:
     """Whether a file is a log of a CAN bus, by its ending; a .csv by its first line."""
     endings = [ending.lower() for ending in path.suffixes if ending.lower() != ".gz"]
-    if endings[-1:] != [".csv"] or path.suffix.lower() == ".gz":
-        return endings[-1:] != [] and endings[-1] in (*CAN_LOGS, ".csv")
+    if endings[-1:] != [".csv"]:
+        return endings[-1:] != [] and endings[-1] in CAN_LOGS
+    opened = gzip.open if path.suffix.lower() == ".gz" else open
     try:
-        with path.open("rb") as file:
+        with opened(path, "rb") as file:
             return file.readline(1000).startswith(b"timestamp,arbitration_id,")
-    except OSError:  # reported when the file is read
+    except (OSError, EOFError, zlib.error):  # reported when the file is read
         return False
 
 

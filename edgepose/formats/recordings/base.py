@@ -215,7 +215,11 @@ class SampleTable:
         check(np.abs(norm - 1.0) > 0.1, "has a quaternion that is not of unit length")
         reached = np.maximum.accumulate(np.concatenate([[before], np.where(good, times, -inf)]))[:-1]
         back = good & (times < reached - _RESTART_S)
-        check(back, "goes back in time by more than a second; if it was restarted there, split the recording")
+        check(
+            back,
+            "goes back in time by more than a second; sort the rows by time_s or, if the sensor was "
+            "restarted there, split the recording",
+        )
         check(good & (times < reached), "goes back in time; sort the rows by time_s")
         if not good.all():
             rows, norm = rows[good], norm[good]

@@ -1,4 +1,7 @@
-"""Recordings as CSV, one row per sample."""
+"""Recordings as CSV, one row per sample.
+
+Programs that have saved a recording again may have changed its separators, decimal points or encoding.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from typing import TextIO
 
 from edgepose.errors import FileFormatError
 from edgepose.formats.recordings.base import ReadOptions, RecordingFormat, SampleTable, iter_samples, shorten
+from edgepose.formats.tables import COMMENTS, SEPARATORS, encoding_of, tidied
 from edgepose.imu import ImuSample, Recording
 from edgepose.placements import PLACEMENTS
 from edgepose.utils.counted_lines import MAX_LINE, CountedLines
@@ -60,13 +64,16 @@ def read_csv(path: Path, options: ReadOptions) -> Recording:
     opened = (
         nullcontext(sys.stdin)
         if str(path) == "-"
-        else path.open(encoding="utf-8-sig", errors="replace", newline="")
+        # A pipe can be read once only.
+        else path.open(
+            encoding=encoding_of(path) if path.is_file() else "utf-8-sig", errors="replace", newline=""
+        )
     )
     with opened as file:
         lines = _Lines(path, file)
-        metadata = _read_metadata(path, lines)
+        metadata, separator = _read_head(path, lines)
         lines.unlimited = options.salvage
-        table, cut = _read_rows(path, lines, options.salvage, options.names)
+        table, cut = _read_rows(path, lines, separator, options)
     sensors = table.sensors()  # checks the last rows
     return Recording(sensors, metadata, table.damage() or cut)
 
@@ -92,38 +99,56 @@ class _Lines(CountedLines):
         return line
 
 
-def _read_metadata(path: Path, lines: _Lines) -> dict[str, str]:
+def _read_head(path: Path, lines: _Lines) -> tuple[dict[str, str], str | None]:
+    """Read all lines up to the names of the columns.
+
+    Returns:
+        Metadata, and the separator of the columns; None if the file is spelled as `write_csv` spells it.
+    """
     metadata: dict[str, str] = {}
     for line in lines:
-        if not line.startswith("#"):
-            header = line.strip().replace('"', "").replace(" ", "")
-            if header == COLUMNS:
-                return metadata
+        if line.startswith("#"):
+            key, _, value = line[1:].partition(":")
+            metadata[key.strip()] = value.strip()
+            continue
+        if line.strip() == COLUMNS:
+            return metadata, None
+        for separator in SEPARATORS:
+            if _is_header(tidied(line.split(separator), separator, _WIDTH)):
+                return metadata, separator
+        if line.strip(f' \r\n"{SEPARATORS}') and not line.startswith("sep="):
             raise FileFormatError(
                 f"{path}: row {lines.number} has the columns {shorten(line)}; a recording has {COLUMNS}"
             )
-        key, _, value = line[1:].partition(":")
-        metadata[key.strip()] = value.strip()
     raise FileFormatError(f"{path}: the file is empty; a recording starts with the columns {COLUMNS}")
 
 
+def _is_header(cells: Sequence[str]) -> bool:
+    return [cell.strip(' "') for cell in cells] == COLUMNS.split(",")
+
+
 def _read_rows(
-    path: Path, lines: _Lines, salvage: bool, names: Sequence[str]
+    path: Path, lines: _Lines, separator: str | None, options: ReadOptions
 ) -> tuple[SampleTable, str | None]:
     """Read all rows, and a message if the last one is cut off."""
-    table = SampleTable(str(path), salvage, names)
-    rows = csv.reader(lines, quoting=csv.QUOTE_NONE)
+    table = SampleTable(str(path), options.salvage, options.names)
+    rows = csv.reader(lines, delimiter=separator or ",", quoting=csv.QUOTE_NONE)
     while True:
         try:
             cells = next(rows, None)
             if cells is None:
                 return table, None
-            if cells:
-                sensor, numbers = _parse_row(cells, not lines.ended, names)
+            if separator is not None:
+                cells = tidied([cell.strip(' "') for cell in cells], separator, _WIDTH)
+            if any(cells):
+                sensor, numbers = _parse_row(cells, not lines.ended, options.names)
                 table.add(sensor, lines.number, numbers, cells.count(""))
         except csv.Error as error:
             table.reject(f"row {lines.number}: {error}")
         except ValueError as error:
+            # Recordings that were joined: nothing of the wearer is in these lines.
+            if not lines.too_long and cells and (_is_header(cells) or cells[0].startswith(COMMENTS)):
+                continue
             # The pieces of a line that is too long have no line end either.
             if lines.ended or lines.too_long:
                 table.reject(f"row {lines.number} {error}")
@@ -150,7 +175,11 @@ def _parse_row(cells: list[str], cut: bool, names: Sequence[str]) -> tuple[str, 
         # The last number may lack digits.
         raise ValueError("has no line end")
     try:
-        return sensor, [float(time_s), *[float(cell) if cell else nan for cell in rest]]
+        seconds = float(time_s)
+    except ValueError:
+        raise ValueError(f"has the time {shorten(time_s)}; times are numbers of seconds") from None
+    try:
+        return sensor, [seconds, *[float(cell) if cell else nan for cell in rest]]
     except ValueError as error:
         raise ValueError(f"has a value that is not a number ({shorten(str(error))})") from None
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from edgepose.errors import FileFormatError
 from edgepose.formats.recordings.base import ReadOptions, RecordingFormat
-from edgepose.formats.recordings.time_checks import check_times
+from edgepose.formats.recordings.time_checks import check_times, find_clocks_apart
 from edgepose.formats.registered import all_formats, built_in_format
 from edgepose.imu import Recording
 from edgepose.placements import PLACEMENTS
@@ -38,7 +38,7 @@ def read_recording(
         salvage: leave bad rows of CSV and NPZ out, too.
 
     Raises:
-        FileFormatError: it cannot be read, or is not a recording of all six sensors.
+        FileFormatError: it cannot be read, or is not a recording of all six sensors at one time.
     """
     recording = _read(Path(path), ReadOptions(ids=ids, salvage=salvage))
     missing = missing_sensors(recording)
@@ -47,11 +47,14 @@ def read_recording(
         raise FileFormatError(
             f"{path}: no samples of {', '.join(missing)}; a recording needs all six sensors{damage}"
         )
+    apart = find_clocks_apart(recording, str(path))
+    if apart:
+        raise FileFormatError(apart)
     return recording
 
 
 def salvage_recording(path: Path | str, ids: Mapping[int, str] | None = None) -> Recording:
-    """Read the good rows of a recording of any number of sensors; `damage` reports bad rows left out.
+    """Read the good rows of a recording of any number of sensors; `damage` reports what is wrong with it.
 
     Args:
         path: file, or folder of a session.
@@ -60,7 +63,9 @@ def salvage_recording(path: Path | str, ids: Mapping[int, str] | None = None) ->
     Raises:
         FileFormatError: it cannot be read, or is not a recording.
     """
-    return _read(Path(path), ReadOptions(salvage=True, ids=ids))
+    recording = _read(Path(path), ReadOptions(salvage=True, ids=ids))
+    problems = filter(None, [recording.damage, find_clocks_apart(recording, str(path))])
+    return recording._replace(damage="; ".join(problems) or None)
 
 
 def read_sensors(path: Path | str, names: Sequence[str]) -> Recording:

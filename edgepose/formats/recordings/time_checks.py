@@ -1,4 +1,4 @@
-"""Checks of the times of a recording: their unit and their resolution."""
+"""Checks of the times of a recording: their unit, their resolution, and that its sensors share them."""
 
 from __future__ import annotations
 
@@ -32,6 +32,25 @@ def check_times(recording: Recording, name: str) -> None:
         if len(data.time_s) >= _FEWEST:
             _check_resolution(data.time_s, sensor, name)
             _check_unit(data.time_s, sensor, name)
+
+
+def find_clocks_apart(recording: Recording, name: str) -> str | None:
+    """Return a message if a sensor starts after another has ended; None if all share some time.
+
+    Args:
+        recording: as read.
+        name: of the file, for the message.
+    """
+    sensors = recording.sensors
+    first = min(sensors, key=lambda sensor: sensors[sensor].time_s[-1])
+    last = max(sensors, key=lambda sensor: sensors[sensor].time_s[0])
+    end_s, start_s = sensors[first].time_s[-1], sensors[last].time_s[0]
+    if start_s <= end_s:
+        return None
+    return (
+        f"{name}: {last} starts at {start_s:.1f} s, after the end of {first} at {end_s:.1f} s; if their "
+        "clocks differ, synchronise the sensors and record again"
+    )
 
 
 def _check_resolution(time_s: Array, sensor: str, name: str) -> None:

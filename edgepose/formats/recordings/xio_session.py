@@ -62,12 +62,6 @@ def read_session(folder: Path, ids: Mapping[int, str] | None = None) -> Recordin
         for sample in _samples(PLACEMENTS.index(name), sensor_folder, problems)
     ]
     recording = recording_from_samples(rows, _METADATA, name=str(folder), salvage=True)
-    starts = [data.time_s[0] for data in recording.sensors.values()]
-    ends = [data.time_s[-1] for data in recording.sensors.values()]
-    if starts and max(starts) > min(ends):
-        problems.append(
-            f"{folder}: the sensors' clocks have no time in common; synchronise them and record again"
-        )
     if recording.damage:
         problems.append(recording.damage)
     return recording._replace(damage="; ".join(problems) or None)
@@ -86,7 +80,8 @@ def by_placement(folder: Path, sensors: Sequence[Path], ids: Mapping[int, str] |
             continue
         if placement in result:
             raise FileFormatError(
-                f"{folder}: {result[placement].name!r} and {sensor.name!r} are both {placement}; rename one"
+                f"{folder}: {result[placement].name!r} and {sensor.name!r} are both {placement}; rename one, "
+                "or give each recording a folder of its own"
             )
         result[placement] = sensor
     if not sensors:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from edgepose.errors import FileFormatError
 from edgepose.formats.ledger import Ledger
 from edgepose.formats.recordings.base import RecordingFormat, SampleTable
-from edgepose.formats.recordings.xio_session import by_placement
+from edgepose.formats.recordings.xio_session import by_placement, placement_of
 from edgepose.formats.tables import open_table, read_numbers
 from edgepose.imu import Recording
 from edgepose.rotations import euler_to_matrix, matrix_to_quat, quat_conjugate, quat_rotate
@@ -32,6 +32,7 @@ _COUNTER, _TICKS = "PacketCounter", "SampleTimeFine"
 _RATE = re.compile(r"(?:Update Rate|OutputRate)\W*([0-9]+(?:\.[0-9]+)?)\s*Hz", re.IGNORECASE)
 _DOT = ("DeviceTag", "Quat_W", "Euler_X")
 _UP = (0.0, 0.0, STANDARD_G)
+_LONGEST_GAP = 1 / 32  # of the counts from wrap to wrap, in which a counter may wrap unseen: 20 s at 100 Hz
 
 _METADATA = {"frame": "Z up", "units": "s, m/s^2, rad/s; mag in the device's own units"}
 
@@ -97,6 +98,11 @@ def _sensors(folder: Path) -> list[Path]:
     return []
 
 
+def _empty_files(folder: Path) -> list[Path]:
+    files = (path for path in folder.iterdir() if path.suffix.lower() in _ENDINGS and path.is_file())
+    return sorted(path for path in files if not path.stat().st_size)
+
+
 def _fits(names: Sequence[str]) -> bool:
     return _COUNTER in names and len(names) > 1
 
@@ -113,7 +119,7 @@ def read_session(folder: Path, ids: Mapping[int, str] | None = None) -> Recordin
         FileFormatError: no file is of a placement, two are of one, or a file lacks columns.
     """
     places = by_placement(folder, _sensors(folder), ids)
-    damage: list[str] = []
+    damage = [f"{path}: is empty" for path in _empty_files(folder) if placement_of(path.name, ids)]
     sensors = {name: _read(path, damage) for name, path in places.items()}
     sensors = {name: sensor for name, sensor in sensors.items() if len(sensor.time)}
     table = SampleTable(str(folder), salvage=True)
@@ -164,11 +170,15 @@ def _read(path: Path, damage: list[str]) -> _Sensor:
         rows, columns, count = rows[good], {name: v[good] for name, v in columns.items()}, count[good]
 
     keep(np.isfinite(count), "has no number of its packet")
-    keep(_steps_on(count, wrap), "is not after the row before it")
+    keep(
+        _steps_on(count, wrap),
+        "is not after the row before it; if the sensor was restarted there, split the file",
+    )
     quantities = _quantities(columns, orientation, force, is_dot)
     measured = np.asarray(~np.isnan(quantities).all(axis=1))
     ledger.leave_out_unless(measured, rows, "has no measurement")
-    damage += filter(None, [ledger.damage()])
+    empty = None if measured.any() or ledger.count else f"{path}: has no rows below its columns"
+    damage += filter(None, [ledger.damage(), empty])
     return _Sensor(_unwrapped(count, wrap)[measured], scale_s, wrap, quantities[measured], rows[measured])
 
 
@@ -189,11 +199,15 @@ def _clock(
 
 
 def _steps_on(count: Array, wrap: int) -> NDArray[np.bool_]:
-    """Which counts (n,) come after the last good one, over wraps."""
+    """Which counts (n,) come after the last good one, over wraps.
+
+    A count that starts again long before it would wrap is that of a sensor that was restarted.
+    """
     good = np.ones(len(count), dtype=bool)
     last = None
     for i, value in enumerate(count.tolist()):
-        good[i] = last is None or 0 < (value - last) % wrap < wrap / 2
+        longest = wrap / 2 if last is None or value > last else wrap * _LONGEST_GAP
+        good[i] = last is None or 0 < (value - last) % wrap < longest
         last = value if good[i] else last
     return good
 
