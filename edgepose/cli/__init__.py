@@ -136,3 +136,7 @@ def main() -> NoReturn:
     except Exception as error:
         say(traceback.format_exc().rstrip() if debug else f"edgepose: {as_edgepose_error(error)}")
         sys.exit(1)
+    finally:
+        # All is done; an interrupt while Python ends would only print a traceback.
+        for number in stop_signals():
+            signal.signal(number, signal.SIG_IGN)

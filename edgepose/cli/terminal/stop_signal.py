@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 import signal
+import time
 from types import FrameType, TracebackType
 from typing import Any
+
+REPEAT_S = 1.0
+"""Signals that follow the first this closely are part of it, seconds.
+
+Programs that start others pass on a Ctrl-C that the terminal has sent to all of them, and a session that ends
+may send SIGTERM and SIGHUP.
+"""
 
 
 def stop_signals() -> list[int]:
@@ -14,7 +22,7 @@ def stop_signals() -> list[int]:
 
 
 class StopSignal:
-    """Remembers the first stop signal while it is entered; a second one interrupts at once.
+    """Remembers the first stop signal while it is entered; one after REPEAT_S interrupts at once.
 
     Attributes:
         asked: whether a stop signal has arrived.
@@ -23,6 +31,7 @@ class StopSignal:
     def __init__(self) -> None:
         """Create the flag; `__enter__` installs the signal handlers."""
         self.asked = False
+        self._asked_s = 0.0
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> StopSignal:
@@ -34,12 +43,16 @@ class StopSignal:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Restore the previous signal handlers."""
-        self._restore()
+        """Restore the previous signal handlers; after a stop signal, when another comes after REPEAT_S."""
+        if not self.asked:
+            self._restore()
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        self.asked = True
-        self._restore()
+        if not self.asked:
+            self.asked, self._asked_s = True, time.monotonic()
+        elif time.monotonic() - self._asked_s > REPEAT_S:
+            self._restore()
+            signal.raise_signal(number)
 
     def _restore(self) -> None:
         for number, handler in self._before.items():
