@@ -93,6 +93,7 @@ class VmcSink(DatagramSink):
         offsets[_ON_UPPER_CHEST] += offsets[_UPPER_CHEST]
         self._positions = offsets[_INDEX] * TO_UNITY
         self._start_s: float | None = None
+        self._quats = np.zeros((len(BONES), 4))  # of the pose before
         super().__init__(host, port)
 
     def encode(self, pose: PoseFrame) -> Sequence[bytes]:
@@ -101,7 +102,11 @@ class VmcSink(DatagramSink):
             self._start_s = pose.time_s
         rotations = pose.rotations.copy()
         rotations[_CHEST] = rotations[_CHEST] @ rotations[_UPPER_CHEST]
-        w, x, y, z = matrix_to_quat(rotations[_INDEX]).T
+        quats = matrix_to_quat(rotations[_INDEX])
+        # Receivers that smooth or interpolate the numbers would turn a bone round where signs change.
+        opposite = (quats * self._quats).sum(axis=-1, keepdims=True) < 0.0
+        self._quats = np.where(opposite, -quats, quats)
+        w, x, y, z = self._quats.T
         positions = self._positions.copy()
         positions[0] = (self._standing if pose.translation is None else pose.translation) * TO_UNITY
         numbers = np.column_stack([positions, x, -y, -z, w]).astype(">f4")

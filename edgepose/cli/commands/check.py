@@ -82,7 +82,7 @@ def check(
     The sensors may lie on a table or be worn. Hold them still for some seconds: gravity, noise and bias only
     show at rest. Then turn each one to and fro: gyroscope and orientation can only be compared in motion.
 
-    The exit code is 0 if all six sensors are fine, and 1 if one of them has a problem.
+    The exit code is 0 if all six sensors are fine, and 1 if one of them, or a part of the file, is not.
 
     \b
     Examples:
@@ -130,7 +130,7 @@ def check(
         click.echo("\n".join(_lines(state, shutil.get_terminal_size().columns if is_terminal() else None)))
     if error is not None:
         raise error
-    ctx.exit(1 if state.problems else 0)
+    ctx.exit(1 if state.problems or opened.damage else 0)
 
 
 def _listen(

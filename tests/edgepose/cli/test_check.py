@@ -91,7 +91,8 @@ def test_a_damaged_recording(command, tmp_path):
     write_csv(file, read_recording(REAL))
     file.write_text(file.read_text().replace(",head,", ",head,x", 1))
     result = command("check", "--file", file, "--json")
-    assert result.returncode == 0, result.stdout
+    assert result.returncode == 1, result.stdout
+    assert json.loads(result.stdout)["problems"] == 0
     (warning,) = json.loads(result.stdout)["warnings"]
     assert "not a number" in warning
     assert f"warning: {warning}\n" == result.stderr

@@ -65,6 +65,19 @@ def bones(one: PoseFrame, **options) -> dict[str, tuple[np.ndarray, Rotation]]:
     return found
 
 
+def test_quaternions_of_a_wearer_who_turns_round_keep_their_signs():
+    turning = []
+    for i in range(40):
+        rotations = np.tile(np.eye(3, dtype=np.float32), (24, 1, 1))
+        rotations[0] = Rotation.from_euler("y", 20 * i, degrees=True).as_matrix()
+        turning.append(anything(i)._replace(rotations=rotations))
+    messages = [message for datagram in received(turning) for message in datagram]
+    hips = np.array([arguments[4:] for _, arguments in messages if arguments[0] == "Hips"])
+    half = np.radians(10.0)
+    np.testing.assert_allclose((hips[1:] * hips[:-1]).sum(axis=1), np.cos(half), atol=1e-6)
+    np.testing.assert_allclose(hips[30], [0, -np.sin(30 * half), 0, np.cos(30 * half)], atol=1e-6)
+
+
 def test_what_is_in_the_datagrams():
     datagrams = received([pose(0), pose(90)])
     first, second = datagrams[:2]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 from collections.abc import Callable
+from datetime import datetime, timezone
 from pathlib import Path
 
 import can
@@ -44,6 +45,37 @@ def shown(sent: list[can.Message]) -> list[str]:
         f" ({m.timestamp:.6f})  can0  {m.arbitration_id:03X}   [{m.dlc}]  {m.data.hex(' ').upper()}\n"
         for m in sent
     ]
+
+
+def deltas(lines: list[str]) -> list[str]:
+    """As candump -td writes or shows the times: since the line before."""
+    times = [float(line[line.index("(") + 1 : line.index(")")]) for line in lines]
+    steps = np.diff(times, prepend=times[0])
+    return [f" ({step:010.6f}){line[line.index(')') + 1 :]}" for step, line in zip(steps, lines, strict=True)]
+
+
+def dates(lines: list[str]) -> list[str]:
+    """As candump -tA shows the times."""
+    result = []
+    for line in lines:
+        stamp = line[line.index("(") + 1 : line.index(")")]
+        date = datetime.fromtimestamp(float(stamp), timezone.utc)
+        result.append(line.replace(stamp, f"{date:%Y-%m-%d %H:%M:%S.%f}"))
+    return result
+
+
+def from_zero(lines: list[str]) -> list[str]:
+    """As candump -tz shows the times; every third line comes too early, as with a second bus."""
+    stamps = [f"{float(line[line.index('(') + 1 : line.index(')')]) - START_S:010.6f}" for line in lines]
+    result = [f" ({s}){line[line.index(')') + 1 :]}" for s, line in zip(stamps, lines, strict=True)]
+    for i in range(0, len(result) - 3, 3):
+        result[i : i + 2] = result[i + 1], result[i]
+    return result
+
+
+def with_direction(lines: list[str]) -> list[str]:
+    """As candump -x shows them."""
+    return [line.replace("can0", "can0  RX - -") for line in lines]
 
 
 def asc(sent: list[can.Message], relative: bool) -> list[str]:
@@ -95,6 +127,12 @@ def check_whole(times: dict[int, list[float]], missing: int = 0) -> None:
         ("a.log", lines_of),
         ("a.log.gz", lines_of),
         ("a.log", shown),
+        ("a.log", lambda sent: deltas(lines_of(sent))),
+        ("a.log.gz", lambda sent: deltas(shown(sent))),
+        ("a.log", lambda sent: dates(shown(sent))),
+        ("a.log", lambda sent: from_zero(shown(sent))),
+        ("a.log", lambda sent: with_direction(shown(sent))),
+        ("a.log", lambda sent: with_direction(dates(shown(sent)))),
         ("a.asc", lambda sent: asc(sent, False)),
         ("a.asc", lambda sent: asc(sent, True)),
         ("a.asc.gz", lambda sent: asc(sent, True)),
@@ -130,6 +168,7 @@ BAD = {
     "no number": "(17000000xx.500000) can0 400#00\n",
     "not UTF-8": "(\ufffd) \ufffd\n",
     "empty data": "(1700000001.5) can0\n",
+    "no date": " (2023-14-01 22:13:21.500000)  can0  400   [1]  00\n",
     "an odd digit": "(1700000001.5) can0 400#0\n",
 }
 
@@ -180,3 +219,25 @@ def test_zeros_at_the_end_of_a_log(tmp_path):
     times, damage = read(path)
     check_whole(times)
     assert damage == f"{path}: 1 bad lines left out, the first: line 5401 is not a frame"
+
+
+def test_markers_with_the_ending_of_a_trace(tmp_path):
+    path = tmp_path / "walk.trc"
+    path.write_text("PathFileType\t4\t(X/Y/Z)\twalk.trc\nDataRate\tCameraRate\n100\t100\n")
+    with pytest.raises(EdgeposeError, match=r"walk\.trc: it holds the positions of markers"):
+        read(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("walk.csv.gz", "packed with gzip; unpack it first"),
+        ("walk.mat", "a file of MATLAB; write its samples as .csv or .npz"),
+        ("walk.MTB", "export it as text, one file a sensor, and give the folder"),
+    ],
+)
+def test_files_of_other_programs(tmp_path, name, says):
+    path = tmp_path / name
+    path.write_bytes(gzip.compress(b"time_s,sensor\n"))
+    with pytest.raises(EdgeposeError, match=says):
+        open_source(file=path)

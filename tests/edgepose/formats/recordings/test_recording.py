@@ -360,3 +360,56 @@ def test_a_sensor_that_was_restarted(tmp_path):
     assert salvaged.damage.startswith(f"{tmp_path / 'a.npz'}: ")
     assert 200 <= len(salvaged.sensors["head"].time_s) < len(time_s)
     assert len(salvaged.sensors["pelvis"].time_s) == len(time_s)
+
+
+def semicolons(content):
+    return "sep=;\n" + content.replace(",", ";").replace(".", ",")
+
+
+def quoted(content):
+    return "".join(",".join(f'"{cell}"' for cell in row.split(",")) + "\r\n" for row in content.splitlines())
+
+
+@pytest.mark.parametrize(
+    "save",
+    [
+        lambda content: content.encode("utf-16"),
+        lambda content: semicolons(content).encode("utf-8-sig"),
+        lambda content: quoted(content).encode(),
+        lambda content: content.replace(",", "\t").encode(),
+        lambda content: content.replace(",", ", ").encode(),
+        lambda content: content.replace("\n", ",,\n").encode() + b",,,,,,,,,,,,,,,,\n",
+        lambda content: content.replace("\n", "\r").encode(),
+    ],
+    ids=["UTF-16", "decimal commas", "quotes", "tabs", "blanks", "empty columns and rows", "CR"],
+)
+def test_recordings_that_other_programs_have_saved_again(tmp_path, save):
+    rows = [row._replace(mag=(1.5, 2, 3) if row.sensor == 4 else None) for row in rig(4)]
+    path = tmp_path / "a.csv"
+    path.write_bytes(save(text(rows)))
+    recording = read_recording(path)
+    assert recording.damage is None
+    same(recording, recording_from_samples(rows))
+
+
+@pytest.mark.parametrize("between", ["", COLUMNS + "\n", "# place: gym, hall 2\n" + COLUMNS + "\n"])
+def test_recordings_that_were_joined(tmp_path, between):
+    rows = rig(6)
+    recording = read_recording(write(tmp_path / "a.csv", text(rows[:18]) + between + text(rows[18:])))
+    assert recording.damage is None
+    same(recording, recording_from_samples(rows))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda rows: rows[::-1], "goes back in time by more than a second; sort the rows by time_s or"),
+        (
+            lambda rows: [f"2023-10-29T02:00:{row}" for row in rows],
+            r"row 2 has the time '2023-10-29T02:00:0.000000'; times are numbers of seconds",
+        ),
+    ],
+)
+def test_times_in_another_order_or_form(tmp_path, change, says):
+    rows = [csv_row(row._replace(time_s=row.time_s * 100)) for row in rig(4)]
+    assert says in error(write(tmp_path / "a.csv", COLUMNS + "\n" + "".join(change(rows))))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -60,3 +61,16 @@ def test_times_that_are_not_seconds(tmp_path, change, problem, write):
 def test_times_that_are_unusual(tmp_path, change):
     write_npz(tmp_path / "a.npz", changed(change))
     assert read_recording(tmp_path / "a.npz").damage is None
+
+
+def test_sensors_that_share_no_time(tmp_path):
+    recording = changed(lambda t: t)
+    head = recording.sensors["head"]
+    recording.sensors["head"] = head._replace(time_s=head.time_s + 500.0)
+    write_npz(tmp_path / "a.npz", recording)
+    says = r"head starts at 540\.0 s, after the end of left_forearm at 43\.0 s; if their clocks differ, synch"
+    with pytest.raises(EdgeposeError, match=says):
+        read_recording(tmp_path / "a.npz")
+    recording = salvage_recording(tmp_path / "a.npz")
+    assert re.search(says, recording.damage)
+    assert len(recording.sensors["head"].time_s) == 300

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -264,3 +265,47 @@ def test_a_folder_is_converted_as_one_recording(tmp_path):
         EdgeposeError, match="one sensor of a session of Xsens sensors; give the folder above"
     ):
         read_recording(folder / "head.csv")
+
+
+def test_tables_that_were_joined(tmp_path):
+    written = session(tmp_path, list(PLACEMENTS))
+    for name in PLACEMENTS:
+        file = tmp_path / f"{name}.txt"
+        lines = file.read_text().splitlines(keepends=True)
+        file.write_text("".join([*lines[:50], *lines[:5], *lines[50:]]))
+    recording = read_session(tmp_path)
+    assert recording.damage is None
+    same(recording, written)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [("", "is empty"), (HEAD + "\t".join(COLUMNS) + "\n", "has no rows below its columns")],
+)
+def test_a_file_without_rows_is_named(tmp_path, content, says):
+    session(tmp_path, list(PLACEMENTS))
+    (tmp_path / "head.txt").write_text(content)
+    with pytest.raises(EdgeposeError, match=rf"no samples of head; .* \({tmp_path / 'head.txt'}: {says}\)"):
+        read_recording(tmp_path)
+
+
+def test_a_sensor_that_was_restarted_far_from_the_wrap(tmp_path):
+    """Its counter is at 0 again: that is no gap of four minutes."""
+    session(tmp_path, list(PLACEMENTS), start=40_000)
+    head = tmp_path / "head.txt"
+    lines = head.read_text().splitlines(keepends=True)
+    lines[65:] = [re.sub(r"^\d+", str(i), line) for i, line in enumerate(lines[65:])]
+    head.write_text("".join(lines))
+    recording = read_session(tmp_path)
+    assert recording.damage == (
+        f"{head}: 40 bad rows left out, the first: row 66 is not after the row before it; if the sensor was "
+        "restarted there, split the file"
+    )
+    assert recording.sensors["head"].time_s[-1] == pytest.approx(0.59)
+
+
+def test_two_recordings_in_one_folder(tmp_path):
+    session(tmp_path, [f"{name}_000-000" for name in PLACEMENTS])
+    session(tmp_path, [f"{name}_001-000" for name in PLACEMENTS])
+    with pytest.raises(EdgeposeError, match=r"are both \w+; rename one, or give each recording a folder of"):
+        read_session(tmp_path)
