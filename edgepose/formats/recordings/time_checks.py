@@ -41,10 +41,12 @@ def find_clocks_apart(recording: Recording, name: str) -> str | None:
         recording: as read.
         name: of the file, for the message.
     """
-    sensors = recording.sensors
-    first = min(sensors, key=lambda sensor: sensors[sensor].time_s[-1])
-    last = max(sensors, key=lambda sensor: sensors[sensor].time_s[0])
-    end_s, start_s = sensors[first].time_s[-1], sensors[last].time_s[0]
+    times = {sensor: data.time_s for sensor, data in recording.sensors.items() if len(data.time_s) >= _FEWEST}
+    if not times:
+        return None
+    first = min(times, key=lambda sensor: times[sensor][-1])
+    last = max(times, key=lambda sensor: times[sensor][0])
+    end_s, start_s = times[first][-1], times[last][0]
     if start_s <= end_s:
         return None
     return (

@@ -543,3 +543,12 @@ def test_documented_conversions_work(command, tmp_path):
     for words in documented("convert"):
         result = command("convert", *words, cwd=tmp_path)
         assert result.returncode == 0, (words, result.stdout, result.stderr)
+
+
+def test_files_that_systems_leave_in_folders(tmp_path):
+    folder = tmp_path / "take"
+    (folder / ".Trash").mkdir(parents=True)
+    for name in ("walk.csv", "._walk.csv", ".Trash/old.csv", "Thumbs.db"):
+        (folder / name).write_bytes(b"\0\5\26\7")
+    for source in (folder, folder / "*.*"):
+        assert [job.source.name for job in plan([source], "npz", tmp_path / "out")] == ["walk.csv"]
