@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
+from pathlib import Path
 from typing import Any
 
 import can
@@ -81,6 +83,9 @@ class CanBus:
         if interface not in can.VALID_INTERFACES:
             known = ", ".join(sorted(can.VALID_INTERFACES))
             raise DeviceError(f"{name}: no CAN interface {interface!r}; python-can has {known}")
+        # A bus that is down can be opened, but not read.
+        if interface == "socketcan" and is_down(channel):
+            raise DeviceError(f"{name}: it is down; {_bring_up(channel)}")
         flags: dict[str, Any] = {"fd": True} if fd else {}
         try:
             self._bus = can.Bus(channel or None, interface, bitrate=bitrate, **flags)
@@ -121,13 +126,27 @@ class CanBus:
             self._bus.shutdown()
 
 
+def is_down(channel: str, interfaces: Path = Path("/sys/class/net")) -> bool:
+    """Return whether a network interface exists and is down; `interfaces` is where Linux lists them."""
+    try:
+        return not int((interfaces / channel / "flags").read_text(), 16) & 1  # IFF_UP
+    except (OSError, ValueError):
+        return False
+
+
+def _bring_up(channel: str) -> str:
+    return f"bring it up with  sudo ip link set {channel or 'can0'} up type can bitrate 500000"
+
+
 def _opening_problem(interface: str, channel: str, error: Exception) -> str:
     text = (str(error).splitlines() or [""])[0] or type(error).__name__
     if interface == "socketcan":
-        return (
-            f"cannot open it: {text}; bring it up with  "
-            f"sudo ip link set {channel or 'can0'} up type can bitrate 500000"
-        )
+        if getattr(error, "errno", None) == errno.EAFNOSUPPORT:
+            return (
+                "this system has no CAN sockets; load them with  sudo modprobe can_raw  or, where they are "
+                "missing (WSL, some containers), use slcan:PORT"
+            )
+        return f"cannot open it: {text}; {_bring_up(channel)}"
     if isinstance(error, can.CanInterfaceNotImplementedError | ImportError):
         return f"python-can cannot use this interface here: {text}; install the vendor's driver and library"
     return f"cannot open it: {text}; see python-can's page on {interface} for the names of its channels"

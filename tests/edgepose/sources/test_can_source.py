@@ -12,6 +12,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import open_source
+from edgepose.sources.can_bus import is_down
 from firmware_protocols import native_can
 from firmware_protocols.native_packet import Info, Packet
 from firmware_protocols.registry import PROTOCOLS
@@ -313,3 +314,18 @@ def ids(folder):
     path = folder / "ids.toml"
     path.write_text("\n".join(f"{name} = {{ id = {40 + i} }}" for i, name in enumerate(PLACEMENTS)))
     return path
+
+
+def test_an_interface_that_is_down(tmp_path):
+    """The numbers are those of Linux for a CAN interface before and after `ip link set can0 up`."""
+    for name, flags in (("can0", "0x40080\n"), ("can1", "0x400c1\n"), ("odd", "what\n")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "flags").write_text(flags)
+    assert [is_down(name, tmp_path) for name in ("can0", "can1", "odd", "none")] == [
+        True,
+        False,
+        False,
+        False,
+    ]
+    with pytest.raises(EdgeposeError, match="no CAN sockets; load them with|bring it up with"):
+        everything(can="socketcan:nosuch0")
