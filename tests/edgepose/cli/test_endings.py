@@ -15,6 +15,7 @@ import time
 
 import pytest
 
+from edgepose.cli.terminal.stop_signal import REPEAT_S, StopSignal
 from edgepose.formats.poses.registry import read_poses
 from tests.support import processes
 
@@ -201,3 +202,15 @@ def test_a_user_without_a_home(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert "birnn" in done.stdout
+
+
+def test_a_signal_that_comes_twice_and_one_that_is_meant():
+    before = signal.getsignal(signal.SIGINT)
+    with StopSignal() as stop:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGTERM)
+        assert stop.asked
+        time.sleep(REPEAT_S + 0.05)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) == before
