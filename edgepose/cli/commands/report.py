@@ -9,7 +9,7 @@ import click
 
 from edgepose.cli.options.outputs import overwrite_option
 from edgepose.cli.terminal.messages import show
-from edgepose.utils.output_targets import check_output
+from edgepose.output_files import check_output
 
 
 @click.command()
