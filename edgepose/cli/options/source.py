@@ -77,8 +77,8 @@ def source_options(command: Callable[..., Any]) -> Callable[..., Any]:
             "--file",
             type=click.Path(path_type=Path),
             help="Read a file instead: a recording ("
-            f"{', '.join(reader.files for reader in READERS.values())}), a raw serial capture (.bin, .raw) or "
-            "a log of a CAN bus (.asc, .blf, .log, .mf4, .trc, .csv of python-can).",
+            f"{', '.join(reader.files for reader in READERS.values())}), a raw serial capture (.bin, .raw) "
+            "or a log of a CAN bus (.asc, .blf, .log, .mf4, .trc, .csv of python-can).",
         ),
         click.option(
             "--realtime", is_flag=True, help="Replay --file at its own pace instead of as fast as possible."

@@ -153,7 +153,7 @@ WRITERS: dict[str, Writer] = {
 
 
 def writer(name: str) -> Writer:
-    """Return the function that writes a format, the one above or `write_recording` in the format's own test."""
+    """Return the function that writes a format: one of the above, or `write_recording` of its own test."""
     if name in WRITERS:
         return WRITERS[name]
     test: Any = import_module(f"tests.edgepose.formats.recordings.test_{name.replace('-', '_')}")

@@ -119,6 +119,6 @@ def test_endings_of_files_that_are_read_or_written():
 def test_no_output_replaces_a_file_of_another_kind(tmp_path, ending):
     other = tmp_path / f"walk{ending}"
     other.write_bytes(OLD)
-    with pytest.raises(EdgeposeError, match="is the ending of another kind of file; for poses use .csv"):
+    with pytest.raises(EdgeposeError, match="is the ending of another kind of file; for poses use"):
         check_output(other, "poses", (".csv",), True)
     check_output(tmp_path / "walk.2026-11-30", "poses", (".csv",), True)
