@@ -47,7 +47,7 @@ def _list() -> None:
         about = archive.read_info(path).metadata
         frames = (
             f"{about['past']} past, {about['future']} future"
-            if about["kind"] == "birnn"
+            if about["past"] or about["future"]
             else "1, no look-ahead"
         )
         size = f"{path.stat().st_size / 1e6:.1f} MB"

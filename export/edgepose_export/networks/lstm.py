@@ -10,6 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from edgepose_export.networks.kind import NetworkKind, Statistics
 from edgepose_export.networks.normalisation import network_inputs, tilt_of
 from edgepose_export.networks.packed_linear import PackedLinear
 from edgepose_export.networks.shape import SIGMA_FLOOR, PoseDecoder, PoseNetwork, turned
@@ -389,3 +390,25 @@ class BirnnArchive(nn.Module):
 def _fields(waiting: Tensor, count: int, future: int) -> Tensor:
     """Return the frames that each of the `count` oldest of (B, T, N) uses, (B * count, future + 1, N)."""
     return waiting.narrow(1, 0, count + future).unfold(1, future + 1, 1).transpose(2, 3).flatten(0, 1)
+
+
+def _ends(network: PoseNetwork, statistics: Statistics, decoder: PoseDecoder) -> NormalisationAndDecoding:
+    return NormalisationAndDecoding(network, statistics.input_mean, statistics.input_std, decoder)
+
+
+BIRNN = NetworkKind(
+    PoseNetwork,
+    lambda network, *ends: BirnnArchive(network, _ends(network, *ends)),
+    "bidirectional LSTM; the pose of a frame is known once its {future} future frames have arrived "
+    "({latency:.0f} ms); two layers with {hidden} units per direction",
+    windowed=True,
+    streamed=True,
+    smoothed=True,
+)
+
+RNN = NetworkKind(
+    PoseNetwork,
+    lambda network, *ends: RnnArchive(network, _ends(network, *ends)),
+    "unidirectional LSTM; the pose of a frame is known at once; two layers with {hidden} units per direction",
+    smoothed=True,
+)

@@ -8,11 +8,13 @@ ends of a sequence, the first and last frames are repeated to fill the field.
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from edgepose.inference.features import ACCELERATIONS
+from edgepose_export.networks.kind import Network, NetworkKind, Statistics
 from edgepose_export.networks.normalisation import Inputs
 from edgepose_export.networks.shape import SIGMA_FLOOR, NetworkShape, PoseDecoder
 
@@ -43,7 +45,7 @@ def padded(x: Tensor, past: int, future: int) -> Tensor:
     return torch.cat([before, x, behind], dim=1)
 
 
-class FeedForward(nn.Module):
+class FeedForward(Network):
     """Five dense layers over 20 past frames, the present one and 5 future ones."""
 
     def __init__(self, shape: NetworkShape) -> None:
@@ -88,7 +90,7 @@ class _DilatedLayer(nn.Module):
         return self.residual(z) + x[:, :, self.reach :], self.skip(z)
 
 
-class WaveNet(nn.Module):
+class WaveNet(Network):
     """Ten layers of causal dilated convolutions: a long past and no future frames."""
 
     def __init__(self, shape: NetworkShape) -> None:
@@ -127,7 +129,7 @@ class FieldArchive(nn.Module):
     each contains the whole field.
     """
 
-    def __init__(self, network: FeedForward | WaveNet, inputs: Inputs, decoder: PoseDecoder) -> None:
+    def __init__(self, network: Any, inputs: Inputs, decoder: PoseDecoder) -> None:
         """Combine a trained network with its inputs and its decoder."""
         super().__init__()
         self.network, self.inputs, self.decoder = network, inputs, decoder
@@ -219,3 +221,25 @@ class FieldArchive(nn.Module):
             rotations.append(rotation.unsqueeze(1))
             stds.append(std.unsqueeze(1))
         return torch.cat(rotations, dim=1), torch.cat(stds, dim=1)
+
+
+def field_archive(network: Network, statistics: Statistics, decoder: PoseDecoder) -> FieldArchive:
+    """Return the archive's module for a network over a receptive field."""
+    shape = network.shape
+    inputs = Inputs(shape.normalisation, shape.acceleration, statistics.input_mean, statistics.input_std)
+    return FieldArchive(network, inputs, decoder)
+
+
+FEED_FORWARD = NetworkKind(
+    FeedForward,
+    field_archive,
+    "five dense layers over {past} past and {future} future frames; the pose of a frame is known once these "
+    "have arrived ({latency:.0f} ms); {hidden} units in the widest layer",
+)
+
+WAVENET = NetworkKind(
+    WaveNet,
+    field_archive,
+    "dilated convolutions over {past} past frames; the pose of a frame is known at once; {hidden} units in "
+    "the widest layer",
+)
