@@ -1,4 +1,4 @@
-"""`edgepose calibrate`: make a calibration file from a known pose, held live or in a recording."""
+"""`edgepose calibrate`: find out how the sensors sit on the wearer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`edgepose convert`: convert recordings and poses of any kind to CSV, NPZ or BVH, many at once."""
+"""`edgepose convert`: convert recordings, captures and poses."""
 
 from __future__ import annotations
 

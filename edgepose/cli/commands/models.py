@@ -1,4 +1,4 @@
-"""`edgepose models`: list model archives and show their cards."""
+"""`edgepose models`: list model archives, show their cards."""
 
 from __future__ import annotations
 

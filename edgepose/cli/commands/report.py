@@ -1,4 +1,4 @@
-"""`edgepose report`: make a page about the poses of a file."""
+"""`edgepose report`: make a page with the angles, steps and sensors of poses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`edgepose solve`: find the poses of a whole recording at once, without a network."""
+"""`edgepose solve`: find the poses of a whole recording, without a network."""
 
 from __future__ import annotations
 
