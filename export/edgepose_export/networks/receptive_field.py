@@ -25,10 +25,11 @@ DILATIONS = (1, 2, 4, 8, 16) * 2
 """Distance of these frames, by layer: a field of 62 past frames. DIP does not state the sizes."""
 
 
-class _Heads(nn.Module):
+class Heads(nn.Module):
     """Means and, through SoftPlus, standard deviations, as in the recurrent networks (DIP figure 12)."""
 
     def __init__(self, width: int, shape: NetworkShape) -> None:
+        """Create random weights for inputs of this width."""
         super().__init__()
         outputs = shape.pose_outputs + ACCELERATIONS
         self.mean = nn.Linear(width, outputs)
@@ -36,6 +37,7 @@ class _Heads(nn.Module):
         self.floor = SIGMA_FLOOR
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Return means and deviations (..., outputs) for (..., width)."""
         return self.mean(x), nn.functional.softplus(self.deviation(x)) + self.floor
 
 
@@ -58,7 +60,7 @@ class FeedForward(Network):
         # A dense layer over the field of every frame is a convolution.
         self.first = nn.Conv1d(shape.inputs, widths[0], self.past + 1 + self.future)
         self.others = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
-        self.heads = _Heads(widths[-1], shape)
+        self.heads = Heads(widths[-1], shape)
 
     def hidden(self, x: Tensor) -> Tensor:
         """Return the last layer (B, T, units) for z-scored inputs (B, past + T + future, inputs)."""
@@ -104,7 +106,7 @@ class WaveNet(Network):
             _DilatedLayer(shape.hidden, dilation, i == last) for i, dilation in enumerate(DILATIONS)
         )
         self.out = nn.Linear(shape.hidden, shape.hidden)
-        self.heads = _Heads(shape.hidden, shape)
+        self.heads = Heads(shape.hidden, shape)
 
     def hidden(self, x: Tensor) -> Tensor:
         """Return the last layer (B, T, units) for z-scored inputs (B, past + T, inputs)."""
