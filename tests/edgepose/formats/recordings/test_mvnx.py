@@ -140,7 +140,7 @@ def test_bad_frames_cost_only_themselves(tmp_path):
     found = read_mvnx(path)
     assert f"{path}: 3 bad frames left out; {path}: 1 incomplete sensorMagneticField" in found.damage
     assert f"{path}: 1 bad rows left out" in found.damage
-    assert "head has a quaternion that is not of unit length" in found.damage
+    assert "(head) has a quaternion that is not of unit length" in found.damage
     assert {name: len(data.time_s) for name, data in found.sensors.items()} == {
         name: FRAMES - 4 if name == "head" else FRAMES - 3 for name in PLACEMENTS
     }

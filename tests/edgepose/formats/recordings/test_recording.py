@@ -324,7 +324,7 @@ def npz(path, **changes):
         ({"pelvis_acc": np.full((300, 3), np.nan)}, "row 0 (pelvis)"),
         ({"pelvis_acc": np.ones((300, 4))}, "'pelvis_acc'"),
         ({"pelvis_acc": np.full((300, 3), "a")}, "'pelvis_acc'"),
-        ({"head_quat": np.ones((300, 4))}, "head has a quaternion"),
+        ({"head_quat": np.ones((300, 4))}, "(head) has a quaternion"),
         ({"hat_acc": np.ones((300, 3))}, "'hat_acc'"),
         ({"metadata": np.ones(3)}, "'metadata'"),
         ({"head_quat": None, "head_acc": None, "head_gyr": None}, "no samples of head"),
