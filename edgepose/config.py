@@ -127,14 +127,17 @@ class OutputConfig:
                 mean no such output.
 
         Raises:
-            ConfigError: an output is unknown or given twice, a target or the representation is invalid.
+            ConfigError: an output is unknown, given twice or in the wrong place, or a value is invalid.
         """
         if unknown := outputs.keys() - SINKS.keys():
             raise ConfigError(f"unknown output {min(unknown)!r}; outputs are {', '.join(SINKS)}")
+        sinks = sinks or {}
+        if own := sinks.keys() & SINKS.keys():
+            raise ConfigError(f"{min(own)} is not an output of another package: give --{min(own)}")
         pairs = [
             *targets,
             *((name, outputs[name]) for name in SINKS if name in outputs),
-            *(sinks or {}).items(),
+            *sinks.items(),
         ]
         pairs = [
             (name, _target(name, value)) for name, value in pairs if value is not None and value is not False

@@ -45,8 +45,10 @@ class Output:
         """Return the sink's target for a value: text is parsed, anything else is a target already.
 
         Raises:
-            ConfigError: the text has another form.
+            ConfigError: the text has another form, or a switch is not True.
         """
+        if self.metavar is None and value is not True:
+            raise ConfigError(f"{value!r} is neither True nor False")
         return self.parse(str(value)) if isinstance(value, str | Path) else value
 
 

@@ -186,7 +186,7 @@ def test_every_output_has_a_flag_in_the_order_of_the_table():
     for name, output in SINKS.items():
         assert name.isidentifier()
         assert callable(sink_factory(name))
-        assert not (output.suffix and output.metavar != "FILE")
+        assert bool(output.suffix) == (output.metavar == "FILE")
 
 
 @pytest.mark.parametrize(
@@ -198,7 +198,9 @@ def test_every_output_has_a_flag_in_the_order_of_the_table():
         (lambda: edgepose.OutputConfig(rotations="rodrigues"), "is not one of"),
         (lambda: edgepose.OutputConfig(cvs="a.csv"), "unknown output 'cvs'; outputs are csv, npz, "),
         (lambda: edgepose.OutputConfig(udp="127.0.0.1"), "udp: no port in '127.0.0.1'"),
-        (lambda: edgepose.OutputConfig(csv="a.csv", sinks={"csv": "b"}), "csv is given twice"),
+        (lambda: edgepose.OutputConfig([("csv", "a"), ("csv", "b")]), "csv is given twice"),
+        (lambda: edgepose.OutputConfig(sinks={"csv": "a"}), "csv is not an output of another package"),
+        (lambda: edgepose.OutputConfig(view="no"), "view: 'no' is neither True nor False"),
     ],
 )
 def test_configurations_that_mean_nothing(make, says):
