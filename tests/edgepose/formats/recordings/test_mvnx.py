@@ -297,3 +297,29 @@ def test_sensors_that_measure_nothing_that_is_read(tmp_path):
     )
     with pytest.raises(EdgeposeError, match="neither orientations nor accelerations that can be"):
         salvage_recording(path)
+
+
+def write_recording(path: Path, recording: Recording) -> Path:
+    frames = len(recording.sensors["head"].time_s)
+    data = recording.sensors.values()
+    rows = []
+    for i in range(frames):
+        quats = " ".join(cell for d in data for cell in _cells(*d.quat[i]))
+        free = " ".join(
+            cell for d in data for cell in _cells(*(quat_rotate(d.quat[i], d.acc[i]) - [0.0, 0.0, GRAVITY]))
+        )
+        rows.append(
+            f'<frame time="{1000 * i // 60}" type="normal"><sensorOrientation>{quats}</sensorOrientation>'
+            f"<sensorFreeAcceleration>{free}</sensorFreeAcceleration></frame>\n"
+        )
+    sensors = "".join(f'<sensor label="{label}"/>' for label in LABELS)
+    path = path.with_suffix(".mvnx")
+    path.write_text(
+        f'<mvnx version="4"><subject frameRate="60"><sensors>{sensors}</sensors>\n'
+        f"<frames>{''.join(rows)}</frames></subject></mvnx>\n"
+    )
+    return path
+
+
+def _cells(*values: float) -> list[str]:
+    return [f"{value:.7f}" for value in values]
