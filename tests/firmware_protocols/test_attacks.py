@@ -60,6 +60,8 @@ SLOW = [
 def beginnings(name):
     """The first bytes of a message."""
     protocol = PROTOCOLS[name]
+    if protocol.encoder is None:
+        return []
     sensor = protocol.ids[0] if protocol.ids else 0
     message = protocol.encode(STILL._replace(sensor=sensor, mag=(20.0, 0.0, -40.0), temperature=25.0), 0)
     return [message[:size] for size in (1, 2, 3, 5, 8, 12)]
