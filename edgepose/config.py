@@ -7,42 +7,23 @@ WearerConfig(source=SourceConfig(port="/dev/ttyUSB0"), calibration=Path("calib.j
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from edgepose.errors import ConfigError, EdgeposeError
 from edgepose.formats.poses.csv_columns import ROTATION_FORMATS
 from edgepose.imu import FILTERS
-from edgepose.utils.output_targets import check_output, is_stream, part_path
-from edgepose.utils.sockets import Destination, parse_address, parse_destination
+from edgepose.output_files import check_output
+from edgepose.sinks.registry import SINKS
+from edgepose.utils.output_targets import is_stream
+from edgepose.utils.sockets import parse_host_and_port
 from edgepose.utils.text_files import read_toml
 
 ANY_OUTPUT = "give at least one output, such as --csv FILE, --udp HOST:PORT or --view"
 ONE_SOURCE = "give one source: --port PORT, --can INTERFACE:CHANNEL or --file PATH"
-
-
-def parse_host_and_port(text: str) -> tuple[str, int]:
-    """Parse a text that is exactly HOST:PORT.
-
-    Raises:
-        ConfigError: the text is something else.
-    """
-    if "," in text:
-        raise ConfigError(f"{text!r} is more than HOST:PORT")
-    return parse_address(text)
-
-
-FILE_OUTPUTS = ("csv", "npz", "bvh")
-"""Outputs to a file with that ending. It must not be an input, and is replaced only with --overwrite."""
-
-NETWORK_OUTPUTS: dict[str, Callable[[str], Any]] = {
-    "udp": parse_destination,
-    "osc": parse_host_and_port,
-    "tcp": parse_host_and_port,
-}
-"""Outputs to an address, with the parser of the address."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,58 +82,97 @@ class SourceConfig:
         return {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, init=False)
 class OutputConfig:
-    """The outputs of a run; those that are None or false are not written.
+    """The outputs of a run, by the names in `edgepose.sinks.registry.SINKS`.
+
+    OutputConfig(csv="poses.csv", udp="127.0.0.1:9000", view=True, height=1.68)
 
     Attributes:
-        csv: CSV file; "-" is standard output.
+        targets: name and target of each output. The target of the output NAME is also the attribute NAME,
+            which is None if it is not written.
         rotations: representation of rotations in the CSV.
         std: add the network's standard deviations to the CSV.
-        npz: NPZ file.
-        bvh: BVH file.
-        udp: destination of datagrams.
-        osc: host and port of a VMC receiver.
-        tcp: address to listen on for viewers.
-        view: show a figure in the browser.
         height: the wearer's stature, metres.
         overwrite: replace existing files.
-        sinks: targets of outputs from other packages (entry points `edgepose.sinks`), by output name.
     """
 
-    csv: str | None = None
-    rotations: str = "axis-angle"
-    std: bool = False
-    npz: str | None = None
-    bvh: str | None = None
-    udp: Destination | None = None
-    osc: tuple[str, int] | None = None
-    tcp: tuple[str, int] | None = None
-    view: bool = False
-    height: float = 1.75
-    overwrite: bool = False
-    sinks: Mapping[str, str] = field(default_factory=dict)
+    targets: tuple[tuple[str, Any], ...]
+    rotations: str
+    std: bool
+    height: float
+    overwrite: bool
 
-    def __post_init__(self) -> None:
-        """Raise ConfigError for an unknown representation of rotations."""
-        if self.rotations not in ROTATION_FORMATS:
+    def __init__(
+        self,
+        targets: Iterable[tuple[str, Any]] = (),
+        *,
+        rotations: str = "axis-angle",
+        std: bool = False,
+        height: float = 1.75,
+        overwrite: bool = False,
+        sinks: Mapping[str, str] | None = None,
+        **outputs: Any,
+    ) -> None:
+        """Parse the targets.
+
+        Args:
+            targets: outputs as pairs of name and target.
+            rotations: representation of rotations in the CSV.
+            std: add the network's standard deviations to the CSV.
+            height: the wearer's stature, metres.
+            overwrite: replace existing files.
+            sinks: targets of outputs from other packages (entry points `edgepose.sinks`), by output name.
+            **outputs: targets of this package's outputs, as text or parsed; True for `view`. None and False
+                mean no such output.
+
+        Raises:
+            ConfigError: an output is unknown, given twice or in the wrong place, or a value is invalid.
+        """
+        if unknown := outputs.keys() - SINKS.keys():
+            raise ConfigError(f"unknown output {min(unknown)!r}; outputs are {', '.join(SINKS)}")
+        sinks = sinks or {}
+        if own := sinks.keys() & SINKS.keys():
+            raise ConfigError(f"{min(own)} is not an output of another package: give --{min(own)}")
+        pairs = [
+            *targets,
+            *((name, outputs[name]) for name in SINKS if name in outputs),
+            *sinks.items(),
+        ]
+        pairs = [
+            (name, _target(name, value)) for name, value in pairs if value is not None and value is not False
+        ]
+        if repeated := [name for name, count in Counter(name for name, _ in pairs).items() if count > 1]:
+            raise ConfigError(f"the output {repeated[0]} is given twice")
+        if rotations not in ROTATION_FORMATS:
             raise ConfigError(
-                f"rotations: {self.rotations!r} is not one of {', '.join(map(repr, ROTATION_FORMATS))}"
+                f"rotations: {rotations!r} is not one of {', '.join(map(repr, ROTATION_FORMATS))}"
             )
+        values = (tuple(pairs), rotations, std, height, overwrite)
+        for each, value in zip(dataclasses.fields(self), values, strict=True):
+            object.__setattr__(self, each.name, value)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return the target of an output of this package, None if it is not written."""
+        if name not in SINKS:
+            raise AttributeError(f"OutputConfig has no attribute {name!r}")
+        return dict(self.targets).get(name)
 
     @property
     def any(self) -> bool:
         """Whether there is any output."""
-        targets = (getattr(self, name) for name in (*FILE_OUTPUTS, *NETWORK_OUTPUTS))
-        return self.view or bool(self.sinks) or any(target is not None for target in targets)
+        return bool(self.targets)
 
     @property
-    def files(self) -> dict[str, str | None]:
+    def files(self) -> dict[str, str | Path | None]:
         """The files that are written, by flag."""
-        # During a run, the poses for an NPZ file are in a CSV file next to it.
-        growing = None if self.npz is None or is_stream(self.npz) else str(part_path(self.npz))
-        by_flag = {f"--{name}": getattr(self, name) for name in FILE_OUTPUTS}
-        return by_flag | {"--npz (while it grows)": growing}
+        files: dict[str, str | Path | None] = {}
+        for name, target in self._files():
+            part = SINKS[name].part
+            files[f"--{name}"] = target
+            if part is not None and not is_stream(target):
+                files[f"--{name} (while it grows)"] = part(target)
+        return files
 
     def check(self) -> None:
         """Check that no existing file would be lost.
@@ -160,10 +180,26 @@ class OutputConfig:
         Raises:
             EdgeposeError: a file exists already, or cannot be written.
         """
-        for name in FILE_OUTPUTS:
-            path = getattr(self, name)
-            if path is not None:
-                check_output(path, "poses", (f".{name}",), self.overwrite)
+        for name, target in self._files():
+            check_output(target, "poses", (SINKS[name].suffix,), self.overwrite)
+
+    def _files(self) -> list[tuple[str, str]]:
+        return [(name, target) for name, target in self.targets if name in SINKS and SINKS[name].suffix]
+
+
+def _target(name: str, value: Any) -> Any:
+    if name not in SINKS:
+        return value
+    try:
+        return SINKS[name].target(value)
+    except ConfigError as error:
+        raise ConfigError(f"{name}: {error}") from None
+
+
+def setting_names(config: type) -> tuple[str, ...]:
+    """Return the keywords of a configuration class."""
+    names = tuple(each.name for each in dataclasses.fields(config))
+    return (*SINKS, *names[1:], "sinks") if config is OutputConfig else names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -231,13 +267,11 @@ class WearerConfig:
         """
         values = dict(values)
 
-        def take_fields(kind: type) -> dict[str, Any]:
-            return {
-                each.name: values.pop(each.name) for each in dataclasses.fields(kind) if each.name in values
-            }
+        def take_settings(kind: type) -> dict[str, Any]:
+            return {name: values.pop(name) for name in setting_names(kind) if name in values}
 
-        source = SourceConfig(**take_fields(SourceConfig))
-        outputs = OutputConfig(**take_fields(OutputConfig))
+        source = SourceConfig(**take_settings(SourceConfig))
+        outputs = OutputConfig(**take_settings(OutputConfig))
         if values.get("calibration") is None:
             raise ConfigError("calibration is missing")
         return cls(source=source, outputs=outputs, **values, **more)
@@ -249,7 +283,7 @@ _TEXT, _SWITCH, _WHOLE, _NUMBER = "text in quotes", "true or false", "a whole nu
 
 _TYPES: dict[str, tuple[type, ...]] = {_TEXT: (str,), _SWITCH: (bool,), _WHOLE: (int,), _NUMBER: (int, float)}
 
-_FILES = ("file", "sensors", "calibration", *FILE_OUTPUTS)
+_FILES = ("file", "sensors", "calibration", *(name for name, output in SINKS.items() if output.suffix))
 """Keys whose values are files, relative to the TOML file; that of `protocol` may be one too."""
 
 _KEYS = {
@@ -265,10 +299,9 @@ _KEYS = {
     "filter": _TEXT,
     "no-mag": _SWITCH,
     "calibration": _TEXT,
-    **dict.fromkeys((*FILE_OUTPUTS, *NETWORK_OUTPUTS), _TEXT),
+    **{name: _SWITCH if output.metavar is None else _TEXT for name, output in SINKS.items()},
     "rotations": _TEXT,
     "std": _SWITCH,
-    "view": _SWITCH,
     "height": _NUMBER,
     "overwrite": _SWITCH,
     "control": _TEXT,
@@ -303,7 +336,6 @@ def _text(key: str, value: str, folder: Path) -> Any:
     parse: dict[str, Callable[[str], Any]] = {
         "protocol": lambda name: str(folder / name) if name.endswith(".toml") else checked_protocol(name),
         "control": parse_host_and_port,
-        **NETWORK_OUTPUTS,
     }
     if key not in parse:
         return value

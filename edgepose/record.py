@@ -19,12 +19,12 @@ from edgepose.formats.recordings.npz import write_npz
 from edgepose.formats.recordings.raw_capture import times_header, times_path, times_row
 from edgepose.formats.recordings.registry import salvage_recording
 from edgepose.imu import ImuSample
+from edgepose.output_files import check_output
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import Batch, Source
 from edgepose.sources.replay import CAPTURES
 from edgepose.utils.durable_files import replace_file
 from edgepose.utils.growing_files import DurableAppender
-from edgepose.utils.output_targets import check_output
 
 CAN_LOGS = (".asc", ".blf", ".log")
 """Endings of the CAN logs that can be written; .trc is missing: python-can would drop the CAN FD frames."""

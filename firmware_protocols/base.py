@@ -64,7 +64,7 @@ class Protocol:
         name: the name that users type.
         transport: "bytes" on a serial line or frames on a "can" bus.
         default_bitrate: usual baud or bit rate of the devices as delivered, bit/s.
-        description: one line that describes the format.
+        description: one line that describes the sensors and the format.
         decoder: creates a decoder. Two protocols may share one and then differ by name only: detection
             reports the first of them.
         encoder: creates a function that encodes samples; create one per line, because some keep counters. If
@@ -75,6 +75,9 @@ class Protocol:
             with a heading of its own.
         request: for devices that send only on request: returns the request for one sample of the device with
             an id, and the length of the answer in bytes.
+        lacks: what its samples never have: "time", "quat", "acc".
+        setup: what a device must be set to, as text for users; empty if it is right as delivered.
+        page: its page in `docs/`, without ".md"; by default its name.
     """
 
     name: str
@@ -87,6 +90,9 @@ class Protocol:
     single_device: bool = False
     common_heading: bool = True
     request: Callable[[int], tuple[bytes, int]] | None = None
+    lacks: Sequence[Literal["time", "quat", "acc"]] = ()
+    setup: str = ""
+    page: str = ""
 
     @property
     def wrap_us(self) -> int:

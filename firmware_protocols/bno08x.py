@@ -133,9 +133,11 @@ PROTOCOL = Protocol(
     name="bno08x-rvc",
     transport="bytes",
     default_bitrate=115200,
-    description="BNO08x in UART-RVC mode: angles without a common heading, acceleration",
+    description="BNO08x in UART-RVC mode",
     decoder=Bno08xDecoder,
     encoder=lambda: encode,
     single_device=True,
     common_heading=False,
+    lacks=("time",),
+    page="bno08x",
 )

@@ -136,4 +136,5 @@ PROTOCOL = Protocol(
     encoder=uncounted(encode),
     ids=range(6),
     common_heading=False,
+    lacks=("time",),
 )

@@ -366,9 +366,10 @@ PROTOCOL = Protocol(
     name="hipnuc",
     transport="bytes",
     default_bitrate=115200,
-    description="HiPNUC HI2xx, CH0x0, CH10x, HI221 and its wireless receiver",
+    description="HiPNUC HI2xx, CH0x0, CH10x; ids are those of the wireless receiver",
     decoder=HipnucDecoder,
     encoder=uncounted(encode),
     ids=range(6),
     single_device=True,
+    setup="frame 0x91",
 )

@@ -226,18 +226,24 @@ PROTOCOL_CANOPEN = Protocol(
     name="hipnuc-canopen",
     transport="can",
     default_bitrate=500_000,
-    description="HiPNUC CANopen process data; ids are node ids",
+    description="HiPNUC on CANopen; ids are node ids",
     decoder=HipnucCanopenDecoder,
     encoder=uncounted_can(encode_canopen),
     ids=range(1, 7),
+    lacks=("time",),
+    setup="acceleration and quaternion at one rate, and nothing faster",
+    page="hipnuc",
 )
 
 PROTOCOL_J1939 = Protocol(
     name="hipnuc-j1939",
     transport="can",
     default_bitrate=500_000,
-    description="HiPNUC J1939 groups, CAN 2.0 and CAN FD; ids are source addresses",
+    description="HiPNUC on J1939, CAN 2.0 and CAN FD; ids are source addresses",
     decoder=HipnucJ1939Decoder,
     encoder=uncounted_can(encode_j1939),
     ids=range(1, 7),
+    lacks=("time",),
+    setup="acceleration and quaternion at one rate, and nothing faster",
+    page="hipnuc",
 )

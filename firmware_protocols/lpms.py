@@ -164,9 +164,10 @@ PROTOCOL = Protocol(
     name="lpms",
     transport="bytes",
     default_bitrate=115200,
-    description="LP-Research LPMS, set to send rate, acceleration, field and quaternion as f32",
+    description="LP-Research LPMS",
     decoder=LpmsDecoder,
     encoder=uncounted(encode),
     ids=range(1, 7),
     single_device=True,
+    setup="rate, acceleration, field, quaternion, as floats",
 )

@@ -246,9 +246,10 @@ PROTOCOL = Protocol(
     name="mavlink",
     transport="bytes",
     default_bitrate=57600,
-    description="MAVLink 1 and 2 (needs pymavlink); ids are system id << 8 | component id",
+    description="autopilot boards: MAVLink 1 and 2; ids are system id * 256 + component id",
     decoder=MavlinkDecoder,
     encoder=_encoder,
     ids=[system << 8 | 1 for system in range(1, 7)],
     single_device=True,
+    setup='attitude quaternion and an IMU message; needs `pip install "edgepose[mavlink]"`',
 )

@@ -276,4 +276,5 @@ PROTOCOL = Protocol(
     decoder=MipDecoder,
     encoder=uncounted(encode),
     single_device=True,
+    setup="acceleration, rate, quaternion, reference time",
 )

@@ -185,8 +185,9 @@ PROTOCOL = Protocol(
     name="native",
     transport="bytes",
     default_bitrate=115200,
-    description="edgepose's own packet: COBS and CRC-16, many sensors on one line",
+    description="self-built boards: edgepose's own packet",
     decoder=NativeDecoder,
     encoder=_encoder,
     ids=range(6),
+    page="../README",
 )

@@ -280,8 +280,9 @@ PROTOCOL = Protocol(
     name="native-can",
     transport="can",
     default_bitrate=500_000,
-    description="edgepose's own packet on CAN 2.0 and CAN FD",
+    description="self-built boards: edgepose's own packet on CAN 2.0 and CAN FD",
     decoder=NativeCanDecoder,
     encoder=_encoder,
     ids=range(6),
+    page="../README",
 )

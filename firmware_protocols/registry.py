@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 GROUP = "edgepose.protocols"
 """Group of the entry points of other packages: name of the format -> its `Protocol`."""
 
-_BUILT_IN = {
+BUILT_IN = {
     "native": "native:PROTOCOL",
     "native-can": "native_can:PROTOCOL",
     "xsens": "xsens:PROTOCOL",
@@ -51,28 +51,28 @@ _BUILT_IN = {
 def protocol_names() -> tuple[str, ...]:
     """Return the names of all formats, those of other packages last, without importing any."""
     others = {point.name for point in entry_points(group=GROUP)}
-    return (*_BUILT_IN, *sorted(others - set(_BUILT_IN)))
+    return (*BUILT_IN, *sorted(others - set(BUILT_IN)))
 
 
 class _Registry(Mapping[str, Protocol]):
-    """The formats of this package in the order of `_BUILT_IN`, then those of other packages by name."""
+    """The formats of this package in the order of `BUILT_IN`, then those of other packages by name."""
 
     def __getitem__(self, name: str) -> Protocol:
-        if name not in _BUILT_IN:
+        if name not in BUILT_IN:
             return _installed()[name]
-        module, _, constant = _BUILT_IN[name].partition(":")
+        module, _, constant = BUILT_IN[name].partition(":")
         protocol: Protocol = getattr(import_module(f"firmware_protocols.{module}"), constant)
         return protocol
 
     def __contains__(self, name: object) -> bool:
-        return name in _BUILT_IN or name in _installed()
+        return name in BUILT_IN or name in _installed()
 
     def __iter__(self) -> Iterator[str]:
-        yield from _BUILT_IN
+        yield from BUILT_IN
         yield from _installed()
 
     def __len__(self) -> int:
-        return len(_BUILT_IN) + len(_installed())
+        return len(BUILT_IN) + len(_installed())
 
 
 @cache
@@ -81,7 +81,7 @@ def _installed() -> dict[str, Protocol]:
     found: dict[str, Protocol] = {}
     for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
         package = f"protocol {point.name!r} of {point.dist.name if point.dist else point.value}"
-        if point.name in _BUILT_IN or point.name in found:
+        if point.name in BUILT_IN or point.name in found:
             _log.warning("%s is ignored: the name is taken", package)
             continue
         try:

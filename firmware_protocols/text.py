@@ -277,38 +277,45 @@ PROTOCOL_ADAFRUIT = Protocol(
     name="adafruit",
     transport="bytes",
     default_bitrate=115200,
-    description='text lines "Quaternion: w, x, y, z" of sketches for Adafruit\'s libraries',
+    description='sketches for Adafruit\'s libraries: text lines "Quaternion: w, x, y, z"',
     decoder=partial(TextDecoder, "adafruit"),
     encoder=_encoder("adafruit"),
     single_device=True,
+    lacks=("time", "acc"),
+    page="text",
 )
 
 PROTOCOL_RAZOR = Protocol(
     name="razor",
     transport="bytes",
     default_bitrate=57600,
-    description='text lines "#YPR=" of the Razor AHRS firmware',
+    description='Razor AHRS firmware: text lines "#YPR="',
     decoder=partial(TextDecoder, "razor"),
     encoder=_encoder("razor"),
     single_device=True,
+    lacks=("time", "acc"),
+    page="text",
 )
 
 PROTOCOL_OPENLOG = Protocol(
     name="openlog",
     transport="bytes",
     default_bitrate=115200,
-    description="text lines of OpenLog Artemis as delivered, without orientation",
+    description="OpenLog Artemis as delivered: text lines without orientation",
     decoder=partial(TextDecoder, "artemis"),
     encoder=_encoder("artemis"),
     single_device=True,
+    lacks=("quat",),
+    page="text",
 )
 
 PROTOCOL_OPENLOG_DMP = Protocol(
     name="openlog-dmp",
     transport="bytes",
     default_bitrate=115200,
-    description="text lines of OpenLog Artemis with the sensor's own orientation",
+    description="OpenLog Artemis: text lines with the sensor's own orientation",
     decoder=partial(TextDecoder, "artemis-dmp"),
     encoder=_encoder("artemis-dmp"),
     single_device=True,
+    page="text",
 )

@@ -342,18 +342,22 @@ PROTOCOL = Protocol(
     name="vectornav",
     transport="bytes",
     default_bitrate=115200,
-    description="VectorNav binary outputs (reads the ASCII lines too)",
+    description="VectorNav VN-100 and relatives, binary outputs",
     decoder=VectorNavDecoder,
     encoder=uncounted(encode_binary),
     single_device=True,
+    setup="binary output with time, quaternion, acceleration, rate",
 )
 
 PROTOCOL_ASCII = Protocol(
     name="vectornav-ascii",
     transport="bytes",
     default_bitrate=115200,
-    description="VectorNav ASCII lines (reads the binary outputs too)",
+    description="VectorNav VN-100 and relatives, ASCII lines",
     decoder=VectorNavDecoder,
     encoder=uncounted(encode_ascii),
     single_device=True,
+    lacks=("time",),
+    setup="lines with quaternion, acceleration and rate",
+    page="vectornav",
 )

@@ -158,4 +158,5 @@ PROTOCOL = Protocol(
     decoder=WitDecoder,
     encoder=uncounted(encode),
     single_device=True,
+    setup="quaternion and time as well, at 100 Hz and 115200 baud or more",
 )

@@ -114,4 +114,7 @@ PROTOCOL = Protocol(
     decoder=WitCanDecoder,
     encoder=uncounted_can(encode_can),
     ids=range(0x50, 0x56),
+    lacks=("time",),
+    setup="an identifier each",
+    page="witmotion",
 )

@@ -171,4 +171,7 @@ PROTOCOL = Protocol(
     encoder=uncounted(encode_modbus),
     ids=range(0x50, 0x56),
     request=_request,
+    lacks=("time",),
+    setup="an address each",
+    page="witmotion",
 )

@@ -354,4 +354,5 @@ PROTOCOL = Protocol(
     decoder=Ximu3Decoder,
     encoder=uncounted(encode),
     single_device=True,
+    setup="quaternion and inertial messages",
 )

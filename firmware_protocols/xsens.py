@@ -319,9 +319,10 @@ PROTOCOL = Protocol(
     name="xsens",
     transport="bytes",
     default_bitrate=115200,
-    description="Xsens / Movella MTi: Xbus with MTData2; ids are bus ids behind a master",
+    description="Xsens / Movella MTi; ids are bus ids behind an Xbus master",
     decoder=XbusDecoder,
     encoder=lambda: encode_mtdata2,
     ids=range(1, 7),
     single_device=True,
+    setup="MTData2: quaternion, acceleration, rate of turn, sample time, packet counter",
 )

@@ -280,4 +280,6 @@ PROTOCOL = Protocol(
     decoder=_decoder,
     encoder=_encoder,
     ids=range(6),
+    setup="quaternion, acceleration, rate of turn, sample time, packet counter",
+    page="xsens",
 )

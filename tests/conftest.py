@@ -11,6 +11,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from edgepose_export.archive.torchscript import Statistics, describe, new_network, save, script
+from edgepose_export.networks.receptive_field import field_archive
+from edgepose_export.networks.registry import NETWORKS
 from edgepose_export.networks.shape import NetworkShape
 
 # Tests send Ctrl-C to programs that they start; a shell that starts the tests in the background leaves it
@@ -25,15 +27,20 @@ sys.dont_write_bytecode = False
 # The tests' networks are tiny: a second thread would only wait.
 torch.set_num_threads(1)
 
+WITH_STATE = [name for name, kind in NETWORKS.items() if kind.archive is not field_archive]
 SHAPES = [
     NetworkShape(kind, 8, targets, measured)
-    for kind in ("birnn", "rnn")
+    for kind in WITH_STATE
     for targets, measured in (
         ("local-matrix", "predicted"),
         ("global-6d", "predicted"),
         ("global-6d", "passed"),
     )
-] + [NetworkShape(kind, 8, "global-6d", "passed", smoothing=0.6) for kind in ("birnn", "rnn")]
+] + [
+    NetworkShape(kind, 8, "global-6d", "passed", smoothing=0.6)
+    for kind in WITH_STATE
+    if NETWORKS[kind].smoothed
+]
 DATA = {"summary": "Made-up motion", "licenses": ["Made-up motion, public domain"], "takes": 3, "hours": 0.5}
 
 
@@ -91,8 +98,6 @@ def write_archive():
     def write(path, shape=SHAPES[2], **changes):
         checkpoint = {"step": 7, "data": DATA, "config": '{"steps": 7}'}
         about = describe(path.stem, tiny_network(shape)[0], checkpoint, 4, 2)
-        if shape.kind == "rnn":
-            about |= {"past": 0, "future": 0}
         save(tiny_module(shape), path, about | changes)
         return path
 

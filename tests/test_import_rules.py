@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[1]
 LEVELS = (
     "errors placements rotations skeleton imu pose utils",
     "formats orientation calibration inference",
-    "sources sinks sip analysis diagnostics viewer convert record config",
+    "sources sinks sip analysis diagnostics viewer convert record config output_files",
     "pipeline",
     "benchmarks",
     "cli",

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edgepose.errors import EdgeposeError
+from edgepose.output_files import check_output
 from edgepose.skeleton import forward_kinematics
 from edgepose.utils.durable_files import replace_file
-from edgepose.utils.output_targets import check_output, is_stream
+from edgepose.utils.output_targets import is_stream
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

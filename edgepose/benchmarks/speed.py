@@ -235,7 +235,7 @@ class _Reference(nn.Module):
 
 
 def _reference(about: dict[str, Any]) -> Callable[[], object]:
-    both = about["kind"] == "birnn"
+    both = archive.is_windowed(about)
     module = _Reference(about["hidden"], both)
     x = torch.randn(1, about["past"] + 1 + about["future"] if both else 1, INPUTS)
     carried: list[Any] = [None]  # state of a unidirectional network
@@ -272,7 +272,7 @@ def model_speeds(info: archive.ArchiveInfo, trust: bool) -> list[Speed]:
     if about["kind"] in ("birnn", "rnn"):
         ways["reference", "f32"] = _reference(about)
     orientation, acceleration = np.tile(np.eye(3), (len(PLACEMENTS), 1, 1)), np.zeros((len(PLACEMENTS), 3))
-    for mode in ("stream", "window") if about["kind"] == "birnn" else ("stream",):
+    for mode in ("stream", "window") if archive.is_windowed(about) else ("stream",):
         for precision in PRECISIONS if stored == "f32" else (stored,):
             try:
                 engine = load_engine(info, trust, precision, mode)

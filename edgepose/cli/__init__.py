@@ -9,6 +9,7 @@ import sys
 import traceback
 from importlib.metadata import entry_points
 from io import StringIO
+from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
@@ -21,24 +22,23 @@ from edgepose.cli.terminal.stop_signal import stop_signals
 from edgepose.errors import as_edgepose_error
 from edgepose.utils.similar_names import similar_names
 
-COMMANDS = {
-    "bench": "Measure accuracy and speed.",
-    "calibrate": "Find out how the sensors sit on the wearer.",
-    "check": "Find out what is wrong with a rig.",
-    "convert": "Convert recordings, captures and poses.",
-    "devices": "List serial ports and CAN interfaces.",
-    "models": "List model archives, show their cards.",
-    "record": "Record what the sensors send.",
-    "report": "Make a page with the angles, steps and sensors of poses.",
-    "run": "Turn sensor data into poses.",
-    "solve": "Find the poses of a whole recording, without a network.",
-    "view": "Show poses as a figure in the browser.",
-}
-"""Commands of this package with their descriptions in the list of commands.
+COMMANDS = Path(__file__).with_name("commands")
+"""Folder with a module for each command of this package, of the same name.
 
-Their modules are imported when they are used. Other packages add commands through the entry-point group
-`edgepose.commands`.
+Other packages add commands through the entry-point group `edgepose.commands`.
 """
+
+
+def own_commands() -> list[str]:
+    """Return the names of the commands of this package, without importing any."""
+    return sorted(path.stem for path in COMMANDS.glob("[!_]*.py"))
+
+
+def summary(name: str) -> str:
+    """Return what the list of commands says of a command: the first line of its module, after the colon."""
+    with (COMMANDS / f"{name}.py").open(encoding="utf-8") as file:
+        text = file.readline().strip().strip('"').partition(": ")[2]
+    return text[:1].upper() + text[1:]
 
 
 class LazyGroup(click.Group):
@@ -46,13 +46,13 @@ class LazyGroup(click.Group):
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of all commands without importing any."""
-        return sorted({*COMMANDS, *(point.name for point in entry_points(group="edgepose.commands"))})
+        return sorted({*own_commands(), *(point.name for point in entry_points(group="edgepose.commands"))})
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List all commands, without importing those of this package."""
-        names = self.list_commands(ctx)
+        names, own = self.list_commands(ctx), own_commands()
         limit = formatter.width - 6 - max(map(len, names))
-        rows = [(name, COMMANDS.get(name) or self._listed_as(ctx, name, limit)) for name in names]
+        rows = [(name, summary(name) if name in own else self._listed_as(ctx, name, limit)) for name in names]
         with formatter.section("Commands"):
             formatter.write_dl(rows)
 
@@ -62,7 +62,7 @@ class LazyGroup(click.Group):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import and return a command; None if there is none of that name."""
-        if cmd_name in COMMANDS:
+        if cmd_name in own_commands():
             command: click.Command = getattr(
                 importlib.import_module(f"edgepose.cli.commands.{cmd_name}"), cmd_name
             )

@@ -48,8 +48,8 @@ def check_all_files(wearers: Sequence[WearerConfig], model: Path) -> None:
         wearers: one or several.
         model: the archive that is loaded.
     """
-    if sum(wearer.outputs.csv == "-" for wearer in wearers) > 1:
-        raise click.UsageError("several wearers write CSV to standard output; give all but one a file")
+    if sum("-" in wearer.outputs.files.values() for wearer in wearers) > 1:
+        raise click.UsageError("several wearers write to standard output; give all but one a file")
     outputs: dict[str, str | Path | None] = {}
     inputs: dict[str, Path | None] = {"--model": model}
     for wearer in wearers:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
 from pkgutil import resolve_name
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 GROUP = "edgepose.formats"
 """Each entry point of the group names a `RecordingFormat` or a `PoseFormat`."""
@@ -30,20 +30,32 @@ class FileFormat:
     suffixes: tuple[str, ...]
 
 
+class Reader(NamedTuple):
+    """One line of a table of formats.
+
+    Attributes:
+        location: "module:constant" of the format; imported when a file may be of it.
+        files: its files, for help texts, such as ".pkl of DIP-IMU".
+    """
+
+    location: str
+    files: str
+
+
 Format = TypeVar("Format", bound=FileFormat)
 
 
-def built_in_format(kind: type[Format], name: str) -> Format:
-    """Import the format that is named as "module:constant"."""
-    format = resolve_name(name)
+def built_in_format(kind: type[Format], reader: Reader) -> Format:
+    """Import the format of a reader."""
+    format = resolve_name(reader.location)
     assert isinstance(format, kind)
     return format
 
 
-def all_formats(kind: type[Format], names: Iterable[str]) -> Iterator[Format]:
-    """Yield the formats of a kind: the named ones, imported one after the other, then those of plug-ins."""
-    for name in names:
-        yield built_in_format(kind, name)
+def all_formats(kind: type[Format], readers: Iterable[Reader]) -> Iterator[Format]:
+    """Yield the formats of a kind: those of readers, imported one after the other, then those of plug-ins."""
+    for reader in readers:
+        yield built_in_format(kind, reader)
     yield from (format for format in plugin_formats() if isinstance(format, kind))
 
 

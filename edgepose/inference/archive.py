@@ -13,6 +13,7 @@ import json
 import os
 import zipfile
 import zlib
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 METADATA_FILE = "edgepose.json"
 FORMAT = 1
 MODELS = Path(str(resources.files("edgepose.inference") / "models"))
-KINDS = ("birnn", "rnn", "feed-forward", "wavenet")
 
 _METADATA_LIMIT = 1 << 20
 _MOST_FRAMES = 1000
@@ -47,6 +47,11 @@ class ArchiveInfo(NamedTuple):
     sha256: str
     trusted: bool
     metadata: dict[str, Any]
+
+
+def is_windowed(metadata: Mapping[str, Any]) -> bool:
+    """Whether a model can compute a window of any length, past and future, for each frame."""
+    return bool(metadata.get("windowed", metadata["kind"] == "birnn"))  # the first archives do not say
 
 
 def _settings() -> str:
@@ -141,8 +146,10 @@ def _check_metadata(path: Path, metadata: Any) -> None:
             f"{path}: archive format {metadata['format']} is newer than this edgepose reads ({FORMAT}); "
             "update edgepose"
         )
-    if metadata.get("kind") not in KINDS:
-        raise ModelError(f"{path}: unknown kind of network {metadata.get('kind')!r}")
+    if not isinstance(metadata.get("kind"), str) or not metadata["kind"].isprintable():
+        raise ModelError(f"{path}: the archive's kind of network {metadata.get('kind')!r} is not a name")
+    if type(metadata.get("windowed", False)) is not bool:
+        raise ModelError(f"{path}: the archive's ability to compute windows is neither true nor false")
     if metadata.get("placements") != list(PLACEMENTS):
         raise ModelError(f"{path}: made for other sensor placements: {metadata.get('placements')}")
     if not isinstance(metadata.get("rate_hz"), (int, float)) or not 1 <= metadata["rate_hz"] <= 1000:

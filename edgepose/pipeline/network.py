@@ -74,15 +74,20 @@ class Network:
             past=info.metadata["past"] if config.past is None else config.past,
             future=info.metadata["future"] if config.future is None else config.future,
         )
-        if network.kind == "rnn" and network.future:
-            raise ConfigError(f"{config.model} is unidirectional: --future must be 0")
+        most = info.metadata["future"]
+        if network.future > most and not archive.is_windowed(info.metadata):
+            raise ConfigError(
+                f"{config.model} is unidirectional: --future must be 0"
+                if most == 0
+                else f"{config.model} sees {most} future frames: --future must be at most {most}"
+            )
         if wearer_count > 1 and network.windowed:
             raise ConfigError("--online window runs one wearer; use --online stream for several")
         return network
 
     @property
     def kind(self) -> str:
-        """Architecture of the network: "rnn" is unidirectional, "birnn" bidirectional."""
+        """Name of the network's architecture, such as "birnn"."""
         return str(self.info.metadata["kind"])
 
     @property
@@ -93,7 +98,9 @@ class Network:
     @property
     def windowed(self) -> bool:
         """Whether a whole window is computed for each frame."""
-        return self.kind != "rnn" and self.config.online == "window"
+        from edgepose.inference.archive import is_windowed
+
+        return self.config.online == "window" and is_windowed(self.info.metadata)
 
     def load(
         self, wearers: Sequence[WearerConfig], notify: Callable[[str], None]

@@ -1,15 +1,12 @@
-"""The interface of outputs, and the table of available ones."""
+"""The interface of outputs; `registry` has the table of available ones."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from importlib import import_module
-from importlib.metadata import entry_points
 from types import TracebackType
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
-from edgepose.errors import ConfigError
 from edgepose.pose import PoseFrame
 from edgepose.skeleton import Body
 
@@ -97,41 +94,3 @@ SinkFactory = Callable[[Any, SinkContext], Sink]
 Raises:
     EdgeposeError: the sink cannot be opened.
 """
-
-SINKS = {
-    "udp": "edgepose.sinks.udp:open_sink",
-    "osc": "edgepose.sinks.vmc:open_sink",
-    "tcp": "edgepose.sinks.tcp:open_sink",
-    "npz": "edgepose.sinks.npz:open_sink",
-    "bvh": "edgepose.sinks.bvh:open_sink",
-    "csv": "edgepose.sinks.csv:open_sink",
-    "view": "edgepose.sinks.viewer:open_sink",
-}
-"""Factories by the name of their flag, in the order of opening.
-
-Addresses come first, so that a wrong one is reported before waiting for a pipe's reader; the viewer starts
-once everything else is ready.
-"""
-
-ENTRY_POINTS = "edgepose.sinks"
-"""Group of entry points under which other packages register their factories."""
-
-
-def sink_factory(name: str) -> SinkFactory:
-    """Return the factory of a sink, from the table or from another package.
-
-    Raises:
-        ConfigError: there is none of that name, or the other package cannot be imported.
-    """
-    if name in SINKS:
-        module, _, function = SINKS[name].partition(":")
-        factory: SinkFactory = getattr(import_module(module), function)
-        return factory
-    for point in entry_points(group=ENTRY_POINTS, name=name):
-        try:
-            loaded: SinkFactory = point.load()
-        except (Exception, SystemExit) as error:  # third-party code
-            raise ConfigError(f"output {name!r}: {point.value} cannot be imported: {error}") from error
-        return loaded
-    known = ", ".join(sorted({point.name for point in entry_points(group=ENTRY_POINTS)})) or "none"
-    raise ConfigError(f"unknown output {name!r}; installed packages add: {known}")

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
+from typing import Any
 
 from edgepose.config import OutputConfig
-from edgepose.sinks.base import SINKS, Sink, SinkContext, sink_factory
-from edgepose.skeleton import default_body
+from edgepose.sinks.base import Sink, SinkContext
+from edgepose.sinks.registry import SINKS, sink_factory
+from edgepose.skeleton import Body, default_body
+from edgepose.utils.output_targets import has_reader
 
 
 def open_outputs(
@@ -15,6 +18,9 @@ def open_outputs(
     outputs: OutputConfig,
     rate: float = 60.0,
     stopped: Callable[[], bool] = lambda: False,
+    *,
+    body: Body | None = None,
+    translation: bool = False,
 ) -> list[Sink]:
     """Open the sinks of one wearer. No file appears or is replaced before all of them are open.
 
@@ -23,31 +29,41 @@ def open_outputs(
         outputs: the outputs to open.
         rate: poses per second.
         stopped: whether the run is to end, see `SinkContext`.
+        body: the wearer's body; None for the default body of the configured height.
+        translation: every pose has a translation.
+
+    Returns:
+        The sinks in the order in which each pose should be written to them.
 
     Raises:
         EdgeposeError: a file or address cannot be written to.
     """
     outputs.check()
-    if outputs.view:
-        from edgepose.sinks.viewer import check_viewer
-
-        check_viewer()
     context = SinkContext(
-        body=default_body(outputs.height),
+        body=body or default_body(outputs.height),
         height=outputs.height,
         rate=rate,
         rotations=outputs.rotations,
         std=outputs.std,
+        translation=translation,
         overwrite=outputs.overwrite,
         stopped=stopped,
     )
-    targets = {name: getattr(outputs, name) for name in SINKS if name != "view"} | dict(outputs.sinks)
-    sinks = []
-    for name, target in targets.items():
-        if target is not None:
-            sinks.append(stack.enter_context(sink_factory(name)(target, context)))
-    for sink in sinks:
+    targets = sorted(outputs.targets, key=_rank)
+    sinks = [stack.enter_context(sink_factory(name)(target, context)) for name, target in targets]
+    for sink in reversed(sinks):  # the viewer starts when the files exist
         sink.start()
-    if outputs.view:  # last: when the viewer is up, the files exist
-        sinks.append(stack.enter_context(sink_factory("view")(True, context)))
     return sinks
+
+
+def _rank(output: tuple[str, Any]) -> int:
+    """Return when to open an output: pipes come last, because opening one waits for its reader.
+
+    Poses are written in the same order, so what shows or forwards them comes before the files.
+    """
+    name, target = output
+    if name not in SINKS:
+        return 1
+    if not SINKS[name].suffix:
+        return 0
+    return 2 if has_reader(target) else 1

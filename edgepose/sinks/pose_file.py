@@ -51,12 +51,12 @@ class PoseFileSink(Sink):
             self._output.start()
 
     def write(self, pose: PoseFrame) -> None:
-        """Add a pose; it is on disk within about a second."""
-        if self._empty:
+        """Add a pose; it is on disk within about a second, the first at once."""
+        if self._add(pose) or self._empty or time.monotonic() - self._flushed >= FLUSH_S:
+            self._flush()
+        if self._empty:  # only now may an existing file be replaced: there is room for poses
             self._empty = False
             self._output.start()
-        if self._add(pose) or time.monotonic() - self._flushed >= FLUSH_S:
-            self._flush()
 
     def close(self) -> None:
         """Write the collected poses and close the file; standard output stays open.

@@ -16,19 +16,13 @@ STOP_S = 5.0
 """Longest time to wait for the viewer to exit, seconds."""
 
 
-def check_viewer() -> None:
-    """Raise EdgeposeError unless the packages that the viewer needs are installed."""
-    if find_spec("viser") is None:
-        raise EdgeposeError("the viewer needs viser: install it with pip install 'edgepose[view]'")
-
-
 class ViewSink(Sink):
     """Starts `edgepose view` and sends it each pose as a datagram; the viewer shows the newest one."""
 
     live = True
 
     def __init__(self, height_m: float) -> None:
-        """Start the viewer, which prints the address of its page on standard error.
+        """Store the settings; `start` starts the viewer.
 
         Args:
             height_m: stature of the figure, metres.
@@ -36,13 +30,19 @@ class ViewSink(Sink):
         Raises:
             EdgeposeError: a package that the viewer needs is not installed.
         """
-        check_viewer()
+        if find_spec("viser") is None:
+            raise EdgeposeError("the viewer needs viser: install it with pip install 'edgepose[view]'")
+        self._height_m = height_m
+        self._viewer: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        """Start the viewer, which prints the address of its page on standard error."""
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
         command = [sys.executable, "-m", "edgepose", "view", "--udp", f"127.0.0.1:{port}", "--with-parent"]
         self._viewer = subprocess.Popen(
-            [*command, "--height", str(height_m)], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+            [*command, "--height", str(self._height_m)], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
         )
         self._datagrams = UdpSink("127.0.0.1", port, "binary")
 
@@ -52,6 +52,8 @@ class ViewSink(Sink):
 
     def close(self) -> None:
         """Stop the viewer; a second call does nothing."""
+        if self._viewer is None:
+            return
         self._datagrams.close()
         self._viewer.terminate()
         try:

@@ -1,4 +1,4 @@
-"""Resolution of output names, and checks that writing there loses nothing.
+"""Resolution of output names.
 
 Devices, pipes and standard output are streams, which hold nothing that could be lost. For a symbolic link,
 its target is written.
@@ -11,20 +11,11 @@ import os
 import re
 import stat
 import sys
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
 from edgepose.errors import EdgeposeError
-
-ENDINGS = frozenset(
-    (
-        *(".csv", ".npz", ".bvh", ".json", ".html", ".htm", ".png", ".pdf", ".svg", ".pt", ".md", ".toml"),
-        *(".bin", ".raw", ".times", ".asc", ".blf", ".log", ".mf4", ".trc", ".db", ".mvnx", ".pkl"),
-        *(".sensors", ".zip", ".asf", ".amc", ".py"),
-    )
-)
-"""Endings of files that edgepose reads or writes: a file of another kind is never overwritten."""
 
 _LINKS = 40
 
@@ -101,32 +92,6 @@ def identity(name: str | Path) -> object:
 def part_path(npz: str | Path) -> Path:
     """Return the file that holds the poses for an NPZ file during a run."""
     return Path(npz).with_name(f"{Path(npz).stem}.part.csv")
-
-
-def check_output(name: str | Path, what: str, endings: Collection[str], overwrite: bool) -> None:
-    """Check, before any work is done, that writing an output would lose nothing.
-
-    Args:
-        name: name of the output; "-", devices and pipes always pass.
-        what: the output's content, for messages.
-        endings: endings of its kind of files, such as ".csv".
-        overwrite: whether an existing file may be replaced.
-
-    Raises:
-        EdgeposeError: the file exists, has the ending of another kind of file, or cannot be written.
-    """
-    target = find_target(name, what)
-    if target.stream:
-        return
-    for path in (Path(name), target.path):
-        ending = path.suffix.lower()
-        if ending in ENDINGS and ending not in endings:
-            raise EdgeposeError(
-                f"{name}: {ending} is the ending of another kind of file; for {what} use "
-                f"{' or '.join(endings)}"
-            )
-    if target.exists and not overwrite:
-        raise EdgeposeError(f"{name} already exists; choose another name or give --overwrite")
 
 
 def check_free(paths: Iterable[Path], hint: str) -> None:

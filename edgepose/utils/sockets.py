@@ -50,6 +50,17 @@ def parse_address(text: str) -> tuple[str, int]:
     return host, int(port)
 
 
+def parse_host_and_port(text: str) -> tuple[str, int]:
+    """Parse a text that is exactly HOST:PORT.
+
+    Raises:
+        ConfigError: the text is something else.
+    """
+    if "," in text:
+        raise ConfigError(f"{text!r} is more than HOST:PORT")
+    return parse_address(text)
+
+
 def parse_destination(text: str) -> Destination:
     """Parse "HOST:PORT[,format=json|binary]"; JSON is the default, see `parse_address`.
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 
 from edgepose import PoseFrame, Sink
+from edgepose.output_files import check_output
 from edgepose.sinks.base import SinkContext
 from edgepose.utils.durable_files import write_whole
-from edgepose.utils.output_targets import check_output
 from firmware_protocols.base import Decoder, Protocol
 from firmware_protocols.sample import Counters, Sample
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import subprocess
@@ -9,11 +10,14 @@ import sys
 from importlib import resources
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 
 import edgepose
+from edgepose.cli import cli
 from edgepose.formats.poses.registry import read_poses
+from edgepose.sinks.registry import SINKS, sink_factory
 from tests.support import processes
 
 ROOT = Path(__file__).parents[2]
@@ -155,6 +159,36 @@ def test_one_configuration_from_toml_and_from_python(tmp_path):
     assert from_file == own
 
 
+def test_outputs_by_name():
+    outputs = edgepose.OutputConfig(
+        csv=Path("a.csv"), udp="[::1]:9000,format=binary", view=True, osc=None, sinks={"mine": "x"}
+    )
+    assert outputs.targets == (
+        ("csv", "a.csv"),
+        ("udp", ("::1", 9000, "binary")),
+        ("view", True),
+        ("mine", "x"),
+    )
+    assert (outputs.csv, outputs.udp.port, outputs.osc, outputs.any) == ("a.csv", 9000, None, True)
+    assert outputs.files == {"--csv": "a.csv"}
+    assert dataclasses.replace(outputs, overwrite=True).targets == outputs.targets
+    assert (
+        outputs == edgepose.OutputConfig(outputs.targets) != edgepose.OutputConfig(outputs.targets, std=True)
+    )
+    assert not edgepose.OutputConfig(view=False, csv=None).any
+    with pytest.raises(AttributeError, match="mine"):
+        outputs.mine  # noqa: B018
+
+
+def test_every_output_has_a_flag_in_the_order_of_the_table():
+    flags = [param.name for param in cli.get_command(click.Context(cli), "run").params]
+    assert [name for name in flags if name in SINKS] == list(SINKS)
+    for name, output in SINKS.items():
+        assert name.isidentifier()
+        assert callable(sink_factory(name))
+        assert bool(output.suffix) == (output.metavar == "FILE")
+
+
 @pytest.mark.parametrize(
     ("make", "says"),
     [
@@ -162,6 +196,11 @@ def test_one_configuration_from_toml_and_from_python(tmp_path):
         (lambda: edgepose.SourceConfig(port="a", file="b"), "give one source"),
         (lambda: edgepose.SourceConfig(port="a", baud=0), "not in the range"),
         (lambda: edgepose.OutputConfig(rotations="rodrigues"), "is not one of"),
+        (lambda: edgepose.OutputConfig(cvs="a.csv"), "unknown output 'cvs'; outputs are csv, npz, "),
+        (lambda: edgepose.OutputConfig(udp="127.0.0.1"), "udp: no port in '127.0.0.1'"),
+        (lambda: edgepose.OutputConfig([("csv", "a"), ("csv", "b")]), "csv is given twice"),
+        (lambda: edgepose.OutputConfig(sinks={"csv": "a"}), "csv is not an output of another package"),
+        (lambda: edgepose.OutputConfig(view="no"), "view: 'no' is neither True nor False"),
     ],
 )
 def test_configurations_that_mean_nothing(make, says):

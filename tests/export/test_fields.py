@@ -12,11 +12,14 @@ from edgepose_export.archive.torchscript import build, describe, new_network, sa
 from edgepose_export.evaluation import evaluate as evaluation
 from edgepose_export.evaluation.evaluate import Mode
 from edgepose_export.networks.normalisation import network_inputs
-from edgepose_export.networks.receptive_field import DILATIONS, KERNEL, padded
+from edgepose_export.networks.receptive_field import DILATIONS, KERNEL, field_archive, padded
+from edgepose_export.networks.registry import NETWORKS
 from edgepose_export.networks.shape import NetworkShape
 from edgepose_export.training.dataset import Take
 
-SHAPES = [NetworkShape(kind, 8, "local-matrix") for kind in ("feed-forward", "wavenet")]
+SHAPES = [
+    NetworkShape(name, 8, "local-matrix") for name, kind in NETWORKS.items() if kind.archive is field_archive
+]
 CHECKPOINT = {
     "step": 7,
     "data": {"summary": "m", "licenses": ["m"], "takes": 1, "hours": 1.0},

@@ -16,6 +16,7 @@ from edgepose.skeleton import PARENTS, PREDICTED, default_body
 from edgepose_export.archive.torchscript import Statistics
 from edgepose_export.cli.synthesize import LICENSES
 from edgepose_export.mocap import read_motion, resample
+from edgepose_export.networks.registry import NETWORKS
 from edgepose_export.networks.shape import NetworkShape, PoseDecoder, smoothed
 from edgepose_export.synthesis.augmentation import Augmentation, augment
 from edgepose_export.synthesis.virtual_imus import recording_arrays, virtual_imus
@@ -502,8 +503,7 @@ def test_files_that_are_no_checkpoints(takes, tmp_path):
 @pytest.mark.parametrize(
     ("kind", "normalisation", "acceleration", "inputs"),
     [
-        ("feed-forward", "root", True, 60),
-        ("wavenet", "root", True, 60),
+        *((kind, "root", True, 60) for kind in NETWORKS if not NETWORKS[kind].streamed),
         ("rnn", "heading", True, 72),
         ("rnn", "sequence", True, 72),
         ("rnn", "root", False, 45),

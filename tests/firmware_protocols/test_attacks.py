@@ -57,9 +57,19 @@ SLOW = [
 ]  # fmt: skip
 
 
+def beginnings(name):
+    """The first bytes of a message."""
+    protocol = PROTOCOLS[name]
+    if protocol.encoder is None:
+        return []
+    sensor = protocol.ids[0] if protocol.ids else 0
+    message = protocol.encode(STILL._replace(sensor=sensor, mag=(20.0, 0.0, -40.0), temperature=25.0), 0)
+    return [message[:size] for size in (1, 2, 3, 5, 8, 12)]
+
+
 @pytest.mark.parametrize("name", [name for name, p in PROTOCOLS.items() if p.transport == "bytes"])
 def test_no_pattern_is_slow(name):
-    for pattern in SLOW:
+    for pattern in (*SLOW, *beginnings(name)):
         taken = []
         for size in (6_000, 24_000):
             data = (pattern * size)[:size]

@@ -10,11 +10,6 @@ from firmware_protocols.base import Decoder, Protocol
 from firmware_protocols.registry import PROTOCOLS
 from firmware_protocols.sample import Sample
 
-NO_TIME = {
-    *("hipnuc-canopen", "hipnuc-j1939", "witmotion-modbus", "witmotion-can", "bno08x-rvc"),
-    *("vectornav-ascii", "haritorax", "adafruit", "razor"),
-}
-
 
 @pytest.mark.parametrize("name", PROTOCOLS)
 def test_what_is_encoded_is_decoded(name):
@@ -44,7 +39,7 @@ def test_what_is_encoded_is_decoded(name):
                     got += decoder.feed(can_id, data, extended)
     assert len(got) >= 20 * len(sensors) - len(sensors)
     assert {sample.sensor for sample in got} == set(sensors)
-    assert {sample.time_us is None for sample in got} == {name in NO_TIME}
+    assert {sample.time_us is None for sample in got} == {"time" in protocol.lacks}
     assert decoder.counters.bad == decoder.counters.lost == 0
     assert decoder.counters.packets == len(got)
     assert protocol.wrap_us > 1_000_000

@@ -12,8 +12,8 @@ from firmware_protocols.rotation import rotate, rotate_back
 from firmware_protocols.sample import Sample
 
 UP = (0.0, 0.0, 9.81)
-ONLY_PART = {"adafruit": "quat", "razor": "quat", "openlog": "acc"}
-"""Formats with either orientation or force, and which of the two."""
+ONLY_PART = [name for name, protocol in PROTOCOLS.items() if {"quat", "acc"} & set(protocol.lacks)]
+"""Formats with either orientation or force."""
 
 quaternions = (
     st.tuples(*[st.floats(-1, 1)] * 4)
@@ -62,4 +62,5 @@ def test_still(name):
 @pytest.mark.parametrize("name", ONLY_PART)
 def test_formats_with_a_part_only(name):
     for sample in sent_and_read(name, (0.5, 0.5, -0.5, 0.5)):
-        assert (sample.quat is None, sample.acc is None) == (name == "openlog", name != "openlog")
+        lacks = PROTOCOLS[name].lacks
+        assert (sample.quat is None, sample.acc is None) == ("quat" in lacks, "acc" in lacks)

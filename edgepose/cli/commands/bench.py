@@ -1,4 +1,4 @@
-"""`edgepose bench`: measure speed, and accuracy on data with known truth."""
+"""`edgepose bench`: measure accuracy and speed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`edgepose calibrate`: make a calibration file from a known pose, held live or in a recording."""
+"""`edgepose calibrate`: find out how the sensors sit on the wearer."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from edgepose.cli.terminal import messages as terminal
 from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
 from edgepose.orientation.stage import OrientationStage
+from edgepose.output_files import check_output
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 from edgepose.sources.sensor_map import read_map
-from edgepose.utils.output_targets import check_output
 
 
 def _body_frame(ctx: click.Context, param: click.Parameter, value: str | None) -> str | None:

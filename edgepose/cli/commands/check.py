@@ -1,4 +1,4 @@
-"""`edgepose check`: show the health of each sensor of a rig, and how to fix problems."""
+"""`edgepose check`: find out what is wrong with a rig."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`edgepose convert`: convert recordings and poses of any kind to CSV, NPZ or BVH, many at once."""
+"""`edgepose convert`: convert recordings, captures and poses."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ from edgepose.cli.options.outputs import overwrite_option
 from edgepose.cli.options.source import protocol_option, sensors_option
 from edgepose.cli.terminal.messages import printable, say, show
 from edgepose.errors import EdgeposeError
-from edgepose.utils.output_targets import check_free, check_output
+from edgepose.formats.poses.registry import READERS as POSES
+from edgepose.formats.recordings.registry import READERS as RECORDINGS
+from edgepose.output_files import check_output
+from edgepose.utils.output_targets import check_free
 
 if TYPE_CHECKING:
     from edgepose.convert import Job, Result
@@ -73,16 +76,15 @@ def convert(
     skip_existing: bool,
     overwrite: bool,
 ) -> None:
-    """Convert recordings: CSV, NPZ, raw captures of a port, logs of a CAN bus, sessions of x-io's
-    software and of Xsens' MT Manager, MVNX of Xsens' MVN, TotalCapture's .sensors and DIP-IMU's .pkl.
+    """Convert recordings ({recordings}), raw captures of a port, logs of a CAN bus, and poses ({poses}).
 
     IN are files, patterns and folders. A folder stands for all recordings in it, at any depth. A folder with
     one subfolder per x-io sensor is one recording; the names of the subfolders contain the placements, or
     --sensors maps their serial numbers as ids (id = 0x64F61CB3). The good part of a damaged recording is
     written, and the poses of a CSV or BVH file before the first bad one; the exit code is then 1.
 
-    Files of poses (CSV and BVH as `run` writes them, NPZ with the keys of AMASS) become CSV, NPZ or BVH. From
-    a recording with true poses, such as DIP-IMU's, --to bvh takes these. - reads CSV from standard input.
+    Poses become CSV, NPZ or BVH. From a recording with true poses, such as DIP-IMU's, --to bvh takes these.
+    - reads CSV from standard input.
 
     \b
     Examples:
@@ -118,6 +120,12 @@ def convert(
         raise EdgeposeError(
             f"{failed} of {len(planned)} recordings not converted, or only in part; see the table"
         )
+
+
+convert.help = (convert.help or "").format(
+    recordings=", ".join(reader.files for reader in RECORDINGS.values()),
+    poses=", ".join(reader.files for reader in POSES.values()),
+)
 
 
 def _check_targets(jobs: Sequence[Job], to: str, overwrite: bool) -> None:

@@ -1,4 +1,4 @@
-"""`edgepose devices`: list the serial ports and CAN interfaces of this machine."""
+"""`edgepose devices`: list serial ports and CAN interfaces."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`edgepose models`: list model archives and show their cards."""
+"""`edgepose models`: list model archives, show their cards."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _list() -> None:
         about = archive.read_info(path).metadata
         frames = (
             f"{about['past']} past, {about['future']} future"
-            if about["kind"] == "birnn"
+            if about["past"] or about["future"]
             else "1, no look-ahead"
         )
         size = f"{path.stat().st_size / 1e6:.1f} MB"

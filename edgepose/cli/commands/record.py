@@ -1,4 +1,4 @@
-"""`edgepose record`: write what arrives to a recording."""
+"""`edgepose record`: record what the sensors send."""
 
 from __future__ import annotations
 

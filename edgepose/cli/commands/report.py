@@ -1,4 +1,4 @@
-"""`edgepose report`: make a page about the poses of a file."""
+"""`edgepose report`: make a page with the angles, steps and sensors of poses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import click
 
 from edgepose.cli.options.outputs import overwrite_option
 from edgepose.cli.terminal.messages import show
-from edgepose.utils.output_targets import check_output
+from edgepose.output_files import check_output
 
 
 @click.command()

@@ -1,4 +1,4 @@
-"""`edgepose solve`: find the poses of a whole recording at once, without a network."""
+"""`edgepose solve`: find the poses of a whole recording, without a network."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ import click
 
 from edgepose.cli.options.body import BodyFlags, body_options
 from edgepose.cli.options.gathered import gathered
-from edgepose.cli.options.outputs import check_files, overwrite_option
+from edgepose.cli.options.outputs import check_files, file_output_options
 from edgepose.cli.terminal.messages import end_status, has_terminal, say, status
+from edgepose.config import OutputConfig
 from edgepose.errors import EdgeposeError
-from edgepose.utils.output_targets import check_output, is_stream, part_path
+from edgepose.sinks.registry import SINKS
 
 if TYPE_CHECKING:
     from edgepose.rotations import Array
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from edgepose.sip.energy import Weights
     from edgepose.sip.measurements import Measurements
     from edgepose.sip.solve import Method, OnProgress, Solution
-    from edgepose.skeleton import Body
 
 PLAIN_EVERY_S = 10.0
 """Time between two lines of progress where there is no terminal, seconds."""
@@ -59,63 +59,6 @@ class SolverFlags:
     rate: float
     evaluations: int
     jobs: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class SolveOutputs:
-    """Files to write; the fields are flags of `edgepose solve`."""
-
-    csv: str | None
-    rotations: str
-    npz: str | None
-    bvh: str | None
-    plot: str | None
-    overwrite: bool
-
-    def check(self, inputs: Mapping[str, Path | None]) -> None:
-        """Make sure that there is an output for the poses, and that no file is lost.
-
-        Args:
-            inputs: files to read, by flag.
-
-        Raises:
-            click.UsageError: no output for poses is given, or an output is also an input or another output.
-            EdgeposeError: an output exists, cannot be written, or has the wrong ending.
-        """
-        if not (self.csv or self.npz or self.bvh):
-            raise click.UsageError("give at least one output: --csv FILE, --npz FILE or --bvh FILE")
-        growing = None if self.npz is None or is_stream(self.npz) else part_path(self.npz)
-        files = {"--csv": self.csv, "--npz": self.npz, "--bvh": self.bvh, "--plot": self.plot}
-        check_files({**files, "--npz (while it grows)": growing}, inputs)
-        for name, ending in ((self.csv, ".csv"), (self.npz, ".npz"), (self.bvh, ".bvh")):
-            if name is not None:
-                check_output(name, "poses", (ending,), self.overwrite)
-        if self.plot is not None:
-            from edgepose.analysis.figures import check_picture
-
-            check_picture(Path(self.plot), "--plot", self.overwrite)
-
-    def open(self, stack: ExitStack, body: Body, rate: float, stopped: Callable[[], bool]) -> list[Sink]:
-        """Open the outputs for poses; the stack closes them."""
-        from edgepose.sinks.base import SinkContext, sink_factory
-
-        context = SinkContext(
-            body=body,
-            rate=rate,
-            rotations=self.rotations,
-            translation=True,
-            overwrite=self.overwrite,
-            stopped=stopped,
-        )
-        targets = {"npz": self.npz, "bvh": self.bvh, "csv": self.csv}
-        sinks = [
-            stack.enter_context(sink_factory(name)(target, context))
-            for name, target in targets.items()
-            if target is not None
-        ]
-        for sink in sinks:
-            sink.start()
-        return sinks
 
 
 def _solver_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -165,25 +108,6 @@ def _solver_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return gathered(command, flags, "solver", SolverFlags)
 
 
-def _output_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the output flags; the command gets them as `outputs: SolveOutputs`."""
-    flags = [
-        click.option("--csv", metavar="FILE", help="Write poses as CSV; - is standard output."),
-        click.option(
-            "--rotations",
-            type=click.Choice(["axis-angle", "quat", "matrix", "euler"]),
-            default="axis-angle",
-            show_default=True,
-            help="Representation of rotations in the CSV.",
-        ),
-        click.option("--npz", metavar="FILE", help="Write poses as NPZ with the keys of AMASS."),
-        click.option("--bvh", metavar="FILE", help="Write poses as BVH."),
-        click.option("--plot", metavar="FILE", help="Write a picture of costs and residuals over time."),
-        overwrite_option,
-    ]
-    return gathered(command, flags, "outputs", SolveOutputs)
-
-
 @click.command()
 @click.argument("recording", metavar="IN", type=click.Path(path_type=Path))
 @click.option(
@@ -202,9 +126,21 @@ def _output_options(command: Callable[..., Any]) -> Callable[..., Any]:
 )
 @body_options
 @_solver_options
-@_output_options
+@file_output_options(
+    click.option(
+        "--plot",
+        type=click.Path(path_type=Path),
+        metavar="FILE",
+        help="Write a picture of costs and residuals over time.",
+    )
+)
 def solve(
-    recording: Path, calibration_path: Path, body: BodyFlags, solver: SolverFlags, outputs: SolveOutputs
+    recording: Path,
+    calibration_path: Path,
+    body: BodyFlags,
+    solver: SolverFlags,
+    outputs: OutputConfig,
+    plot: Path | None,
 ) -> None:
     """Find the poses of a whole recording at once: Sparse Inertial Poser.
 
@@ -218,8 +154,9 @@ def solve(
       edgepose solve walk.npz --calibration calib.json --height 1.68 --npz out.npz
       edgepose solve walk.npz --calibration calib.json --method sop --csv - | head
     """
-    outputs.check({"IN": recording, "--calibration": calibration_path})
+    _check_outputs(outputs, plot, {"IN": recording, "--calibration": calibration_path})
 
+    from edgepose.sinks.open import open_outputs
     from edgepose.sip import residuals
     from edgepose.sip.bodies import sensor_points
     from edgepose.sip.parameterisation import hinge_rig, smpl_rig
@@ -236,7 +173,9 @@ def solve(
     interrupted = False
     with ExitStack() as stack:
         # Opened before the work, so that a wrong name is reported at once.
-        sinks = outputs.open(stack, wearer_body, solver.rate, lambda: interrupted)
+        sinks = open_outputs(
+            stack, outputs, solver.rate, lambda: interrupted, body=wearer_body, translation=True
+        )
         solutions, interrupted = _collect(solve_all(measurements, settings, solver.jobs, _progress()))
         if not solutions:
             raise KeyboardInterrupt
@@ -244,11 +183,36 @@ def solve(
         _write(sinks, solution, measurements, pelvis_path(solution, points.offsets, solver.rate))
         for sink in sinks:
             sink.close()
-    _report(solution, measurements, outputs)
+    _report(solution, measurements)
+    if plot is not None:
+        residuals.plot(plot, solution, measurements, outputs.overwrite)
     if interrupted:
         raise KeyboardInterrupt
     if damage:
         raise EdgeposeError(damage)
+
+
+def _check_outputs(outputs: OutputConfig, plot: Path | None, inputs: Mapping[str, Path | None]) -> None:
+    """Make sure that there is an output for the poses, and that no file is lost.
+
+    Args:
+        outputs: files for the poses.
+        plot: file for the picture.
+        inputs: files to read, by flag.
+
+    Raises:
+        click.UsageError: no output for poses is given, or an output is also an input or another output.
+        EdgeposeError: an output exists, cannot be written, or has the wrong ending.
+    """
+    if not outputs.any:
+        flags = [f"--{name} FILE" for name, output in SINKS.items() if output.suffix]
+        raise click.UsageError(f"give at least one output: {', '.join(flags[:-1])} or {flags[-1]}")
+    check_files({**outputs.files, "--plot": plot}, inputs)
+    outputs.check()
+    if plot is not None:
+        from edgepose.analysis.figures import check_picture
+
+        check_picture(plot, "--plot", outputs.overwrite)
 
 
 def _measure(path: Path, calibration_path: Path, solver: SolverFlags) -> tuple[Measurements, str | None]:
@@ -269,15 +233,13 @@ def _measure(path: Path, calibration_path: Path, solver: SolverFlags) -> tuple[M
     return measure(data, mounts, solver.rate), data.damage
 
 
-def _report(solution: Solution, measurements: Measurements, outputs: SolveOutputs) -> None:
-    """Say how well the poses explain the measurements, and plot it if requested."""
+def _report(solution: Solution, measurements: Measurements) -> None:
+    """Say how well the poses explain the measurements."""
     from edgepose.sip import residuals
 
     say(residuals.table(solution, measurements))
     for line in residuals.misfits(solution, measurements):
         say(f"warning: {line}")
-    if outputs.plot is not None:
-        residuals.plot(outputs.plot, solution, measurements, outputs.overwrite)
     done, frames = len(solution.rotations), len(measurements.time_s)
     say(f"{done} of {frames} poses, {solution.evaluations} cost evaluations")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -10,6 +9,7 @@ from typing import Any
 
 import click
 
+from edgepose.config import setting_names
 from edgepose.errors import ConfigError
 
 Command = Callable[..., Any]
@@ -31,17 +31,18 @@ def gathered(
 
     Args:
         command: the function to add flags to.
-        flags: click options, in the order of the help text, each named like a field of `config`.
+        flags: click options, in the order of the help text. The values of those that are not named like a
+            setting of `config` remain arguments of their own.
         name: name of the argument.
-        config: dataclass of the values. Fields without a flag keep their defaults. A ConfigError that it
+        config: class of the values. Settings without a flag keep their defaults. A ConfigError that it
             raises is reported as wrong use.
     """
 
     @functools.wraps(command)
     def with_config(**values: Any) -> Any:
-        fields = [field.name for field in dataclasses.fields(config) if field.name in values]
+        names = [name for name in setting_names(config) if name in values]
         with usage_errors():
-            gathered_values = config(**{field: values.pop(field) for field in fields})
+            gathered_values = config(**{name: values.pop(name) for name in names})
         return command(**{name: gathered_values}, **values)
 
     wrapped: Command = with_config

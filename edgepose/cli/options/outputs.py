@@ -1,19 +1,20 @@
-"""Output flags of `edgepose run`, and checks of the files that a command writes."""
+"""Flags of the outputs for poses, and checks of the files that a command writes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 
-from edgepose.cli.options.gathered import gathered
-from edgepose.config import OutputConfig, parse_host_and_port
+from edgepose.cli.options.gathered import Command, gathered
+from edgepose.config import OutputConfig
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.csv_columns import ROTATION_FORMATS
+from edgepose.sinks.registry import SINKS, Output
 from edgepose.utils.output_targets import identity, is_null
-from edgepose.utils.sockets import Destination, parse_destination
+from edgepose.utils.sockets import parse_host_and_port
 
 
 def check_files(outputs: Mapping[str, str | Path | None], inputs: Mapping[str, Path | None]) -> None:
@@ -42,13 +43,6 @@ def _is_same_file(output: Path, path: Path) -> bool:
         return False
 
 
-def _destination(ctx: click.Context, param: click.Parameter, value: str | None) -> Destination | None:
-    try:
-        return None if value is None else parse_destination(value)
-    except EdgeposeError as error:
-        raise click.BadParameter(str(error)) from None
-
-
 def address(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, int] | None:
     """Parse the value HOST:PORT of a flag (a click callback)."""
     try:
@@ -71,61 +65,75 @@ overwrite_option = click.option("--overwrite", is_flag=True, help="Replace exist
 """The flag --overwrite."""
 
 
-def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the output flags; the command gets them as `outputs: OutputConfig`."""
+_rotations_option = click.option(
+    "--rotations",
+    type=click.Choice(list(ROTATION_FORMATS)),
+    default="axis-angle",
+    show_default=True,
+    help="Representation of rotations in the CSV.",
+)
+
+
+def output_options(command: Command) -> Command:
+    """Add the flags of all outputs; the command gets them as `outputs: OutputConfig`."""
+    std_option = click.option(
+        "--std",
+        is_flag=True,
+        help="Add the network's standard deviation of each joint to the CSV, radians.",
+    )
+    height_option = click.option(
+        "--height",
+        type=float,
+        default=1.75,
+        show_default=True,
+        help="The wearer's height, metres, for the bones of --bvh, --osc and --view.",
+    )
+    other_sinks_option = click.option(
+        "--sink",
+        "sinks",
+        multiple=True,
+        callback=_other_sinks,
+        metavar="NAME=TARGET",
+        help="Write to an output that an installed package adds; repeatable.",
+    )
     flags = [
-        click.option("--csv", metavar="FILE", help="Write poses as CSV; - is standard output."),
-        click.option(
-            "--rotations",
-            type=click.Choice(list(ROTATION_FORMATS)),
-            default="axis-angle",
-            show_default=True,
-            help="Representation of rotations in the CSV.",
-        ),
-        click.option(
-            "--std",
-            is_flag=True,
-            help="Add the network's standard deviation of each joint to the CSV, radians.",
-        ),
-        click.option(
-            "--npz", metavar="FILE", help="Write poses as NPZ with the keys of AMASS when the run ends."
-        ),
-        click.option("--bvh", metavar="FILE", help="Write poses as BVH, for Blender and similar programs."),
-        click.option(
-            "--udp",
-            callback=_destination,
-            metavar="HOST:PORT[,format=json|binary]",
-            help="Send each pose as a datagram.",
-        ),
-        click.option(
-            "--osc",
-            callback=address,
-            metavar="HOST:PORT",
-            help="Send each pose over OSC (the VMC protocol) to programs that show VRM avatars; most of them "
-            "listen on port 39539.",
-        ),
-        click.option(
-            "--tcp",
-            callback=address,
-            metavar="HOST:PORT",
-            help="Listen here for viewers that read poses as text, such as TransPose's on port 8888.",
-        ),
-        click.option("--view", is_flag=True, help="Show a figure in the browser; see `edgepose view`."),
-        click.option(
-            "--height",
-            type=float,
-            default=1.75,
-            show_default=True,
-            help="The wearer's height, metres, for the bones of --bvh, --osc and --view.",
-        ),
-        overwrite_option,
-        click.option(
-            "--sink",
-            "sinks",
-            multiple=True,
-            callback=_other_sinks,
-            metavar="NAME=TARGET",
-            help="Write to an output that an installed package adds; repeatable.",
-        ),
+        *_flags(SINKS, {"csv": [_rotations_option, std_option]}),
+        *(height_option, overwrite_option, other_sinks_option),
     ]
     return gathered(command, flags, "outputs", OutputConfig)
+
+
+def file_output_options(*more: Callable[[Command], Command]) -> Callable[[Command], Command]:
+    """Return a decorator that adds the flags of the outputs to files, then `more`, then --overwrite.
+
+    The command gets the outputs as `outputs: OutputConfig`.
+    """
+    files = {name: output for name, output in SINKS.items() if output.suffix}
+    flags: list[Callable[[Command], Command]] = [
+        *_flags(files, {"csv": [_rotations_option]}),
+        *more,
+        overwrite_option,
+    ]
+    return lambda command: gathered(command, flags, "outputs", OutputConfig)
+
+
+def _flags(
+    outputs: Mapping[str, Output], more: Mapping[str, Sequence[Callable[[Command], Command]]]
+) -> list[Callable[[Command], Command]]:
+    """Return the flags of outputs, each followed by `more` flags that are about this output alone."""
+    flags: list[Callable[[Command], Command]] = []
+    for name, output in outputs.items():
+        flags += [_flag(name, output), *more.get(name, ())]
+    return flags
+
+
+def _flag(name: str, output: Output) -> Callable[[Command], Command]:
+    def target(ctx: click.Context, param: click.Parameter, value: str | None) -> Any:
+        try:
+            return None if value is None else output.target(value)
+        except EdgeposeError as error:
+            raise click.BadParameter(str(error)) from None
+
+    if output.metavar is None:
+        return click.option(f"--{name}", is_flag=True, help=output.help)
+    return click.option(f"--{name}", metavar=output.metavar, callback=target, help=output.help)

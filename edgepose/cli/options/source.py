@@ -11,6 +11,7 @@ import click
 from edgepose.cli.options.gathered import gathered
 from edgepose.config import SourceConfig, checked_protocol
 from edgepose.errors import ConfigError
+from edgepose.formats.recordings.registry import READERS
 from edgepose.imu import FILTERS
 from edgepose.placements import PLACEMENTS
 from firmware_protocols.registry import protocol_names
@@ -75,9 +76,9 @@ def source_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--file",
             type=click.Path(path_type=Path),
-            help="Read a file instead: a recording (.csv, .npz, .mvnx, .pkl of DIP-IMU, .sensors of "
-            "TotalCapture, a folder of MT Manager or x-io), a raw serial capture (.bin, .raw) or a log of a "
-            "CAN bus (.asc, .blf, .log, .mf4, .trc, .csv of python-can).",
+            help="Read a file instead: a recording ("
+            f"{', '.join(reader.files for reader in READERS.values())}), a raw serial capture (.bin, .raw) "
+            "or a log of a CAN bus (.asc, .blf, .log, .mf4, .trc, .csv of python-can).",
         ),
         click.option(
             "--realtime", is_flag=True, help="Replay --file at its own pace instead of as fast as possible."

@@ -10,16 +10,16 @@ from pathlib import Path
 from edgepose.errors import FileFormatError
 from edgepose.formats.bvh import FRAME_TIMES
 from edgepose.formats.poses.base import PoseFormat
-from edgepose.formats.registered import all_formats, built_in_format
+from edgepose.formats.registered import Reader, all_formats, built_in_format
 from edgepose.pose import PoseSequence
 
 READERS = {
-    "csv": "edgepose.formats.poses.csv:FORMAT",
-    "npz": "edgepose.formats.poses.npz_amass:FORMAT",
-    "bvh": "edgepose.formats.poses.bvh:FORMAT",
-    "dip": "edgepose.formats.poses.dip:FORMAT",
+    "csv": Reader("edgepose.formats.poses.csv:FORMAT", ".csv"),
+    "npz": Reader("edgepose.formats.poses.npz_amass:FORMAT", ".npz with the keys of AMASS"),
+    "bvh": Reader("edgepose.formats.poses.bvh:FORMAT", ".bvh"),
+    "dip": Reader("edgepose.formats.poses.dip:FORMAT", ".pkl of DIP-IMU"),
 }
-"""Location of each `PoseFormat`; modules are imported in this order until one fits a file."""
+"""All pose formats; modules are imported in this order until one fits a file."""
 
 
 def read_poses(path: str | Path) -> PoseSequence:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import FileFormatError
+from edgepose.formats.ledger import Ledger
 from edgepose.formats.registered import FileFormat
 from edgepose.imu import ImuSample, Recording, SensorData
 from edgepose.placements import PLACEMENTS
@@ -148,30 +149,26 @@ class SampleTable:
         self._name = name
         self._salvage = salvage
         self._names = names
-        self._left_out = 0
-        self._problem = ""  # of the first row left out
+        self._ledger = Ledger(name)
         self._rows: dict[str, list[list[float]]] = {}
         self._marks: dict[str, list[tuple[int, int]]] = {}  # row number and number of empty cells
         self._blocks: dict[str, list[Array]] = {}
         self._checked = 0
         self.count = 0
 
-    def reject(self, problem: str) -> None:
-        """Leave a row out.
+    def reject(self, number: int, problem: str) -> None:
+        """Leave the row of this number out, which has a problem such as "has no time".
 
         Raises:
             FileFormatError: the table does not salvage.
         """
         if not self._salvage:
-            raise FileFormatError(f"{self._name}: {problem}")
-        self._problem = self._problem or problem
-        self._left_out += 1
+            raise FileFormatError(f"{self._name}: row {number} {problem}")
+        self._ledger.leave_out(number, problem)
 
     def damage(self) -> str | None:
         """Return a message on rows that were left out; None if there are none."""
-        if not self._left_out:
-            return None
-        return f"{self._name}: {self._left_out} bad rows left out, the first: {self._problem}"
+        return self._ledger.damage()
 
     def add(self, sensor: str, number: int, row: list[float], empty: int) -> None:
         """Add a row: its number in the file, 14 numbers, and how many of them are empty (NaN)."""
@@ -196,7 +193,7 @@ class SampleTable:
 
         def check(bad: Any, problem: str) -> None:
             for row in np.flatnonzero(bad & good):
-                self.reject(f"row {numbers[row]}: {sensor} {problem}")
+                self.reject(int(numbers[row]), f"({sensor}) {problem}")
             good[bad] = False
 
         times, values = rows[:, 0], rows[:, 1:]

@@ -144,14 +144,14 @@ def _read_rows(
                 sensor, numbers = _parse_row(cells, not lines.ended, options.names)
                 table.add(sensor, lines.number, numbers, cells.count(""))
         except csv.Error as error:
-            table.reject(f"row {lines.number}: {error}")
+            table.reject(lines.number, f"is not CSV: {error}")
         except ValueError as error:
             # Recordings that were joined: nothing of the wearer is in these lines.
             if not lines.too_long and cells and (_is_header(cells) or cells[0].startswith(COMMENTS)):
                 continue
             # The pieces of a line that is too long have no line end either.
             if lines.ended or lines.too_long:
-                table.reject(f"row {lines.number} {error}")
+                table.reject(lines.number, str(error))
                 continue
             return table, (
                 f"{path}: row {lines.number} is cut off, {table.count} samples before it are good; "

@@ -8,21 +8,23 @@ from pathlib import Path
 from edgepose.errors import FileFormatError
 from edgepose.formats.recordings.base import ReadOptions, RecordingFormat
 from edgepose.formats.recordings.time_checks import check_times, find_clocks_apart
-from edgepose.formats.registered import all_formats, built_in_format
+from edgepose.formats.registered import Reader, all_formats, built_in_format
 from edgepose.imu import Recording
 from edgepose.placements import PLACEMENTS
 
 READERS = {
-    "csv": "edgepose.formats.recordings.csv:FORMAT",
-    "npz": "edgepose.formats.recordings.npz:FORMAT",
-    "mvnx": "edgepose.formats.recordings.mvnx:FORMAT",
-    "dip-imu": "edgepose.formats.recordings.dip_imu:FORMAT",
-    "totalcapture": "edgepose.formats.recordings.totalcapture:FORMAT",
-    "xsens-session": "edgepose.formats.recordings.xsens_session:FORMAT",
-    "xio-session": "edgepose.formats.recordings.xio_session:FORMAT",
-    "packed-session": "edgepose.formats.recordings.packed_session:FORMAT",
+    "csv": Reader("edgepose.formats.recordings.csv:FORMAT", ".csv"),
+    "npz": Reader("edgepose.formats.recordings.npz:FORMAT", ".npz"),
+    "mvnx": Reader("edgepose.formats.recordings.mvnx:FORMAT", ".mvnx of Xsens MVN"),
+    "dip-imu": Reader("edgepose.formats.recordings.dip_imu:FORMAT", ".pkl of DIP-IMU"),
+    "totalcapture": Reader("edgepose.formats.recordings.totalcapture:FORMAT", ".sensors of TotalCapture"),
+    "xsens-session": Reader(
+        "edgepose.formats.recordings.xsens_session:FORMAT", "a folder of MT Manager or DOT"
+    ),
+    "xio-session": Reader("edgepose.formats.recordings.xio_session:FORMAT", "a folder of x-io"),
+    "packed-session": Reader("edgepose.formats.recordings.packed_session:FORMAT", ".zip of such a folder"),
 }
-"""Location of each `RecordingFormat`; modules are imported in this order until one fits a file."""
+"""All recording formats; modules are imported in this order until one fits a file."""
 
 
 def read_recording(

@@ -5,15 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from edgepose_export.evaluation.uncertainty import EXPECTED
-
-_KINDS = {
-    "birnn": "bidirectional LSTM; the pose of a frame is known once its {future} future frames have arrived "
-    "({latency:.0f} ms)",
-    "rnn": "unidirectional LSTM; the pose of a frame is known at once",
-    "feed-forward": "five dense layers over {past} past and {future} future frames; the pose of a frame is "
-    "known once these have arrived ({latency:.0f} ms)",
-    "wavenet": "dilated convolutions over {past} past frames; the pose of a frame is known at once",
-}
+from edgepose_export.networks.registry import NETWORKS
 
 _INPUTS = {
     "root": "in the pelvis frame",
@@ -33,14 +25,15 @@ def card(metadata: dict[str, Any]) -> str:
 
 def _summary(metadata: dict[str, Any]) -> list[str]:
     """Return the list at the top: network, input, targets, training data, licences, version."""
-    kind = _KINDS[metadata["kind"]].format(
+    kind = NETWORKS[metadata["kind"]].card.format(
         past=metadata["past"],
         future=metadata["future"],
+        hidden=metadata["hidden"],
         latency=1e3 * metadata["future"] / metadata["rate_hz"],
     )
     training = metadata["training"]
     return [
-        f"- Network: {kind}; {_size(metadata)}, {metadata['parameters'] / 1e6:.2f} million weights"
+        f"- Network: {kind}, {metadata['parameters'] / 1e6:.2f} million weights"
         f"{', rounded to about one part in a hundred' if metadata.get('rounded') else ''}.",
         f"- Input: calibrated orientations{' and accelerations' if metadata['acceleration'] else ''} of "
         f"{', '.join(metadata['placements'])} at {metadata['rate_hz']:g} Hz, "
@@ -139,12 +132,6 @@ def _mean(training: dict[str, Any]) -> str:
 def _seated(metadata: dict[str, Any]) -> bool:
     """Return whether the network was trained on synthetic sitting."""
     return metadata["training"]["config"].get("seated_share", 0.0) > 0.0
-
-
-def _size(metadata: dict[str, Any]) -> str:
-    if metadata["kind"] in ("birnn", "rnn"):
-        return f"two layers with {metadata['hidden']} units per direction"
-    return f"{metadata['hidden']} units in the widest layer"
 
 
 def _deviations(parts: dict[str, dict[str, Any]]) -> list[str]:

@@ -7,7 +7,7 @@ import subprocess
 import warnings
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -18,38 +18,16 @@ from edgepose.inference.archive import FORMAT, METADATA_FILE
 from edgepose.placements import PLACEMENTS
 from edgepose.skeleton import JOINTS
 from edgepose.utils.durable_files import write_whole
-from edgepose_export.networks.lstm import BirnnArchive, NormalisationAndDecoding, RnnArchive
-from edgepose_export.networks.normalisation import FirstFrameNormaliser, Inputs
-from edgepose_export.networks.receptive_field import FeedForward, FieldArchive, WaveNet
-from edgepose_export.networks.shape import NetworkShape, PoseDecoder, PoseNetwork
+from edgepose_export.networks.kind import Network, Statistics
+from edgepose_export.networks.normalisation import FirstFrameNormaliser
+from edgepose_export.networks.registry import NETWORKS
+from edgepose_export.networks.shape import NetworkShape, PoseDecoder
 from edgepose_export.training.dataset import RATE
-
-Network = PoseNetwork | FeedForward | WaveNet
-
-KINDS: dict[str, type[Network]] = {
-    "birnn": PoseNetwork,
-    "rnn": PoseNetwork,
-    "feed-forward": FeedForward,
-    "wavenet": WaveNet,
-}
-"""The module that is trained for each kind of network."""
-
-
-class Statistics(NamedTuple):
-    """Means and standard deviations of the inputs and of the pose targets over the training set.
-
-    The last 15 inputs are accelerations, if the network has them.
-    """
-
-    input_mean: Tensor
-    input_std: Tensor
-    target_mean: Tensor
-    target_std: Tensor
 
 
 def new_network(shape: NetworkShape) -> Network:
     """Return a network with the given shape and random weights."""
-    return KINDS[shape.kind](shape)
+    return NETWORKS[shape.kind].network(shape)
 
 
 def build(network: Network, statistics: Statistics, std_scale: Tensor | None = None) -> nn.Module:
@@ -62,12 +40,7 @@ def build(network: Network, statistics: Statistics, std_scale: Tensor | None = N
     """
     shape = network.shape
     decoder = PoseDecoder(shape, statistics.target_mean, statistics.target_std, std_scale)
-    if isinstance(network, PoseNetwork):
-        ends = NormalisationAndDecoding(network, statistics.input_mean, statistics.input_std, decoder)
-        module: nn.Module = (BirnnArchive if shape.kind == "birnn" else RnnArchive)(network, ends)
-    else:
-        inputs = Inputs(shape.normalisation, shape.acceleration, statistics.input_mean, statistics.input_std)
-        module = FieldArchive(network, inputs, decoder)
+    module = NETWORKS[shape.kind].archive(network, statistics, decoder)
     return (FirstFrameNormaliser(module) if shape.normalisation == "sequence" else module).eval()
 
 
@@ -128,18 +101,18 @@ def describe(
         name: name of the model.
         network: the network in the archive.
         checkpoint: the state of its training run.
-        past: default number of past frames in a window; used for bidirectional networks only.
+        past: default number of past frames in a window; used for kinds with windows only.
         future: default number of future frames, likewise.
     """
     shape = network.shape
-    if not isinstance(network, PoseNetwork):
-        past, future = network.past, network.future
-    elif shape.kind == "rnn":
-        past, future = 0, 0
+    windowed = NETWORKS[shape.kind].windowed
+    if not windowed:
+        past, future = getattr(network, "past", 0), getattr(network, "future", 0)
     return {
         "format": FORMAT,
         "name": name,
         "kind": shape.kind,
+        "windowed": windowed,
         "hidden": shape.hidden,
         "parameters": sum(p.numel() for p in network.parameters()),
         "placements": list(PLACEMENTS),

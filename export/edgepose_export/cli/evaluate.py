@@ -18,13 +18,6 @@ if TYPE_CHECKING:
 MODES = click.Choice(["window", "stream", "offline"])
 PICTURE = click.Path(path_type=Path, dir_okay=False)
 
-NO_WINDOW = {
-    "rnn": "is unidirectional",
-    "feed-forward": "sees a fixed number of frames",
-    "wavenet": "sees a fixed number of frames",
-}
-"""Why networks of a kind have no window, for messages; only "birnn" has one."""
-
 HEAT_MAP_FRAMES = [0, 1, 5, 10, 20, 50, 100, 200]
 """Past and future frames of DIP's figure 6."""
 
@@ -166,11 +159,9 @@ def _model(
     info = archive.read_info(path)
     module = archive.load(info, trust)
     about = dict(info.metadata)
-    if about["kind"] != "birnn":
+    if not archive.is_windowed(about):
         if future or past or set(modes) - {"stream", "offline"}:
-            raise click.UsageError(
-                f"{name} {_no_window(about['kind'])} and has no window; use --online stream"
-            )
+            raise click.UsageError(f"{name} {_no_window(about)} and has no window; use --online stream")
     else:
         about["past"] = about["past"] if past is None else past
         about["future"] = about["future"] if future is None else future
@@ -181,8 +172,10 @@ def _model(
     return _Model(path.stem, about, module, chosen)
 
 
-def _no_window(kind: str) -> str:
-    return NO_WINDOW.get(kind, f"is a network of the kind {kind!r}")
+def _no_window(metadata: dict[str, Any]) -> str:
+    """Return why a model has no window, for messages."""
+    fixed = metadata["past"] or metadata["future"]
+    return "sees a fixed number of frames" if fixed else "is unidirectional"
 
 
 def _row_name(models: list[_Model], model: _Model, mode: Mode) -> str:
@@ -231,9 +224,11 @@ def _tables(
 def _heat_map(
     model: _Model, data: Path, parts: tuple[str, ...], every: int, path: Path, overwrite: bool
 ) -> None:
-    if model.metadata["kind"] != "birnn":
+    from edgepose.inference.archive import is_windowed
+
+    if not is_windowed(model.metadata):
         raise click.UsageError(
-            f"{model.name} {_no_window(model.metadata['kind'])}; a heat map needs a bidirectional model"
+            f"{model.name} {_no_window(model.metadata)}; a heat map needs a bidirectional model"
         )
     from edgepose_export.cli.progress import labelled
     from edgepose_export.evaluation import plots

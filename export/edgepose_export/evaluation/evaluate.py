@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from edgepose.analysis.metrics import Metric, measure, per_frame, sip_error
+from edgepose.inference.archive import is_windowed
 from edgepose.skeleton import default_body
 from edgepose_export.datasets import read_published
 from edgepose_export.evaluation import baselines
@@ -48,7 +49,7 @@ class Mode(NamedTuple):
 def modes_of(metadata: dict[str, Any]) -> list[Mode]:
     """Return the modes in which an archive is measured."""
     past, future = metadata["past"], metadata["future"]
-    if metadata["kind"] != "birnn":
+    if not is_windowed(metadata):
         return [Mode("stream", 0, future), Mode("offline")]
     return [Mode("window", past, future), Mode("stream", 0, future), Mode("offline")]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+from edgepose.inference.archive import is_windowed
 from edgepose_export.evaluation.evaluate import Mode, Table
 
 
@@ -18,7 +19,7 @@ def _online(metadata: Mapping[str, Any]) -> list[Mode]:
 
 def _windows(metadata: Mapping[str, Any]) -> list[Mode]:
     """Return both windows of table 3; a network without windows is streamed."""
-    if metadata["kind"] != "birnn":
+    if not is_windowed(metadata):
         return _online(metadata)
     return [Mode("window", 20, 5), Mode("window", 50, 5)]
 

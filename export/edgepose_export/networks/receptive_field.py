@@ -8,11 +8,13 @@ ends of a sequence, the first and last frames are repeated to fill the field.
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from edgepose.inference.features import ACCELERATIONS
+from edgepose_export.networks.kind import Network, NetworkKind, Statistics
 from edgepose_export.networks.normalisation import Inputs
 from edgepose_export.networks.shape import SIGMA_FLOOR, NetworkShape, PoseDecoder
 
@@ -23,10 +25,11 @@ DILATIONS = (1, 2, 4, 8, 16) * 2
 """Distance of these frames, by layer: a field of 62 past frames. DIP does not state the sizes."""
 
 
-class _Heads(nn.Module):
+class Heads(nn.Module):
     """Means and, through SoftPlus, standard deviations, as in the recurrent networks (DIP figure 12)."""
 
     def __init__(self, width: int, shape: NetworkShape) -> None:
+        """Create random weights for inputs of this width."""
         super().__init__()
         outputs = shape.pose_outputs + ACCELERATIONS
         self.mean = nn.Linear(width, outputs)
@@ -34,6 +37,7 @@ class _Heads(nn.Module):
         self.floor = SIGMA_FLOOR
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Return means and deviations (..., outputs) for (..., width)."""
         return self.mean(x), nn.functional.softplus(self.deviation(x)) + self.floor
 
 
@@ -43,7 +47,7 @@ def padded(x: Tensor, past: int, future: int) -> Tensor:
     return torch.cat([before, x, behind], dim=1)
 
 
-class FeedForward(nn.Module):
+class FeedForward(Network):
     """Five dense layers over 20 past frames, the present one and 5 future ones."""
 
     def __init__(self, shape: NetworkShape) -> None:
@@ -56,7 +60,7 @@ class FeedForward(nn.Module):
         # A dense layer over the field of every frame is a convolution.
         self.first = nn.Conv1d(shape.inputs, widths[0], self.past + 1 + self.future)
         self.others = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
-        self.heads = _Heads(widths[-1], shape)
+        self.heads = Heads(widths[-1], shape)
 
     def hidden(self, x: Tensor) -> Tensor:
         """Return the last layer (B, T, units) for z-scored inputs (B, past + T + future, inputs)."""
@@ -88,7 +92,7 @@ class _DilatedLayer(nn.Module):
         return self.residual(z) + x[:, :, self.reach :], self.skip(z)
 
 
-class WaveNet(nn.Module):
+class WaveNet(Network):
     """Ten layers of causal dilated convolutions: a long past and no future frames."""
 
     def __init__(self, shape: NetworkShape) -> None:
@@ -102,7 +106,7 @@ class WaveNet(nn.Module):
             _DilatedLayer(shape.hidden, dilation, i == last) for i, dilation in enumerate(DILATIONS)
         )
         self.out = nn.Linear(shape.hidden, shape.hidden)
-        self.heads = _Heads(shape.hidden, shape)
+        self.heads = Heads(shape.hidden, shape)
 
     def hidden(self, x: Tensor) -> Tensor:
         """Return the last layer (B, T, units) for z-scored inputs (B, past + T, inputs)."""
@@ -127,7 +131,7 @@ class FieldArchive(nn.Module):
     each contains the whole field.
     """
 
-    def __init__(self, network: FeedForward | WaveNet, inputs: Inputs, decoder: PoseDecoder) -> None:
+    def __init__(self, network: Any, inputs: Inputs, decoder: PoseDecoder) -> None:
         """Combine a trained network with its inputs and its decoder."""
         super().__init__()
         self.network, self.inputs, self.decoder = network, inputs, decoder
@@ -219,3 +223,25 @@ class FieldArchive(nn.Module):
             rotations.append(rotation.unsqueeze(1))
             stds.append(std.unsqueeze(1))
         return torch.cat(rotations, dim=1), torch.cat(stds, dim=1)
+
+
+def field_archive(network: Network, statistics: Statistics, decoder: PoseDecoder) -> FieldArchive:
+    """Return the archive's module for a network over a receptive field."""
+    shape = network.shape
+    inputs = Inputs(shape.normalisation, shape.acceleration, statistics.input_mean, statistics.input_std)
+    return FieldArchive(network, inputs, decoder)
+
+
+FEED_FORWARD = NetworkKind(
+    FeedForward,
+    field_archive,
+    "five dense layers over {past} past and {future} future frames; the pose of a frame is known once these "
+    "have arrived ({latency:.0f} ms); {hidden} units in the widest layer",
+)
+
+WAVENET = NetworkKind(
+    WaveNet,
+    field_archive,
+    "dilated convolutions over {past} past frames; the pose of a frame is known at once; {hidden} units in "
+    "the widest layer",
+)

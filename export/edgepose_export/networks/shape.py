@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from edgepose.inference.features import ACCELERATIONS, local_rotations, nearest_rotation, rotation_from_6d
 from edgepose.placements import BONES, PLACEMENTS, ROOT
 from edgepose.skeleton import PARENTS, PREDICTED, UNOBSERVED
+from edgepose_export.networks.kind import Network
 from edgepose_export.networks.normalisation import tilt_of
 
 SIGMA_FLOOR = 0.02
@@ -26,7 +27,7 @@ class NetworkShape(NamedTuple):
     """Choices that decide the shapes of the weights and the meaning and processing of the outputs.
 
     Attributes:
-        kind: "birnn" or "rnn" (DIP 3.4), "feed-forward" or "wavenet" (DIP appendix A).
+        kind: a name in `registry.NETWORKS`.
         hidden: units of the dense layer and of each LSTM direction, or of the widest layer; 512 in the paper.
         targets: "local-matrix" (the paper: 9 numbers of each local rotation) or "global-6d" (6 numbers of
             each rotation in the root's frame).
@@ -73,7 +74,7 @@ class NetworkShape(NamedTuple):
         return len(self.joints) * self.numbers
 
 
-class PoseNetwork(nn.Module):
+class PoseNetwork(Network):
     """Dense layer with ReLU, two LSTM layers, heads for means and standard deviations (DIP figure 12)."""
 
     def __init__(self, shape: NetworkShape) -> None:

@@ -8,8 +8,8 @@ from typing import Any
 
 from edgepose.errors import EdgeposeError
 from edgepose.utils.text_files import read_toml
-from edgepose_export.archive.torchscript import KINDS
 from edgepose_export.networks.normalisation import SCHEMES
+from edgepose_export.networks.registry import NETWORKS
 from edgepose_export.networks.shape import NetworkShape
 from edgepose_export.synthesis.augmentation import Augmentation
 
@@ -130,10 +130,11 @@ def config_from(values: dict[str, Any]) -> TrainConfig:
         raise ValueError(
             "a network without accelerations cannot reconstruct them: set acceleration_loss = false"
         )
-    if config.streamed and config.network.kind != "birnn":
-        raise ValueError('streamed needs kind = "birnn"')
-    if config.network.smoothing and config.network.kind not in ("birnn", "rnn"):
-        raise ValueError('smoothing needs kind = "birnn" or "rnn"')
+    kind = NETWORKS[config.network.kind]
+    if config.streamed and not kind.streamed:
+        raise ValueError(f"streamed needs {_kinds('streamed')}")
+    if config.network.smoothing and not kind.smoothed:
+        raise ValueError(f"smoothing needs {_kinds('smoothed')}")
     if config.network.smoothing and config.network.targets != "global-6d":
         raise ValueError('smoothing needs targets = "global-6d"')
     if config.streamed >= config.window:
@@ -143,8 +144,14 @@ def config_from(values: dict[str, Any]) -> TrainConfig:
     return config
 
 
+def _kinds(ability: str) -> str:
+    """Return the kinds of networks with an ability, for messages."""
+    names = [f'"{name}"' for name, kind in NETWORKS.items() if getattr(kind, ability)]
+    return f"kind = {' or '.join(names)}"
+
+
 _CHOICES = {
-    "kind": tuple(KINDS),
+    "kind": tuple(NETWORKS),
     "normalisation": SCHEMES,
     "targets": ("local-matrix", "global-6d"),
     "measured": ("predicted", "passed"),

@@ -105,7 +105,8 @@ def test_one_byte_changed_is_another_sum(tmp_path, made):
     [
         ({"format": 2}, "format 2 is newer.*update edgepose"),
         ({"format": "1"}, "not what edgepose export writes"),
-        ({"kind": "transformer"}, "unknown kind of network 'transformer'"),
+        ({"kind": 7}, "kind of network 7 is not a name"),
+        ({"windowed": "yes"}, "is neither true nor false"),
         ({"placements": ["head", "pelvis"]}, "other sensor placements"),
         ({"placements": None}, "other sensor placements"),
         ({"rate_hz": 0}, "not a rate"),

@@ -248,7 +248,7 @@ def test_what_does_not_go_together(command, wearer, rig, tmp_path, ben, flags, s
 def test_only_one_wearer_has_standard_output(command, rig):
     result = command("run", *words(rig(csv="-"), rig("ben", csv="-")))
     assert result.returncode == 2
-    assert "several wearers write CSV to standard output; give all but one a file" in result.stderr
+    assert "several wearers write to standard output; give all but one a file" in result.stderr
 
 
 def test_the_example_of_a_rig_file_is_one(tmp_path):

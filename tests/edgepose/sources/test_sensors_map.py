@@ -156,12 +156,6 @@ def test_examples_of_commands_are_commands(line):
     assert command.make_context(name, words).params
 
 
-def test_every_protocol_is_on_the_page():
-    for name, protocol in PROTOCOLS.items():
-        row = next(row for row in PAGE.splitlines() if row.startswith("|") and f"`{name}`" in row)
-        assert str(protocol.default_bitrate) in row
-
-
 # --- without a map ------------------------------------------------------------------------------------------
 
 

@@ -10,13 +10,15 @@ import pytest
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.registry import pose_suffixes
 from edgepose.formats.recordings.registry import recording_suffixes
+from edgepose.output_files import check_output, known_endings
 from edgepose.pose import PoseFrame
 from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.npz import NpzSink
+from edgepose.sinks.registry import SINKS
 from edgepose.sources.replay import CAN_LOGS, CAPTURES
 from edgepose.utils.durable_files import replace_file, write_whole
 from edgepose.utils.growing_files import GrowingFile
-from edgepose.utils.output_targets import ENDINGS, descriptor, find_target, has_reader
+from edgepose.utils.output_targets import descriptor, find_target, has_reader
 
 OLD = b"what was there before\n"
 
@@ -108,5 +110,15 @@ def test_an_error_of_a_writer_leaves_the_old_file(tmp_path):
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [OLD]
 
 
-def test_no_output_has_the_ending_of_a_file_that_is_read():
-    assert {*recording_suffixes(), *pose_suffixes(), *CAPTURES, *CAN_LOGS} <= ENDINGS
+def test_endings_of_files_that_are_read_or_written():
+    assert {*recording_suffixes(), *pose_suffixes(), *CAPTURES, *CAN_LOGS} <= known_endings()
+    assert {output.suffix for output in SINKS.values()} - {""} <= known_endings()
+
+
+@pytest.mark.parametrize("ending", [".mvnx", ".sensors", ".log", ".json", ".PKL"])
+def test_no_output_replaces_a_file_of_another_kind(tmp_path, ending):
+    other = tmp_path / f"walk{ending}"
+    other.write_bytes(OLD)
+    with pytest.raises(EdgeposeError, match="is the ending of another kind of file; for poses use"):
+        check_output(other, "poses", (".csv",), True)
+    check_output(tmp_path / "walk.2026-11-30", "poses", (".csv",), True)

@@ -14,6 +14,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.registry import read_poses
 from edgepose.formats.recordings.dip_imu import read_recording
 from edgepose.formats.recordings.registry import read_recording as read_npz
+from edgepose.imu import Recording
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.rotations import Z_UP_TO_T, quat_to_matrix, rotvec_to_matrix
 from edgepose.skeleton import forward_kinematics
@@ -114,3 +115,15 @@ def test_by_the_command(content, command, tmp_path):
     np.testing.assert_allclose(read.rotations, wanted, atol=3e-6)
     np.testing.assert_allclose(read_poses(source).rotations, wanted, atol=1e-9)
     assert read.rate == read_poses(source).rate == 60.0
+
+
+def write_recording(path: Path, recording: Recording) -> Path:
+    frames = len(recording.sensors["head"].time_s)
+    content = {"imu_ori": np.zeros((frames, 17, 3, 3)), "imu_acc": np.zeros((frames, 17, 3))}
+    for place, data in zip(PLACES, recording.sensors.values(), strict=True):
+        bones = Z_UP_TO_T @ quat_to_matrix(data.quat)
+        content["imu_ori"][:, place] = bones
+        content["imu_acc"][:, place] = (bones @ data.acc[..., None])[..., 0] - [0.0, GRAVITY, 0.0]
+    path = path.with_suffix(".pkl")
+    path.write_bytes(pickle.dumps(content, 2))
+    return path

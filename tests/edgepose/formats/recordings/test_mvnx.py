@@ -140,7 +140,7 @@ def test_bad_frames_cost_only_themselves(tmp_path):
     found = read_mvnx(path)
     assert f"{path}: 3 bad frames left out; {path}: 1 incomplete sensorMagneticField" in found.damage
     assert f"{path}: 1 bad rows left out" in found.damage
-    assert "head has a quaternion that is not of unit length" in found.damage
+    assert "(head) has a quaternion that is not of unit length" in found.damage
     assert {name: len(data.time_s) for name, data in found.sensors.items()} == {
         name: FRAMES - 4 if name == "head" else FRAMES - 3 for name in PLACEMENTS
     }
@@ -297,3 +297,29 @@ def test_sensors_that_measure_nothing_that_is_read(tmp_path):
     )
     with pytest.raises(EdgeposeError, match="neither orientations nor accelerations that can be"):
         salvage_recording(path)
+
+
+def write_recording(path: Path, recording: Recording) -> Path:
+    frames = len(recording.sensors["head"].time_s)
+    data = recording.sensors.values()
+    rows = []
+    for i in range(frames):
+        quats = " ".join(cell for d in data for cell in _cells(*d.quat[i]))
+        free = " ".join(
+            cell for d in data for cell in _cells(*(quat_rotate(d.quat[i], d.acc[i]) - [0.0, 0.0, GRAVITY]))
+        )
+        rows.append(
+            f'<frame time="{1000 * i // 60}" type="normal"><sensorOrientation>{quats}</sensorOrientation>'
+            f"<sensorFreeAcceleration>{free}</sensorFreeAcceleration></frame>\n"
+        )
+    sensors = "".join(f'<sensor label="{label}"/>' for label in LABELS)
+    path = path.with_suffix(".mvnx")
+    path.write_text(
+        f'<mvnx version="4"><subject frameRate="60"><sensors>{sensors}</sensors>\n'
+        f"<frames>{''.join(rows)}</frames></subject></mvnx>\n"
+    )
+    return path
+
+
+def _cells(*values: float) -> list[str]:
+    return [f"{value:.7f}" for value in values]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import stat
 import zipfile
 from pathlib import Path
@@ -12,7 +13,9 @@ import pytest
 from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings import packed_session
 from edgepose.formats.recordings.registry import find_format, read_recording
+from edgepose.imu import Recording
 from edgepose.placements import PLACEMENTS
+from tests.edgepose.formats.recordings.test_xio_session import write_recording as write_session
 
 HEAD = "// Update Rate: 100.0Hz\n"
 NAMES = "PacketCounter,Acc_X,Acc_Y,Acc_Z,Quat_q0,Quat_q1,Quat_q2,Quat_q3\n"
@@ -82,3 +85,10 @@ def test_what_is_not_a_session(tmp_path, monkeypatch):
     with pytest.raises(EdgeposeError, match="more than 3000 bytes are packed in it"):
         read_recording(path)
     assert find_format(path) is packed_session.FORMAT
+
+
+def write_recording(path: Path, recording: Recording) -> Path:
+    write_session(path / "walk", recording)
+    packed = shutil.make_archive(str(path), "zip", path)
+    shutil.rmtree(path)
+    return Path(packed)

@@ -189,13 +189,13 @@ def test_damaged_npz_is_an_error_or_still_a_recording(tmp_path_factory, place, c
     [
         (",head,", ",hat,", "row 6 names an unknown sensor 'hat'"),
         ("9.81", "abc", "row 2 has a value that is not a number"),
-        ("9.81", "nan", "row 2: left_forearm has a number that is NaN or absurd"),
-        ("9.81", "", "row 2: left_forearm has only a part of acc"),
+        ("9.81", "nan", "row 2 (left_forearm) has a number that is NaN or absurd"),
+        ("9.81", "", "row 2 (left_forearm) has only a part of acc"),
         ("9.81", "9" * 9000, "row 2 has 9 columns"),
         ("9.81", "\0" * 10, "row 2"),
-        ("0.010000,pelvis", "0.030000,pelvis", "row 19: pelvis goes back in time"),
-        ("0.010000,pelvis", "nan,pelvis", "row 13: pelvis has no time"),
-        (",1,0,0,0,", ",0,0,0,0,", "row 2: left_forearm has a quaternion that is not of unit length"),
+        ("0.010000,pelvis", "0.030000,pelvis", "row 19 (pelvis) goes back in time"),
+        ("0.010000,pelvis", "nan,pelvis", "row 13 (pelvis) has no time"),
+        (",1,0,0,0,", ",0,0,0,0,", "row 2 (left_forearm) has a quaternion that is not of unit length"),
     ],
 )
 def test_a_bad_row_alone_is_left_out(tmp_path, old, new, problem):
@@ -204,6 +204,16 @@ def test_a_bad_row_alone_is_left_out(tmp_path, old, new, problem):
     assert f"{tmp_path / 'a.csv'}: " in recording.damage
     assert " bad rows left out, the first: " + problem in recording.damage
     assert "\n" not in recording.damage
+
+
+def test_the_first_bad_row_is_named(tmp_path):
+    """Sensors are checked one after the other, whatever the order of their rows."""
+    lines = text(rig()).splitlines(keepends=True)
+    for row in (7, 2):  # pelvis, left_forearm
+        lines[row - 1] = lines[row - 1].replace("9.81", "nan")
+    lines[4] = "noise\n"
+    recording = salvage_recording(write(tmp_path / "a.csv", "".join(lines)))
+    assert ": 3 bad rows left out, the first: row 2 (left_forearm) has" in recording.damage
 
 
 def test_zeros_at_the_end_after_a_power_cut(tmp_path):
@@ -232,13 +242,13 @@ def test_salvage_of_samples_and_arrays(tmp_path):
         recording_from_samples(rows)
     recording = recording_from_samples(rows, name="port", salvage=True)
     assert len(list(iter_samples(recording))) == 17
-    assert recording.damage.startswith("port: 1 bad rows left out, the first: row 8: right_forearm")
+    assert recording.damage.startswith("port: 1 bad rows left out, the first: row 8 (right_forearm)")
     with np.load(REAL) as file:
         values = file["head_acc"].copy()
     values[3] = np.nan
     recording = salvage_recording(npz(tmp_path / "a.npz", head_acc=values))
     assert len(list(iter_samples(recording))) == 1799
-    assert "row 3: head" in recording.damage
+    assert "row 3 (head)" in recording.damage
 
 
 def test_metadata_cannot_start_a_row(tmp_path):
@@ -311,10 +321,10 @@ def npz(path, **changes):
         ({"t": np.arange(300.0)[::-1]}, "back in time"),
         ({"t": np.arange(299.0)}, "(299, 4)"),
         ({"t": np.arange(300.0)[:, None, None] * np.ones((1, 2, 1))}, "'t'"),
-        ({"pelvis_acc": np.full((300, 3), np.nan)}, "row 0: pelvis"),
+        ({"pelvis_acc": np.full((300, 3), np.nan)}, "row 0 (pelvis)"),
         ({"pelvis_acc": np.ones((300, 4))}, "'pelvis_acc'"),
         ({"pelvis_acc": np.full((300, 3), "a")}, "'pelvis_acc'"),
-        ({"head_quat": np.ones((300, 4))}, "head has a quaternion"),
+        ({"head_quat": np.ones((300, 4))}, "(head) has a quaternion"),
         ({"hat_acc": np.ones((300, 3))}, "'hat_acc'"),
         ({"metadata": np.ones(3)}, "'metadata'"),
         ({"head_quat": None, "head_acc": None, "head_gyr": None}, "no samples of head"),
@@ -354,7 +364,9 @@ def test_a_sensor_that_was_restarted(tmp_path):
     time_s[200:] -= 1.9
     recording.sensors["head"] = head._replace(time_s=time_s)
     write_npz(tmp_path / "a.npz", recording)
-    with pytest.raises(EdgeposeError, match="row 200: head goes back in time by more than a second; sort"):
+    with pytest.raises(
+        EdgeposeError, match=r"row 200 \(head\) goes back in time by more than a second; sort"
+    ):
         read_recording(tmp_path / "a.npz")
     salvaged = read_recording(tmp_path / "a.npz", salvage=True)
     assert salvaged.damage.startswith(f"{tmp_path / 'a.npz'}: ")

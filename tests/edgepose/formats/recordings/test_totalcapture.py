@@ -10,6 +10,7 @@ import pytest
 from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.registry import read_recording as read_npz
 from edgepose.formats.recordings.totalcapture import NAMES, read_recording
+from edgepose.imu import Recording
 from edgepose.placements import PLACEMENTS
 
 REAL = Path(__file__).parents[3] / "data" / "imu" / "six-sites-3s.npz"
@@ -104,3 +105,15 @@ def test_another_inertial_frame(file):
         EdgeposeError, match=r"L_LowArm measures gravity along \[0\.0, 9\.8, 0\.0\] instead of Z"
     ):
         read_recording(file)
+
+
+def write_recording(path: Path, recording: Recording) -> Path:
+    frames = len(recording.sensors["head"].time_s)
+    lines = [f"{len(NAMES)}\t{frames}"]
+    for i in range(frames):
+        lines.append(str(i + 1))
+        for name, data in zip(NAMES, recording.sensors.values(), strict=True):
+            lines.append("\t".join([name, *(f"{x:.7f}" for x in (*data.quat[i], *data.acc[i]))]))
+    path = path.with_suffix(".sensors")
+    path.write_text("\n".join(lines) + "\n")
+    return path

@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation
 from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.registry import salvage_recording
 from edgepose.formats.recordings.xio_session import read_session
+from edgepose.imu import Recording
+from firmware_protocols.sample import STANDARD_G
 
 COUNT = 50
 TURNS = Rotation.from_rotvec(np.cumsum(np.full((COUNT, 3), [0.01, -0.02, 0.03]), axis=0))
@@ -77,3 +79,21 @@ def test_another_file(tmp_path):
     (folder / NAME / "Quaternion.csv").write_text("t,W,X,Y,Z\n")
     with pytest.raises(EdgeposeError, match=r"Quaternion.csv: starts with 't,W,X,Y,Z', not with"):
         read_session(folder)
+
+
+def write_recording(path: Path, recording: Recording) -> Path:
+    for name, data in recording.sensors.items():
+        inertial = [
+            "Timestamp (us),Gyroscope X (deg/s),Gyroscope Y (deg/s),Gyroscope Z (deg/s),"
+            "Accelerometer X (g),Accelerometer Y (g),Accelerometer Z (g)"
+        ]
+        quaternion = ["Timestamp (us),W,X,Y,Z"]
+        for time_s, quat, acc, gyr in zip(data.time_s, data.quat, data.acc, data.gyr, strict=True):
+            numbers = [*map(np.degrees, gyr), *(acc / STANDARD_G)]
+            inertial.append(",".join([str(round(1e6 * time_s)), *(f"{x:.7f}" for x in numbers)]))
+            quaternion.append(",".join([str(round(1e6 * time_s)), *(f"{x:.7f}" for x in quat)]))
+        folder = path / name
+        folder.mkdir(parents=True)
+        (folder / "Inertial.csv").write_text("\n".join(inertial) + "\n")
+        (folder / "Quaternion.csv").write_text("\n".join(quaternion) + "\n")
+    return path

@@ -15,7 +15,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.base import iter_samples, recording_from_samples
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.formats.recordings.xsens_session import is_session, read_session
-from edgepose.imu import ImuSample
+from edgepose.imu import ImuSample, Recording
 from edgepose.placements import PLACEMENTS
 
 REAL = Path(__file__).parents[3] / "data" / "imu" / "six-sites-3s.npz"
@@ -309,3 +309,18 @@ def test_two_recordings_in_one_folder(tmp_path):
     session(tmp_path, [f"{name}_001-000" for name in PLACEMENTS])
     with pytest.raises(EdgeposeError, match=r"are both \w+; rename one, or give each recording a folder of"):
         read_session(tmp_path)
+
+
+def write_recording(path: Path, recording: Recording, names: tuple[str, ...] = PLACEMENTS) -> Path:
+    frames = len(recording.sensors["head"].time_s)
+    columns = ["PacketCounter", *(f"Acc_{x}" for x in "XYZ"), *(f"Gyr_{x}" for x in "XYZ")]
+    columns += [f"Quat_q{i}" for i in range(4)]
+    path.mkdir()
+    for name, data in zip(names, recording.sensors.values(), strict=True):
+        lines = ["// Update Rate: 60.0Hz", "\t".join(columns)]
+        for i in range(frames):
+            lines.append(
+                "\t".join([str(i), *(f"{x:.7f}" for x in (*data.acc[i], *data.gyr[i], *data.quat[i]))])
+            )
+        (path / f"{name}.txt").write_text("\n".join(lines) + "\n")
+    return path

@@ -1,0 +1,110 @@
+"""The table of outputs: how users ask for each, and the location of its sink."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any
+
+from edgepose.errors import ConfigError
+from edgepose.utils.output_targets import part_path
+from edgepose.utils.sockets import parse_destination, parse_host_and_port
+
+if TYPE_CHECKING:
+    from edgepose.sinks.base import SinkFactory
+
+ENTRY_POINTS = "edgepose.sinks"
+"""Group of entry points under which other packages register their factories."""
+
+
+@dataclass(frozen=True)
+class Output:
+    """An output of poses, which has the flag --NAME and the TOML key NAME.
+
+    Attributes:
+        factory: "module:function" of its `SinkFactory`; imported when the output is opened.
+        help: help text of the flag.
+        metavar: form of the flag's value; None for a switch.
+        parse: makes the sink's target from that value. Raises ConfigError if the value has another form.
+        suffix: ending of its files, such as ".csv"; empty if it does not write to a file.
+        part: returns the name of the file that holds the poses during a run, given that of the output; None
+            if there is no such file.
+    """
+
+    factory: str
+    help: str
+    metavar: str | None = "FILE"
+    parse: Callable[[str], Any] = str
+    suffix: str = ""
+    part: Callable[[str], Path] | None = None
+
+    def target(self, value: Any) -> Any:
+        """Return the sink's target for a value: text is parsed, anything else is a target already.
+
+        Raises:
+            ConfigError: the text has another form, or a switch is not True.
+        """
+        if self.metavar is None and value is not True:
+            raise ConfigError(f"{value!r} is neither True nor False")
+        return self.parse(str(value)) if isinstance(value, str | Path) else value
+
+
+SINKS = {
+    "csv": Output("edgepose.sinks.csv:open_sink", "Write poses as CSV; - is standard output.", suffix=".csv"),
+    "npz": Output(
+        "edgepose.sinks.npz:open_sink",
+        "Write poses as NPZ with the keys of AMASS at the end.",
+        suffix=".npz",
+        part=part_path,
+    ),
+    "bvh": Output(
+        "edgepose.sinks.bvh:open_sink",
+        "Write poses as BVH, for Blender and similar programs.",
+        suffix=".bvh",
+    ),
+    "udp": Output(
+        "edgepose.sinks.udp:open_sink",
+        "Send each pose as a datagram.",
+        "HOST:PORT[,format=json|binary]",
+        parse_destination,
+    ),
+    "osc": Output(
+        "edgepose.sinks.vmc:open_sink",
+        "Send each pose over OSC (the VMC protocol) to programs that show VRM avatars; most of them listen "
+        "on port 39539.",
+        "HOST:PORT",
+        parse_host_and_port,
+    ),
+    "tcp": Output(
+        "edgepose.sinks.tcp:open_sink",
+        "Listen here for viewers that read poses as text, such as TransPose's on port 8888.",
+        "HOST:PORT",
+        parse_host_and_port,
+    ),
+    "view": Output(
+        "edgepose.sinks.viewer:open_sink", "Show a figure in the browser; see `edgepose view`.", metavar=None
+    ),
+}
+"""All outputs of this package by name, in the order of their flags."""
+
+
+def sink_factory(name: str) -> SinkFactory:
+    """Return the factory of a sink, from the table or from another package.
+
+    Raises:
+        ConfigError: there is none of that name, or the other package cannot be imported.
+    """
+    if name in SINKS:
+        factory: SinkFactory = resolve_name(SINKS[name].factory)
+        return factory
+    for point in entry_points(group=ENTRY_POINTS, name=name):
+        try:
+            loaded: SinkFactory = point.load()
+        except (Exception, SystemExit) as error:  # third-party code
+            raise ConfigError(f"output {name!r}: {point.value} cannot be imported: {error}") from error
+        return loaded
+    known = ", ".join(sorted({point.name for point in entry_points(group=ENTRY_POINTS)})) or "none"
+    raise ConfigError(f"unknown output {name!r}; installed packages add: {known}")

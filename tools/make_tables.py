@@ -1,0 +1,71 @@
+"""Write the tables of the documentation that are made from the code.
+
+python tools/make_tables.py
+
+A table stands between two comments, `table NAME: made by tools/make_tables.py` and `end of table`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from firmware_protocols.base import Protocol
+from firmware_protocols.registry import BUILT_IN, PROTOCOLS
+
+ROOT = Path(__file__).parents[1]
+PAGES = ("docs/guide/sensors.md",)
+
+_BLOCK = re.compile(
+    r"(<!-- table (\w+): made by tools/make_tables\.py -->\n).*?(<!-- end of table -->)", re.DOTALL
+)
+
+
+def protocols() -> str:
+    """Return the table of wire formats, for a page in docs/guide."""
+    head = ("sensors", "`--protocol`", "line", "baud or bit rate", "first id", "set the device to send")
+    return _table([head, *(_row(PROTOCOLS[name]) for name in BUILT_IN)])
+
+
+def _row(protocol: Protocol) -> Sequence[str]:
+    page = f"../../firmware_protocols/docs/{protocol.page or protocol.name}.md".replace("docs/../", "")
+    return (
+        protocol.description,
+        f"[`{protocol.name}`]({page})",
+        "serial" if protocol.transport == "bytes" else "CAN",
+        str(protocol.default_bitrate),
+        _first_id(protocol),
+        protocol.setup or "-",
+    )
+
+
+def _first_id(protocol: Protocol) -> str:
+    if not protocol.ids:
+        return "-"
+    first, second = protocol.ids[:2]
+    if second != first + 1:
+        return f"{first}, then {second} ..."
+    return f"0x{first:X}" if first > 9 else str(first)
+
+
+def _table(rows: Sequence[Sequence[str]]) -> str:
+    lines = ["| " + " | ".join(cell.replace("|", r"\|") for cell in row) + " |" for row in rows]
+    return "\n".join([lines[0], "|" + "---|" * len(rows[0]), *lines[1:]]) + "\n"
+
+
+TABLES = {"protocols": protocols}
+
+
+def with_tables(text: str) -> str:
+    """Return a page with its tables made again."""
+    return _BLOCK.sub(lambda match: match[1] + TABLES[match[2]]() + match[3], text)
+
+
+if __name__ == "__main__":
+    for page in PAGES:
+        path = ROOT / page
+        before = path.read_text(encoding="utf-8")
+        after = with_tables(before)
+        path.write_text(after, encoding="utf-8")
+        print(f"{page}: {'changed' if after != before else 'up to date'}")
