@@ -1,7 +1,8 @@
 """Assembly of one Sample from messages that a device sends separately.
 
-`MessagePairer` and `InstantMerger` go by the times of the messages. HiPNUC on CAN and WitMotion have no times and go by order,
-with `CycleDetector`. The MTi-600 (time or group counter) and the native packet on CAN have their own rules.
+`MessagePairer` and `InstantMerger` go by the times of the messages. HiPNUC on CAN and WitMotion have no times
+and go by order, with `CycleDetector`. The MTi-600 (time or group counter) and the native packet on CAN have
+their own rules.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ class CycleDetector:
 
 
 class InstantMerger:
-    """Merges messages of one sensor and one instant that hold different quantities, such as orientation alone.
+    """Merges messages of one sensor and one instant that hold different quantities.
 
     It learns which quantities come in every instant, and returns a sample as soon as it has these. Messages
     with the same quantities are never merged.
@@ -102,7 +103,8 @@ class InstantMerger:
 
 def _merged(one: Sample, other: Sample) -> Sample:
     """Return a sample with the quantities of both; the first one's where both have them."""
-    return Sample(*(b if a is None else a for a, b in zip(one, other, strict=True)))
+    missing = {name: value for name, value in other._asdict().items() if getattr(one, name) is None}
+    return one._replace(**missing)
 
 
 class MessagePairer:

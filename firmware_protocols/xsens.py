@@ -235,12 +235,15 @@ class XbusDecoder(StreamDecoder):
         sensor = 0 if frame[1] == _BROADCAST else frame[1]
         sample = Sample(sensor, time_us, quat or matrix or euler, acc, gyr, mag, temperature)
         instant = count if time_us is None else time_us
+        if instant is None:
+            self._emit(sample, samples)
+            return
         if count is not None:
             # The messages of one instant may share a count.
             shared = self._sequence.is_last(sensor, count) and self._merger.completes(sample, instant)
             if not shared and not self._sequence.is_new(sensor, count, time_us):
                 return
-        for complete in [sample] if instant is None else self._merger.add(sample, instant):
+        for complete in self._merger.add(sample, instant):
             self._emit(complete, samples)
 
 

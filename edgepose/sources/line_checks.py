@@ -41,11 +41,21 @@ def check_start(line: LineReader, now_s: float, start_s: float) -> None:
                 f"{spec.name}: packets come only from sensor ids {ids}; set the ids to {decoder.ids}, "
                 "or assign them to placements with --sensors"
             )
+        if decoder.refused is not None:
+            raise DeviceError(f"{spec.name}: {decoder.refused}")
         kind = "" if decoder.protocol is None else f"{decoder.protocol.name} "
         raise DeviceError(
             f"{spec.name}: {decoder.amount} {spec.unit} in {NOISE_S:g} s but no valid {kind}packet; "
             f"check {spec.check[1]}"
         )
+
+
+def warn_about_refused(line: LineReader) -> None:
+    """Log a warning, once, if a line has input that could be understood but not used."""
+    refused = None if line.refused_reported else line.decoder.refused
+    if refused is not None:
+        line.refused_reported = True
+        _log.warning("%s: %s", line.spec.name, refused)
 
 
 def warn_about_clock_resets(line: LineReader) -> None:

@@ -81,6 +81,8 @@ class LogSource:
         problems = [self._ledger.damage()]
         if self._bad:
             problems.append(f"{self._path}: ignored {self._bad} frames with an impossible time or id")
+        if self.counters.packets:
+            problems += [f"{self._path}: {text}" for text in self._refused]
         if self._untimed:
             problems.append(f"{self._path}: left out {self._untimed} samples before the first time")
         if self._set_back_s:
@@ -143,7 +145,13 @@ class LogSource:
     def _untimed(self) -> int:
         return sum(decoder.untimed for decoder in self._decoders.values())
 
+    @property
+    def _refused(self) -> list[str]:
+        return [text for decoder in self._decoders.values() if (text := decoder.refused) is not None]
+
     def _problem(self) -> str:
+        if self._refused:
+            return self._refused[0]
         if not self._decoders and (damage := self._ledger.damage()):
             return f"not a log of frames ({damage})"
         decoders = self._decoders.values()

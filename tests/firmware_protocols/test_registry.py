@@ -11,7 +11,7 @@ from firmware_protocols.registry import PROTOCOLS
 from firmware_protocols.sample import Sample
 
 NO_TIME = {
-    *("hipnuc-canopen", "hipnuc-j1939", "witmotion-modbus", "witmotion-can", "bno08x-rvc"),
+    *("hipnuc-canopen", "hipnuc-j1939", "witmotion-modbus", "witmotion-can", "witmotion-ble", "bno08x-rvc"),
     *("vectornav-ascii", "haritorax", "adafruit", "razor"),
 }
 
