@@ -16,6 +16,7 @@ from edgepose.errors import ConfigError, EdgeposeError
 from edgepose.formats.poses.csv_columns import ROTATION_FORMATS
 from edgepose.imu import FILTERS
 from edgepose.utils.output_targets import check_output, is_stream, part_path
+from edgepose.utils.similar_names import choices
 from edgepose.utils.sockets import Destination, parse_address, parse_destination
 from edgepose.utils.text_files import read_toml
 
@@ -285,7 +286,7 @@ def _value(key: str, value: object, folder: Path) -> Any:
         return value
     what = _KEYS.get(key)
     if what is None:
-        raise ConfigError(f"unknown key {key!r}; keys are name, {', '.join([*_KEYS, 'sinks'])}")
+        raise ConfigError(f"unknown key {key!r}; {choices(key, ['name', *_KEYS, 'sinks'], 'keys are')}")
     if type(value) not in _TYPES[what]:  # not isinstance, to which a bool is an int
         raise ConfigError(f"{key} must be {what}, not {value!r}")
     if not isinstance(value, str):
@@ -323,4 +324,4 @@ def checked_protocol(name: str) -> str:
 
     if name == "auto" or name.endswith(".toml") or name in PROTOCOLS:
         return name
-    raise ConfigError(f"unknown protocol {name!r}; known are {', '.join(PROTOCOLS)}")
+    raise ConfigError(f"unknown protocol {name!r}; {choices(name, ['auto', *PROTOCOLS])}")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from edgepose.errors import ConfigError
+from edgepose.utils.similar_names import choices
 from firmware_protocols.registry import PROTOCOLS, Decoder, Protocol
 from firmware_protocols.sample import Sample
 
@@ -48,7 +49,7 @@ def protocol_named(name: str) -> Protocol:
     if name.endswith(".toml"):
         return _text_lines(Path(name))
     if name not in PROTOCOLS:
-        raise ConfigError(f"unknown protocol {name!r}; known are auto, {', '.join(PROTOCOLS)}")
+        raise ConfigError(f"unknown protocol {name!r}; {choices(name, ['auto', *PROTOCOLS])}")
     return PROTOCOLS[name]
 
 
