@@ -10,8 +10,8 @@
 
 Prints `port NAME[,NAME...]` for use with --port (or `can NAME` for --can), `started UNIX_TIME` and `ended
 UNIX_TIME`. Before a clip, the wearer stands straight for 6 s. Sensors that rest before and after the
-recording have the noise of real ones. Ends at Ctrl-C, or when standard input closes and the recording, if it has
-started, is over.
+recording have the noise of real ones. Ends at Ctrl-C, or when standard input closes and the recording,
+if it has started, is over.
 """
 
 from __future__ import annotations
