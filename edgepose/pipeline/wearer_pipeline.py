@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from edgepose.calibration import apply_calibration
 from edgepose.calibration.misfit import MisfitDetector
 from edgepose.calibration.rezero import HeadingRezero
+from edgepose.diagnostics.rig_monitor import RigMonitor
 from edgepose.errors import EdgeposeError, as_edgepose_error
 from edgepose.imu import ImuFrame, ImuSample
 from edgepose.inference.engine import EngineInput, EngineOutput
@@ -89,6 +90,7 @@ class WearerPipeline:
         notify: Callable[[str], None] = lambda text: None,
         on_pose: Callable[[RunSummary], None] = lambda summary: None,
         misfits: MisfitDetector | None = None,
+        rig: RigMonitor | None = None,
         warn: Callable[[str], None] = lambda text: None,
     ) -> None:
         """Join the stages.
@@ -101,12 +103,13 @@ class WearerPipeline:
             notify: called with one message per sensor that drops out or comes back.
             on_pose: called after each pose has been written.
             misfits: checks whether the calibration fits the wearer.
-            warn: called with one message per finding of `misfits`.
+            rig: checks the sensors as they measure.
+            warn: called with one message per finding of `misfits` and `rig`.
         """
         self.summary, self.clock = RunSummary(), clock
         self.arrived = self._started = time.perf_counter()
         self._headings, self._sinks, self._orient, self._notify = headings, sinks, orient, notify
-        self._on_pose, self._misfits, self._warn = on_pose, misfits, warn
+        self._on_pose, self._misfits, self._rig, self._warn = on_pose, misfits, rig, warn
         self._dropouts = DropoutMonitor()
         self._bones: NDArray[np.float64] | None = None  # those of the previous frame
 
@@ -114,6 +117,9 @@ class WearerPipeline:
         """Return the network inputs of the frames that are ready after a batch."""
         self.summary.backlog_s = batch.backlog_s
         self.arrived = time.perf_counter() - batch.backlog_s
+        if self._rig is not None:
+            for line in self._rig.add(batch.samples, batch.now_s):
+                self._warn(line)
         if batch.samples:
             self.clock.push(self._orient(batch.samples), batch.now_s)
         return self._engine_inputs(self.clock.frames(batch.now_s))
@@ -121,9 +127,10 @@ class WearerPipeline:
     def flush(self) -> Iterator[EngineInput]:
         """Yield the network inputs of the last frames."""
         yield from self._engine_inputs(self.clock.flush())
-        if self._misfits is not None:
-            for line in self._misfits.at_end():
-                self._warn(line)
+        for line in [] if self._rig is None else self._rig.judge():
+            self._warn(line)
+        for line in [] if self._misfits is None else self._misfits.at_end():
+            self._warn(line)
 
     def emit(self, outputs: list[EngineOutput], arrived: float) -> None:
         """Write poses whose newest packet arrived at a time on the clock of `time.perf_counter`."""

@@ -93,7 +93,7 @@ def check(
     """
     from edgepose.calibration import load_calibration
     from edgepose.diagnostics.sensor_health import SensorHealthMonitor
-    from edgepose.pipeline.rig_comparison import other_devices
+    from edgepose.pipeline.rig_comparison import missing_heading_reset, other_devices
     from edgepose.sources import open_source
 
     loaded = None if calibration is None else load_calibration(calibration)
@@ -115,7 +115,8 @@ def check(
                 page.draw([title[:width], *table, *_wrapped(warnings, width)])
 
         state, error = _listen(opened, health, source.file is None, seconds, lambda: stop.asked, watch)
-        if loaded is not None and (difference := other_devices(loaded, opened.devices)) is not None:
+        differences = [] if loaded is None else other_devices(loaded, opened.devices)
+        for difference in [*differences, *missing_heading_reset(loaded, opened.devices)]:
             _log.warning("%s", difference.removeprefix("warning: "))
     if page is not None:
         for warning in warnings:
