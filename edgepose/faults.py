@@ -18,9 +18,14 @@ NO_GRAVITY_M_S2 = 0.5
 HEADING_RESETS = "--heading-reset motion, live or mounting"
 
 
-def two_devices(apart_deg: float) -> str:
-    """Two devices that send under one id, with the angle between them."""
-    return f"two devices, {apart_deg:.0f} deg apart, send under its id: give each an id of its own"
+JUMPS_OF_TWO = 20
+"""Restarts of a clock within a second, or in a log, that a single device does not make."""
+
+
+def two_devices(apart_deg: float | None = None) -> str:
+    """Two devices that send under one id, with the angle between them; None if only their clocks differ."""
+    how = "whose clocks differ" if apart_deg is None else f"{apart_deg:.0f} deg apart"
+    return f"two devices, {how}, send under its id: give each an id of its own"
 
 
 def no_gravity(norm_m_s2: float) -> str | None:

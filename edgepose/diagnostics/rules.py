@@ -94,7 +94,9 @@ def _invalid(s: SensorHealth) -> str | None:
 
 
 def _two_devices(s: SensorHealth) -> str | None:
-    return None if s.two_devices_deg is None else faults.two_devices(s.two_devices_deg)
+    if s.two_devices_deg is None and s.clock_restarts < faults.JUMPS_OF_TWO:
+        return None
+    return faults.two_devices(s.two_devices_deg)
 
 
 def _same(s: SensorHealth) -> str | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 
+from edgepose import faults
 from edgepose.errors import DeviceError
 from edgepose.placements import PLACEMENTS
 from edgepose.sources.line_reader import LineReader
@@ -15,8 +16,6 @@ SILENCE_S = 5.0
 
 NOISE_S = 3.0
 """Longest time with data but no usable packet at the start, seconds."""
-
-_DUPLICATE_JUMPS = 20  # resets of a clock within a second that a single device does not make
 
 
 def check_start(line: LineReader, now_s: float, start_s: float) -> None:
@@ -66,18 +65,14 @@ def warn_about_clock_resets(line: LineReader) -> None:
     devices = {} if line.clocks is None else line.clocks.devices
     for placement, clock in devices.items():
         before = line.clock_resets.get(placement, 0)
-        if clock.resets - before >= _DUPLICATE_JUMPS and not line.duplicate_ids:
+        if clock.resets - before >= faults.JUMPS_OF_TWO and not line.duplicate_ids:
             line.duplicate_ids = True
-            _log.warning(
-                "%s: the clock of the sensor for %s jumps back and forth; do two devices have the same id?",
-                line.spec.name,
-                PLACEMENTS[placement],
-            )
+            _log.warning("%s: %s: %s", line.spec.name, PLACEMENTS[placement], faults.two_devices())
         elif clock.resets > before:
             _log.warning(
-                "%s: the clock of the sensor for %s restarted; if it was switched off, its heading may have "
-                "changed: calibrate again",
+                "%s: %s: %s: calibrate again",
                 line.spec.name,
                 PLACEMENTS[placement],
+                faults.clock_restarted(),
             )
         line.clock_resets[placement] = clock.resets
