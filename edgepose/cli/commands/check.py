@@ -124,6 +124,8 @@ def check(
     if opened.damage:
         say(f"warning: {opened.damage}")
         warnings.append(opened.damage)
+    if error is not None and not any(sensor.samples for sensor, _ in state.sensors):
+        raise error  # a table of sensors that sent nothing would hide the reason
     if as_json:
         show(_json(source.name, state, warnings))
     else:
@@ -240,6 +242,9 @@ _COLUMNS = (
 )
 
 
+_NOTHING = "no packet came from any sensor: switch them on, and check --port or --can, --baud and --protocol"
+
+
 def _lines(state: State, width: int | None) -> list[str]:
     """Return a headline, a row for each sensor and advice, fitted into `width` columns (None: any width)."""
     fine = len(state.sensors) - state.problems
@@ -249,6 +254,8 @@ def _lines(state: State, width: int | None) -> list[str]:
         f"{counters.packets} good, {counters.lost} lost, {counters.bad} bad, {counters.unknown} unknown"
     )
     advice = [f"{sensor.placement}: {finding.advice}" for sensor, finding in state.sensors if finding.advice]
+    if not any(sensor.samples for sensor, _ in state.sensors):
+        advice = [_NOTHING]
     return [headline[:width], "", *_rows(state, width), *([""] if advice else []), *_wrapped(advice, width)]
 
 
