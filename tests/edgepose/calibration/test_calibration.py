@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from edgepose import calibration as cal
 from edgepose import rotations as rot
+from edgepose.calibration.checks import detect_alternating_devices
 from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import ImuSample
@@ -391,6 +392,20 @@ def test_no_accelerometer_is_a_warning(hold: list[cal.SensorHold]) -> None:
     summary = cal.check_hold([*hold[:HEAD], blind, hold[PELVIS]])
     assert summary.warnings == ["head measures no acceleration: gravity was not checked"]
     assert np.isnan(summary.force[HEAD]).all()
+
+
+@pytest.mark.parametrize("speed_deg_s", [0.0, 60.0, 400.0])
+@pytest.mark.parametrize("own_ids", [False, True])
+def test_two_devices_alternate_also_in_motion(speed_deg_s: float, own_ids: bool) -> None:
+    """The samples of two devices that move come in turn; a single one that turns as fast is one."""
+    rng = np.random.default_rng(2)
+    t = np.arange(100) / 100
+    one = rot.rotvec_to_quat(np.outer(np.radians(speed_deg_s) * t, [0.6, 0.0, 0.8]))
+    other = rot.quat_multiply(rot.rotvec_to_quat(np.array([0.0, 1.0, 0.0])), one)
+    quats = one if own_ids else np.concatenate([one, other])[np.argsort(np.tile(t, 2), kind="stable")]
+    quats = rot.quat_multiply(quats, rot.rotvec_to_quat(rng.normal(0.0, 0.002, (len(quats), 3))))
+    apart = detect_alternating_devices(quats)
+    assert apart is None if own_ids else apart == pytest.approx(np.degrees(1.0), abs=6.0)
 
 
 Q = np.array([0.5, 0.1, -0.7, 0.5]) / np.linalg.norm([0.5, 0.1, -0.7, 0.5])
