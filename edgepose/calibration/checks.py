@@ -28,7 +28,7 @@ RATE_LIMIT_DEG_S = (
 )
 GRAVITY_TILT_LIMIT_DEG = 10.0
 
-_EARLIER = (2, 3, 4, 5, 6)  # samples back of one device among those of two
+_EARLIER = (2, 3)  # samples back of one device among those of two
 
 
 class MovedError(CalibrationError):
@@ -117,17 +117,32 @@ def _rms(x: Array) -> float:
 
 
 def detect_alternating_devices(quat: Array) -> float | None:
-    """Return the angle, degrees, between two devices whose samples (n, 4) alternate; None if it is one.
+    """Return the angle, degrees, between two devices whose samples (n, 4) alternate; None if it is one."""
+    at_rest = _alternating_at_rest(quat)
+    return _alternating_in_motion(quat) if at_rest is None else at_rest
 
-    A sample of another device is far from the one before and near an earlier one. A single device that moves
-    is nearest to the one before.
-    """
+
+def _alternating_at_rest(quat: Array) -> float | None:
+    from_first = _angles(quat, quat[0])
+    far = from_first > from_first.max() / 2
+    # A single moving sensor passes through the angles between, and does not change sides every few samples.
+    if np.count_nonzero(far[1:] != far[:-1]) < max(4, len(quat) / 10):
+        return None
+    near, other = quat[~far], quat[far]
+    centre, other_centre = rot.mean_rotation(near), rot.mean_rotation(other)
+    spread = math.degrees(max(_rms(_angles(near, centre)), _rms(_angles(other, other_centre))))
+    apart = math.degrees(_angles(other_centre[None], centre)[0])
+    return apart if spread < SPREAD_LIMIT_DEG and apart > max(2.0 * SPREAD_LIMIT_DEG, 4.0 * spread) else None
+
+
+def _alternating_in_motion(quat: Array) -> float | None:
+    # A single device is nearest to where it was a sample ago, except at the turning points of a fast swing.
     if len(quat) <= _EARLIER[-1]:
         return None
     now = quat[_EARLIER[-1] :]
     apart = [_angles_between(quat[_EARLIER[-1] - k : len(quat) - k], now) for k in (1, *_EARLIER)]
     jumps = (apart[0] > math.radians(2.0 * SPREAD_LIMIT_DEG)) & (np.min(apart[1:], axis=0) < apart[0] / 4.0)
-    if np.count_nonzero(jumps) < max(4, len(now) / 10):
+    if np.count_nonzero(jumps) < max(4, len(now) / 2):
         return None
     return math.degrees(float(np.median(apart[0][jumps])))
 

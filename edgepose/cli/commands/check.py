@@ -124,7 +124,7 @@ def check(
     if opened.damage:
         say(f"warning: {opened.damage}")
         warnings.append(opened.damage)
-    if error is not None and not any(sensor.samples for sensor, _ in state.sensors):
+    if error is not None and not as_json and not any(sensor.samples for sensor, _ in state.sensors):
         raise error  # a table of sensors that sent nothing would hide the reason
     if as_json:
         show(_json(source.name, state, warnings))
