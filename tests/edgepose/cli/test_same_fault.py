@@ -193,6 +193,9 @@ def judge(fault: Fault, lines: list[list[object]], live: bool) -> None:
             process.kill()
         for reader in readers:
             reader.join()
+        for process in processes:
+            process.stdout.close()
+            process.stderr.close()
     for output in outputs:
         assert re.search(fault.says, output), output
         assert "Traceback" not in output
