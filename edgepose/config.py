@@ -19,6 +19,7 @@ from edgepose.imu import FILTERS
 from edgepose.output_files import check_output
 from edgepose.sinks.registry import SINKS
 from edgepose.utils.output_targets import is_stream
+from edgepose.utils.similar_names import choices
 from edgepose.utils.sockets import parse_host_and_port
 from edgepose.utils.text_files import read_toml
 
@@ -318,7 +319,7 @@ def _value(key: str, value: object, folder: Path) -> Any:
         return value
     what = _KEYS.get(key)
     if what is None:
-        raise ConfigError(f"unknown key {key!r}; keys are name, {', '.join([*_KEYS, 'sinks'])}")
+        raise ConfigError(f"unknown key {key!r}; {choices(key, ['name', *_KEYS, 'sinks'], 'keys are')}")
     if type(value) not in _TYPES[what]:  # not isinstance, to which a bool is an int
         raise ConfigError(f"{key} must be {what}, not {value!r}")
     if not isinstance(value, str):
@@ -355,4 +356,4 @@ def checked_protocol(name: str) -> str:
 
     if name == "auto" or name.endswith(".toml") or name in PROTOCOLS:
         return name
-    raise ConfigError(f"unknown protocol {name!r}; known are {', '.join(PROTOCOLS)}")
+    raise ConfigError(f"unknown protocol {name!r}; {choices(name, ['auto', *PROTOCOLS])}")

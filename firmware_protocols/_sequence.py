@@ -23,6 +23,10 @@ class Sequence:
         self._wrap_us = wrap_us
         self._last: dict[int, tuple[int, int | None]] = {}  # count, time by sensor
 
+    def is_last(self, sensor: int, count: int) -> bool:
+        """Return whether a count is that of a sensor's last new packet."""
+        return sensor in self._last and self._last[sensor][0] == count
+
     def is_new(self, sensor: int, count: int, time_us: int | None) -> bool:
         """Return whether a packet is neither a duplicate nor late, and count the packets lost before it."""
         last_count, last_us = self._last.get(sensor, (count - 1, time_us))

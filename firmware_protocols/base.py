@@ -55,6 +55,11 @@ class Decoder(ABC):
         """Return the samples still held back at the end of a recording; by default there are none."""
         return []
 
+    @property
+    def refused(self) -> str | None:
+        """Input of this format that could be understood but not used, and what to do; None by default."""
+        return None
+
 
 @dataclass(frozen=True)
 class Protocol:

@@ -1,13 +1,14 @@
 """LP-Research LPMS: LPBUS frames over a serial line (USB, UART, Bluetooth SPP).
 
 The layout is in docs/lpms.md. Everything is little-endian. A frame does not say which quantities it holds:
-they are a setting of the sensor, which has to be passed to the decoder.
+they are a setting of the sensor, which has to be passed to the decoder. Its length shows the kind of numbers.
 """
 
 from __future__ import annotations
 
 import re
 import struct
+from collections import Counter
 from collections.abc import Iterable
 
 from firmware_protocols._numbers import number, vector
@@ -44,6 +45,8 @@ FIELDS = tuple(_QUANTITIES)
 USUAL_FIELDS = ("gyr", "acc", "mag", "quat")
 """Quantities that sensors should be set to send."""
 
+_NAMES = {"gyr": "angular rate", "acc": "acceleration", "mag": "field", "quat": "quaternion"}
+
 _HEAD = struct.Struct("<3H")
 _START_BYTE, _END = b"\x3a", b"\r\n"
 _OVERHEAD = 1 + _HEAD.size + 2 + len(_END)
@@ -70,20 +73,24 @@ class LpmsDecoder(StreamDecoder):
     WRAP_US = (1 << 32) * TICK_US
     _START = re.compile(_START_BYTE)
 
-    def __init__(self, fields: Iterable[str] = USUAL_FIELDS, floats: bool = True) -> None:
+    def __init__(self, fields: Iterable[str] = USUAL_FIELDS) -> None:
         """Create the decoder.
 
         Args:
             fields: quantities that the sensors are set to send, out of FIELDS, in any order.
-            floats: whether numbers are binary32 instead of int16.
 
         Raises:
             ValueError: unknown fields.
         """
         super().__init__()
-        names, self._layout = _layout(fields, floats)
+        names, as_floats = _layout(fields, True)
+        _, as_integers = _layout(fields, False)
+        self._layouts = {
+            as_floats.size: (as_floats, dict.fromkeys(names, 1.0)),
+            as_integers.size: (as_integers, {name: 1.0 / _QUANTITIES[name][1] for name in names}),
+        }
+        self._other_lengths: Counter[int] = Counter()
         self._index_of: dict[str, int] = {}
-        self._scale = {name: 1.0 if floats else 1.0 / _QUANTITIES[name][1] for name in names}
         at = 1
         for name in names:
             self._index_of[name] = at
@@ -106,29 +113,47 @@ class LpmsDecoder(StreamDecoder):
         if command != SENSOR_DATA:
             self.counters.skipped += 1
             return
-        if length != self._layout.size:  # the sensor is set to send other quantities
+        if length not in self._layouts:  # the sensor is set to send other quantities
+            self._other_lengths[length] += 1
             self.counters.bad += 1
             return
-        v = self._layout.unpack_from(frame, 1 + _HEAD.size)
+        layout, scale = self._layouts[length]
+        v = layout.unpack_from(frame, 1 + _HEAD.size)
         quat: Quaternion | None = None
         at = self._index_of.get("quat")
         if at is not None:
-            s = self._scale["quat"]
+            s = scale["quat"]
             quat = unit_quaternion(v[at] * s, -v[at + 1] * s, -v[at + 2] * s, -v[at + 3] * s)
-        acc = self._vector(v, "acc", -STANDARD_G)
-        gyr = self._vector(v, self._rate, 1.0)
-        mag = self._vector(v, "mag", 1.0)
+        acc = self._vector(v, "acc", scale, -STANDARD_G)
+        gyr = self._vector(v, self._rate, scale)
+        mag = self._vector(v, "mag", scale)
         temperature = None
         at = self._index_of.get("temperature")
         if at is not None:
-            temperature = number(v[at] * self._scale["temperature"])
+            temperature = number(v[at] * scale["temperature"])
         self._emit(Sample(sensor, v[0] * TICK_US, quat, acc, gyr, mag, temperature), samples)
 
-    def _vector(self, v: tuple[float, ...], name: str, unit: float) -> Vector3 | None:
+    def _vector(
+        self, v: tuple[float, ...], name: str, scale: dict[str, float], unit: float = 1.0
+    ) -> Vector3 | None:
         at = self._index_of.get(name)
         if at is None:
             return None
-        return vector(v[at : at + 3], self._scale[name] * unit)
+        return vector(v[at : at + 3], scale[name] * unit)
+
+    @property
+    def refused(self) -> str | None:
+        """Measurements whose length shows that they hold other quantities."""
+        if not self._other_lengths:
+            return None
+        (length, _), *_ = self._other_lengths.most_common(1)
+        floats, integers = self._layouts
+        names = [_NAMES.get(name, name) for name in self._index_of]
+        return (
+            f"{sum(self._other_lengths.values())} measurements came whole, but with {length} bytes instead "
+            f"of {floats} (floats) or {integers} (16 bit): set the sensor to send {', '.join(names[:-1])} "
+            f"and {names[-1]}, and nothing else"
+        )
 
 
 def encode(sample: Sample, fields: Iterable[str] = USUAL_FIELDS, floats: bool = True) -> bytes:
@@ -169,5 +194,5 @@ PROTOCOL = Protocol(
     encoder=uncounted(encode),
     ids=range(1, 7),
     single_device=True,
-    setup="rate, acceleration, field, quaternion, as floats",
+    setup="rate, acceleration, field, quaternion, and nothing else",
 )

@@ -30,6 +30,7 @@ BUILT_IN = {
     "hipnuc-canopen": "hipnuc_can:PROTOCOL_CANOPEN",
     "hipnuc-j1939": "hipnuc_can:PROTOCOL_J1939",
     "witmotion": "witmotion:PROTOCOL",
+    "witmotion-ble": "witmotion_ble:PROTOCOL",
     "witmotion-modbus": "witmotion_modbus:PROTOCOL",
     "witmotion-can": "witmotion_can:PROTOCOL",
     "ximu3": "ximu3:PROTOCOL",

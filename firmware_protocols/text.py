@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from functools import partial
-from math import degrees, isfinite, sqrt
+from math import degrees, isfinite, nan, sqrt
 
 from firmware_protocols import rotation
 from firmware_protocols._numbers import number, vector
@@ -37,6 +37,7 @@ class TextDecoder(Receiver):
     """Decoder for a stream of text lines that may be split anywhere, start anywhere and contain noise.
 
     Lines that do not match the pattern are skipped. Text has no checksum, so wrong digits are not detected.
+    Numbers may have a decimal comma, unless that separates the columns, and a clock may follow a date.
     """
 
     WRAP_US = 1 << 64
@@ -70,9 +71,19 @@ class TextDecoder(Receiver):
         self._skip_first = self._layout is not None
         self._scales = {quantity: pattern.scale(quantity) for quantity in UNITS}
         self._clock = pattern.units.get("time") == "clock"
+        self._decimal_comma = pattern.regex is not None or "," not in pattern.separator
         self._ned = pattern.frame == "NED"
         self._rest = b""
         self._too_long = False
+        self._line_number = self._unread = 0
+        self._first_unread = ""
+
+    @property
+    def refused(self) -> str | None:
+        """Lines that match the pattern but hold something else, if these are most lines."""
+        if self._unread <= self.counters.packets:
+            return None
+        return f"{self._unread} lines cannot be read, the first: {self._first_unread}"
 
     def feed(self, data: bytes) -> list[Sample]:
         """Return the samples completed by the next bytes of the stream, in order of arrival."""
@@ -93,6 +104,7 @@ class TextDecoder(Receiver):
         return samples
 
     def _line(self, line: str) -> Sample | None:
+        self._line_number += 1
         # `feed` passes a line that is too long as an empty one.
         if not line or not line.isascii():
             self._count_bad()
@@ -118,21 +130,30 @@ class TextDecoder(Receiver):
                 return None
             count, indices = self._layout
             if len(columns) != count:
-                self._count_bad()
+                self._count_unread(f"it has {len(columns)} columns instead of {count}")
                 return None
             values = {name: columns[index] for name, index in indices.items()}
         try:
             sample = self._sample(values)
-        except (ValueError, OverflowError):
-            sample = None
-        if sample is None:
-            self._count_bad()
+        except (ValueError, OverflowError) as error:
+            self._count_unread(str(error))
             return None
         self._count_good()
         self.counters.packets += 1
         return sample
 
-    def _sample(self, values: Mapping[str, str | None]) -> Sample | None:
+    def _count_unread(self, why: str) -> None:
+        self._count_bad()
+        self._unread += 1
+        self._first_unread = self._first_unread or f"line {self._line_number}: {why}"
+
+    def _sample(self, values: Mapping[str, str | None]) -> Sample:
+        """Return the sample of a line.
+
+        Raises:
+            ValueError: a value is not a number of its quantity; the message names it.
+            OverflowError: a number is too large.
+        """
         sensor, time_us, temperature = 0, None, None
         quat: Quaternion | None = None
         numbers = {}
@@ -142,31 +163,26 @@ class TextDecoder(Receiver):
             if name == "sensor":
                 sensor = int(text)
                 if not 0 <= sensor < 1 << 32:
-                    return None
+                    raise ValueError(f"sensor is {text!r}, which is no id")
             elif name == "time":
                 time_us = self._time(text)
             else:
-                value = float(text)
-                if not isfinite(value) or "_" in text:
-                    return None
-                numbers[name] = value
+                numbers[name] = self._number(name, text)
         if "x" in numbers:
             x, y, z = numbers["x"], numbers["y"], numbers["z"]
             w = numbers.get("w")
             if w is None:
                 square = 1 - x * x - y * y - z * z
-                if square < -0.02:
-                    return None
-                w = sqrt(max(square, 0.0))
+                w = sqrt(max(square, 0.0)) if square >= -0.02 else nan
             quat = unit_quaternion(w, x, y, z)
             if quat is None:
-                return None
+                raise ValueError("the quaternion is not of length 1")
         elif "yaw" in numbers:
             scale = self._scales["angle"]
             yaw, pitch, roll = (numbers[name] * scale for name in ANGLES)
             quat = rotation.from_angles(yaw, pitch, roll)
             if quat is None:
-                return None
+                raise ValueError("the angles are implausibly large")
         if quat is not None and self._ned:
             quat = z_up(quat)
         if "temperature" in numbers:
@@ -176,7 +192,7 @@ class TextDecoder(Receiver):
             for names, quantity in ((ACC, "acc"), (GYR, "gyr"), (MAG, "mag"))
         )
         if quat is None and acc is None and gyr is None:
-            return None
+            raise ValueError("it has neither orientation nor acceleration nor rate")
         return Sample(sensor, time_us, quat, acc, gyr, mag, temperature)
 
     def _vector(self, numbers: dict[str, float], names: tuple[str, ...], quantity: str) -> Vector3 | None:
@@ -188,23 +204,43 @@ class TextDecoder(Receiver):
             raise ValueError("a value is implausibly large")
         return result
 
+    def _number(self, name: str, text: str) -> float:
+        point = text.replace(",", ".") if self._decimal_comma and "." not in text else text
+        try:
+            value = float(point)
+        except ValueError:
+            value = nan
+        if not isfinite(value) or "_" in text:
+            raise ValueError(f"{name} is {text[:20]!r}, which is no number")
+        return value
+
     def _time(self, text: str) -> int:
-        if "_" in text:
-            raise ValueError
+        try:
+            time_us = self._time_us(text)
+        except ValueError:
+            time_us = -1
+        if time_us < 0 or "_" in text:
+            unit = self.pattern.units.get("time", "us")
+            raise ValueError(f"time is {text[:30]!r}, which is no time in the unit {unit}")
+        return time_us % self.WRAP_US
+
+    def _time_us(self, text: str) -> int:
         if self._clock:
-            hours, minutes, seconds = text.split(":")
-            time_us = round((int(hours) * 60 + int(minutes)) * 60_000_000 + float(seconds) * 1e6)
+            # A date may precede it: 2023-03-04 21:27:11.770, or with a T between the two.
+            _, _, clock = text.strip().replace("T", " ").rpartition(" ")
+            hours, minutes, seconds = clock.split(":")
+            time_us = round(
+                (int(hours) * 60 + int(minutes)) * 60_000_000 + float(seconds.replace(",", ".")) * 1e6
+            )
         else:
             # Integer arithmetic is exact for any number of steps.
             scale = self._scales["time"]
             time_us = (
                 int(text) * int(scale)
                 if text.isdecimal() and scale.is_integer()
-                else round(float(text) * scale)
+                else round(self._number("time", text) * scale)
             )
-        if time_us < 0:
-            raise ValueError
-        return time_us % self.WRAP_US
+        return time_us
 
 
 # --- for simulation -------------------------------------------------------------------------------

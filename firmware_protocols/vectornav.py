@@ -94,10 +94,36 @@ class _Plan(NamedTuple):
     parts: tuple[tuple[str, int, struct.Struct], ...]
 
 
+class _Forms:
+    """Quantities of the newest output in each form, to choose one of two that repeat each other."""
+
+    _FORGOTTEN = 100
+    """Outputs in one form after which the other one has been switched off."""
+
+    def __init__(self) -> None:
+        """Start without outputs."""
+        self._names: dict[bool, frozenset[str]] = {}
+        self._since = {False: 0, True: 0}
+
+    def is_better(self, sample: Sample, binary: bool) -> bool:
+        """Return whether the other form does not have all that a sample has."""
+        own = frozenset(name for name in ("quat", "acc", "gyr") if getattr(sample, name) is not None)
+        if not own:
+            return True
+        self._names[binary] = own
+        self._since[binary] = 0
+        self._since[not binary] += 1
+        if self._since[not binary] > self._FORGOTTEN:
+            self._names.pop(not binary, None)
+        other = self._names.get(not binary, frozenset())
+        return not (own < other or (own == other and not binary))
+
+
 class VectorNavDecoder(StreamDecoder):
     """Decoder for the serial line of one device.
 
-    Only samples of binary outputs with the time since start-up have a time.
+    Only samples of binary outputs with the time since start-up have a time. A device that sends both forms
+    measures once: the form with fewer quantities, or the lines if both have the same, is skipped.
     """
 
     # 64 bits of nanoseconds: 584 years.
@@ -111,6 +137,7 @@ class VectorNavDecoder(StreamDecoder):
         super().__init__()
         self._plans: dict[bytes, _Plan | None] = {}  # by header; None: not an output
         self._current: _Plan | None = None  # of the output whose length was asked for last
+        self._forms = _Forms()
 
     def _length(self, buffer: bytes, at: int) -> int:
         if buffer[at] == 0xFA:
@@ -154,9 +181,11 @@ class VectorNavDecoder(StreamDecoder):
         mag = vector(values["mag"], _GAUSS_UT) if "mag" in values else None
         temperature = number(*values["temperature"]) if "temperature" in values else None
         time_us = values["time"][0] // 1000 if "time" in values else None
-        self._emit(
-            Sample(0, time_us, None if quat is None else z_up(quat), acc, gyr, mag, temperature), samples
-        )
+        sample = Sample(0, time_us, None if quat is None else z_up(quat), acc, gyr, mag, temperature)
+        if self._forms.is_better(sample, frame[0] == 0xFA):
+            self._emit(sample, samples)
+        else:
+            self.counters.skipped += 1
 
     def _binary(self, frame: bytes) -> dict[str, tuple]:
         parts = self._current.parts if self._current else ()

@@ -15,6 +15,7 @@ from firmware_protocols._numbers import number, vector
 from firmware_protocols._sequence import Sequence
 from firmware_protocols._stream import StreamDecoder
 from firmware_protocols.base import Protocol
+from firmware_protocols.pairing import InstantMerger
 from firmware_protocols.rotation import from_angles, from_matrix, rotate, to_yaw_pitch_roll
 from firmware_protocols.sample import Quaternion, Sample, unit_quaternion, z_up
 
@@ -137,7 +138,8 @@ def mtdata2_items(payload: bytes) -> Iterator[tuple[int, Values | bytes]]:
 class XbusDecoder(StreamDecoder):
     """Decoder for the Xbus stream of one device, or of a master with several sensors.
 
-    `sensor` is the bus id behind a master, 0 for a single device.
+    `sensor` is the bus id behind a master, 0 for a single device. Messages with the same sample time (or
+    without one, the same packet counter) become one sample.
     """
 
     WRAP_US = (1 << 32) * TICK_US
@@ -148,6 +150,14 @@ class XbusDecoder(StreamDecoder):
         """Create the decoder."""
         super().__init__()
         self._sequence = Sequence(self.counters, self.WRAP_US)
+        self._merger = InstantMerger()
+
+    def flush(self) -> list[Sample]:
+        """Return the samples still held back at the end of a recording."""
+        samples: list[Sample] = []
+        for sample in self._merger.flush():
+            self._emit(sample, samples)
+        return samples
 
     def _length(self, buffer: bytes, at: int) -> int:
         head = buffer[at : at + 6]
@@ -223,9 +233,18 @@ class XbusDecoder(StreamDecoder):
             elif kind == 0x0810:
                 temperature = number(values[0])
         sensor = 0 if frame[1] == _BROADCAST else frame[1]
-        if count is not None and not self._sequence.is_new(sensor, count, time_us):
+        sample = Sample(sensor, time_us, quat or matrix or euler, acc, gyr, mag, temperature)
+        instant = count if time_us is None else time_us
+        if instant is None:
+            self._emit(sample, samples)
             return
-        self._emit(Sample(sensor, time_us, quat or matrix or euler, acc, gyr, mag, temperature), samples)
+        if count is not None:
+            # The messages of one instant may share a count.
+            shared = self._sequence.is_last(sensor, count) and self._merger.completes(sample, instant)
+            if not shared and not self._sequence.is_new(sensor, count, time_us):
+                return
+        for complete in self._merger.add(sample, instant):
+            self._emit(complete, samples)
 
 
 def _z_up(quat: Quaternion | None, item: int) -> Quaternion | None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 LEVELS = (
-    "errors placements rotations skeleton imu pose utils",
+    "errors placements rotations skeleton imu pose faults utils",
     "formats orientation calibration inference",
     "sources sinks sip analysis diagnostics viewer convert record config output_files",
     "pipeline",

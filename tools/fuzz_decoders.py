@@ -38,6 +38,9 @@ FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
 LINES = ("adafruit", "razor", "openlog", "openlog-dmp")
 """Formats in which a line without its end corrupts the next one, because line starts are not marked."""
 
+CONFIRMED_BY_NEXT = ("witmotion-ble",)
+"""Formats without a checksum, in which a packet counts only if an undamaged one follows."""
+
 
 class Result(NamedTuple):
     """Result of fuzzing a decoder.
@@ -177,6 +180,8 @@ def damaged(rng: random.Random, protocol: Protocol, pieces: list[list[Any]]) -> 
                 out += damage_frames(rng, sample, used)
             else:
                 out.append(damage_bytes(rng, sample[0]))
+                if protocol.name in CONFIRMED_BY_NEXT:
+                    good.discard(number - 1)
                 corrupted = protocol.name in LINES and not out[-1].endswith(b"\n")
         else:
             if protocol.transport == "can" and rng.random() < 0.1:

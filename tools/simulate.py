@@ -1,16 +1,17 @@
 """Plays an IMU recording or a motion-capture clip as six devices in real time, in any wire format.
 
 \b
-    simulate.py recording.npz                         play native packets, then repeat the last sample
-    simulate.py recording.npz --stand                 repeat the first sample until a line arrives on stdin
+    simulate.py recording.npz                         play native packets, then rest
+    simulate.py recording.npz --stand                 rest at the first sample until a line arrives on stdin
     simulate.py walk.bvh --protocol xsens             six ptys with one device each
     simulate.py walk.bvh --protocol native-can        CAN frames of a slcan adapter on a pty
     simulate.py walk.bvh --protocol native-can --can socketcan:can0
     simulate.py walk.bvh --exercises --mounting 7 --raw 6    sensors without a filter at random angles
 
 Prints `port NAME[,NAME...]` for use with --port (or `can NAME` for --can), `started UNIX_TIME` and `ended
-UNIX_TIME`. Before a clip, the wearer stands straight for 6 s. Ends at Ctrl-C, or when standard input closes
-and the recording, if it has started, is over.
+UNIX_TIME`. Before a clip, the wearer stands straight for 6 s. Sensors that rest before and after the
+recording have the noise of real ones. Ends at Ctrl-C, or when standard input closes and the recording,
+if it has started, is over.
 """
 
 from __future__ import annotations
@@ -49,6 +50,11 @@ ANSWER_BITS_S = 115_200
 
 FIELD_UT = (0.0, 20.0, -40.0)
 """Magnetic field in the inertial frame, for formats that require one."""
+
+NOISE_ACC, NOISE_GYR, NOISE_QUAT = 0.005, 0.0005, 0.0001
+"""Noise of a sensor at rest per axis, m/s^2, rad/s and rad: a good chip's at a bandwidth of 25 Hz."""
+
+GRAVITY = (0.0, 0.0, 9.81)
 
 
 class Faults(NamedTuple):
@@ -161,6 +167,29 @@ def with_field(sample: Sample) -> Sample:
     if sample.mag is not None or sample.quat is None:
         return sample
     return sample._replace(mag=rotate_back(sample.quat, FIELD_UT))
+
+
+def at_rest(sample: Sample) -> Sample:
+    """Return a sample of a sensor that stays where a sample was taken; without orientation, the sample."""
+    if sample.quat is None:
+        return sample
+    return sample._replace(
+        acc=None if sample.acc is None else rotate_back(sample.quat, GRAVITY),
+        gyr=None if sample.gyr is None else (0.0, 0.0, 0.0),
+    )
+
+
+def with_noise(sample: Sample, rng: random.Random) -> Sample:
+    """Return a sample with the noise of a sensor at rest."""
+
+    def noisy(vector: Any, deviation: float) -> Any:
+        return None if vector is None else tuple(v + rng.gauss(0.0, deviation) for v in vector)
+
+    quat = noisy(sample.quat, NOISE_QUAT / 2.0)  # half angles
+    if quat is not None:
+        norm = sum(v * v for v in quat) ** 0.5
+        quat = tuple(v / norm for v in quat)
+    return sample._replace(quat=quat, acc=noisy(sample.acc, NOISE_ACC), gyr=noisy(sample.gyr, NOISE_GYR))
 
 
 # --- lines --------------------------------------------------------------------------------------------------
@@ -298,6 +327,8 @@ class Sensor:
         self.wire: Any = None
         self._encode = encode
         self._add_field = False
+        self._rests = True
+        self._rng = random.Random(index)
 
     def prepare(self, wire_format: Format, sensor_id: int) -> None:
         """Set the sensor's id, and check that the format can represent the first sample.
@@ -321,6 +352,8 @@ class Sensor:
 
     def _sample(self, t_us: int) -> Sample:
         sample = self.rows[self.row]._replace(time_us=t_us)
+        if self._rests:
+            sample = with_noise(at_rest(sample) if self.row else sample, self._rng)
         return with_field(sample) if self._add_field else sample
 
     def measure(self, t_us: int) -> None:
@@ -333,7 +366,8 @@ class Sensor:
 
     def step(self, played_s: float | None) -> None:
         """Go to the next row; `played_s` is the time at which the recording started, None before that."""
-        if played_s is None or self.row + 1 == len(self.rows):
+        self._rests = played_s is None or self.row + 1 == len(self.rows)
+        if self._rests:
             self.due += self.period
         else:
             self.row += 1

@@ -11,6 +11,7 @@ from edgepose.calibration.checks import tilt_deg
 from edgepose.errors import CalibrationError
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
+from edgepose.utils.similar_names import choices
 
 FRAME_TILT_LIMIT_DEG = 20.0
 
@@ -30,7 +31,7 @@ def check_body_frame(text: str) -> str:
     if text != "head" and not axis_given and (name != "heading" or _finite(value) is None):
         raise CalibrationError(
             f"body frame {text!r} is none of: head, heading:DEG, SENSOR:AXIS "
-            f"(such as pelvis:-z; sensors: {', '.join(PLACEMENTS)})"
+            f"(such as pelvis:-z); {choices(name, [*PLACEMENTS, 'heading'], 'sensors are')}"
         )
     return text
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from edgepose import faults
 from edgepose import rotations as rot
 from edgepose.calibration.static_pose import (
     MIN_SAMPLES,
@@ -17,7 +18,6 @@ from edgepose.calibration.static_pose import (
     unit_or_zero,
 )
 from edgepose.errors import CalibrationError
-from edgepose.imu import GRAVITY
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array, tilt_deg
 
@@ -26,8 +26,9 @@ DRIFT_LIMIT_DEG = 5.0  # first against last quarter of a hold
 RATE_LIMIT_DEG_S = (
     20.0  # RMS of the angular rate without its mean, which may be bias; standing people 0.3 - 3
 )
-GRAVITY_SCALE_LIMIT = 0.05
 GRAVITY_TILT_LIMIT_DEG = 10.0
+
+_EARLIER = (2, 3)  # samples back of one device among those of two
 
 
 class MovedError(CalibrationError):
@@ -87,11 +88,7 @@ def check_hold(hold: Hold, advice: str = "stand still and repeat") -> HoldSummar
         if (apart := detect_alternating_devices(quat)) is not None
     ]
     if shared:
-        raise CalibrationError(
-            "two sensors report as one placement: "
-            + ", ".join(f"{name} ({apart:.0f} deg apart)" for name, apart in shared)
-            + "; give every sensor a placement of its own"
-        )
+        raise CalibrationError("; ".join(f"{name}: {faults.two_devices(apart)}" for name, apart in shared))
     mean = np.stack([rot.mean_rotation(quat) for quat in quats])
     spread = np.array([_rms(_angles(quat, centre)) for quat, centre in zip(quats, mean, strict=True)])
     moved = [
@@ -121,6 +118,11 @@ def _rms(x: Array) -> float:
 
 def detect_alternating_devices(quat: Array) -> float | None:
     """Return the angle, degrees, between two devices whose samples (n, 4) alternate; None if it is one."""
+    at_rest = _alternating_at_rest(quat)
+    return _alternating_in_motion(quat) if at_rest is None else at_rest
+
+
+def _alternating_at_rest(quat: Array) -> float | None:
     from_first = _angles(quat, quat[0])
     far = from_first > from_first.max() / 2
     # A single moving sensor passes through the angles between, and does not change sides every few samples.
@@ -131,6 +133,23 @@ def detect_alternating_devices(quat: Array) -> float | None:
     spread = math.degrees(max(_rms(_angles(near, centre)), _rms(_angles(other, other_centre))))
     apart = math.degrees(_angles(other_centre[None], centre)[0])
     return apart if spread < SPREAD_LIMIT_DEG and apart > max(2.0 * SPREAD_LIMIT_DEG, 4.0 * spread) else None
+
+
+def _alternating_in_motion(quat: Array) -> float | None:
+    # A single device is nearest to where it was a sample ago, except at the turning points of a fast swing.
+    if len(quat) <= _EARLIER[-1]:
+        return None
+    now = quat[_EARLIER[-1] :]
+    apart = [_angles_between(quat[_EARLIER[-1] - k : len(quat) - k], now) for k in (1, *_EARLIER)]
+    jumps = (apart[0] > math.radians(2.0 * SPREAD_LIMIT_DEG)) & (np.min(apart[1:], axis=0) < apart[0] / 4.0)
+    if np.count_nonzero(jumps) < max(4, len(now) / 2):
+        return None
+    return math.degrees(float(np.median(apart[0][jumps])))
+
+
+def _angles_between(one: Array, other: Array) -> Array:
+    """Return the rotation angles (n,) between unit quaternions (n, 4), radians."""
+    return 2.0 * np.arccos(np.clip(np.abs(np.sum(one * other, axis=-1)), 0.0, 1.0))
 
 
 def _movement(name: str, s: SensorHold, quat: Array, spread: float) -> str | None:
@@ -146,7 +165,8 @@ def _movement(name: str, s: SensorHold, quat: Array, spread: float) -> str | Non
 
 def _gravity(hold: Hold, quats: list[Array]) -> tuple[Array, list[str]]:
     """Return mean specific forces in I (6, 3), m/s^2, and warnings about their size; raise if not upwards."""
-    force, warnings, wrong = np.full((len(PLACEMENTS), 3), np.nan), [], []
+    force, warnings = np.full((len(PLACEMENTS), 3), np.nan), []
+    removed: list[str] = []
     tilted: dict[str, float] = {}
     fitting: dict[str, list[str]] = {}
     for i, (name, s, quat) in enumerate(zip(PLACEMENTS, hold, quats, strict=True)):
@@ -156,31 +176,17 @@ def _gravity(hold: Hold, quats: list[Array]) -> tuple[Array, list[str]]:
             continue
         acc, quat = s.acc[measured], quat[measured]
         force[i] = rot.quat_rotate(quat, acc).mean(axis=0)
-        fitting[name] = fitting_conventions(quat, acc)
-        size = float(np.linalg.norm(force[i]))
-        at_rest = _rms(np.linalg.norm(acc, axis=-1))
-        if at_rest < 0.5:
-            wrong.append(
-                f"{name} measures {at_rest:.2f} m/s^2 (gravity is already removed; send specific force)"
-            )
+        size = float(np.linalg.norm(acc.mean(axis=0)))
+        if (problem := faults.no_gravity(size)) is not None:
+            removed.append(f"{name}: {problem}")
         elif tilt_deg(force[i]) > GRAVITY_TILT_LIMIT_DEG:
-            tilted[name] = tilt_deg(force[i])
-        elif abs(size / GRAVITY - 1.0) > GRAVITY_SCALE_LIMIT:
-            warnings.append(
-                f"{name} measures {size:.2f} m/s^2 at rest, not {GRAVITY:.2f}: check its units and scale"
-            )
-    # Devices of one rig have one convention, although another one may fit a single sensor by chance.
-    shared = [
-        why for why in next(iter(fitting.values()), []) if all(why in each for each in fitting.values())
-    ]
-    for name, tilt in tilted.items():
-        why = next(iter(shared or fitting[name]), "no usual convention fits")
-        wrong.append(f"{name} {tilt:.0f} deg off ({why})")
-    if wrong:
-        raise CalibrationError(
-            f"at rest the acceleration in the inertial frame must point up along +Z: {', '.join(wrong)}; "
-            "the frame or sign convention of the orientation or the acceleration is wrong"
-        )
+            tilted[name], fitting[name] = tilt_deg(force[i]), fitting_conventions(quat, acc)
+        elif (problem := faults.wrong_unit(size) or faults.wrong_scale(size)) is not None:
+            warnings.append(f"{name}: {problem}")
+    conventions = faults.shared_convention(fitting)
+    wrong = [f"{name}: {faults.wrong_frame(tilt, conventions[name])}" for name, tilt in tilted.items()]
+    if removed or wrong:
+        raise CalibrationError("; ".join([*removed, *wrong]))
     return force, warnings
 
 
@@ -207,8 +213,3 @@ def fitting_conventions(quat: Array, acc: Array) -> list[str]:
         ),
     ]
     return [why for why, f in guesses if tilt_deg(f.mean(axis=0)) < GRAVITY_TILT_LIMIT_DEG]
-
-
-def diagnose_gravity_direction(quat: Array, acc: Array) -> str:
-    """Guess from one hold which convention a device uses instead of ours."""
-    return next(iter(fitting_conventions(quat, acc)), "no usual convention fits")

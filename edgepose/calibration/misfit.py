@@ -35,13 +35,12 @@ _EVERY_S = 0.5
 class MisfitDetector:
     """Checks frames against the calibration and warns of each problem once."""
 
-    def __init__(self, calibration: Calibration, compare: Callable[[], str | None] = lambda: None) -> None:
+    def __init__(self, calibration: Calibration, compare: Callable[[], list[str]] = list) -> None:
         """Create the detector.
 
         Args:
             calibration: of the run.
-            compare: called once; returns one line on any other difference from when the calibration was
-                made, or None.
+            compare: called once; returns a line on each other difference from when the calibration was made.
         """
         self._calibration, self._compare = calibration, compare
         self._start_s: float | None = None
@@ -84,8 +83,7 @@ class MisfitDetector:
 
     def _comparison(self) -> list[str]:
         self._compared = True
-        line = self._compare()
-        return [] if line is None else [line]
+        return self._compare()
 
     def _check_bones(self, frame: ImuFrame, bones: Array) -> list[str]:
         wrong = [name for name in impossible_bones(bones) if not frame.held[PLACEMENTS.index(name)]]

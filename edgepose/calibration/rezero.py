@@ -75,6 +75,9 @@ class HeadingRezero:
         """Return the calibration for a frame; None until the first hold, if there must be one."""
         requests = self._requests()
         if self._old is None:
+            if requests:
+                pose = _POSE[self._calibration.pose]
+                self._notify(f"re-zero ignored: no headings have been found yet; {pose}, facing forward")
             self._first_hold(frame)
         else:
             for delay_s in requests[-1:]:

@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike
 
 from edgepose import rotations as rot
 from edgepose.calibration.body_frame import body_from_inertial
-from edgepose.calibration.checks import GRAVITY, HoldSummary
+from edgepose.calibration.checks import HoldSummary
 from edgepose.errors import CalibrationError
+from edgepose.imu import GRAVITY
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 

@@ -17,9 +17,9 @@ from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.base import iter_samples
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.orientation.stage import OrientationStage
+from edgepose.pipeline.rig_comparison import without_common_heading
 from edgepose.sources import Device, open_source
 from edgepose.sources.replay import is_recording
-from firmware_protocols.registry import PROTOCOLS
 
 ROUTINE_S = 30.0
 """Length of the motion that is taken from a recording without --motion, seconds."""
@@ -177,12 +177,9 @@ def _mounted(plan: CalibrationPlan, summary: HoldSummary) -> HeadingReset | None
 
 def _check_north(orient: OrientationStage, plan: CalibrationPlan, devices: Mapping[int, Device]) -> None:
     """Raise EdgeposeError if a filter, or devices, started with arbitrary headings that no reset aligns."""
-    own = sorted({device.protocol for device in devices.values() if not _has_common_heading(device.protocol)})
-    if own and orient.passes and plan.heading_reset is None:
-        raise EdgeposeError(
-            f"sensors of {', '.join(own)} have no common heading: "
-            "add --heading-reset motion, live or mounting"
-        )
+    apart = without_common_heading(devices)
+    if apart is not None and orient.passes and plan.heading_reset is None:
+        raise EdgeposeError(apart)
     if orient.mixed:
         raise EdgeposeError(
             "some sensors have a magnetometer and others do not: their headings would differ; add --no-mag"
@@ -193,11 +190,6 @@ def _check_north(orient: OrientationStage, plan: CalibrationPlan, devices: Mappi
             "without a magnetometer in each sensor the filter's headings are arbitrary: "
             "add --heading-reset motion, live or mounting"
         )
-
-
-def _has_common_heading(protocol: str) -> bool:
-    # Formats of text lines that the user describes are not in the table.
-    return protocol not in PROTOCOLS or PROTOCOLS[protocol].common_heading
 
 
 # --- recordings ---------------------------------------------------------------------------------------------

@@ -6,7 +6,8 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-from edgepose.calibration.checks import GRAVITY, GRAVITY_SCALE_LIMIT, GRAVITY_TILT_LIMIT_DEG
+from edgepose import faults
+from edgepose.calibration.checks import GRAVITY_TILT_LIMIT_DEG
 from edgepose.calibration.fit import POSE_TILT_DEG
 from edgepose.diagnostics.sensor_health import REST_ACC, REST_S, SensorHealth
 from edgepose.sources.clock_sync import FOLLOWED_PPM
@@ -58,7 +59,7 @@ def diagnose(sensor: SensorHealth) -> Diagnosis:
 def _no_packets(s: SensorHealth) -> str | None:
     if s.samples:
         return None
-    return "nothing came: switch it on, check its link, and check that its id is right and not used twice"
+    return "no packet came from it: switch it on, check its link, and check that its id is right"
 
 
 def _silent(s: SensorHealth) -> str | None:
@@ -93,9 +94,9 @@ def _invalid(s: SensorHealth) -> str | None:
 
 
 def _two_devices(s: SensorHealth) -> str | None:
-    if s.two_devices_deg is None:
+    if s.two_devices_deg is None and s.clock_restarts < faults.JUMPS_OF_TWO:
         return None
-    return f"two devices, {s.two_devices_deg:.0f} deg apart, send under its id: give each an id of its own"
+    return faults.two_devices(s.two_devices_deg)
 
 
 def _same(s: SensorHealth) -> str | None:
@@ -112,33 +113,20 @@ def _frozen(s: SensorHealth) -> str | None:
 
 
 def _no_gravity(s: SensorHealth) -> str | None:
-    if s.norm_m_s2 < 0.5:
-        return (
-            f"it reads {s.norm_m_s2:.2f} m/s² at rest, so gravity is already removed: "
-            "send the acceleration as measured (specific force)"
-        )
-    return None
+    return faults.no_gravity(s.norm_m_s2)
 
 
 def _unit(s: SensorHealth) -> str | None:
-    for unit, size in (("g", 1.0), ("milli-g", 1000.0), ("cm/s²", 100.0 * GRAVITY)):
-        if abs(s.norm_m_s2 / size - 1.0) < 2.0 * GRAVITY_SCALE_LIMIT:
-            return f"it reads {s.norm_m_s2:.4g} at rest, which is in {unit}: send m/s², {GRAVITY} at rest"
-    return None
+    return faults.wrong_unit(s.norm_m_s2)
 
 
 def _scale(s: SensorHealth) -> str | None:
-    if abs(s.norm_m_s2 / GRAVITY - 1.0) > GRAVITY_SCALE_LIMIT:
-        return (
-            f"it reads {s.norm_m_s2:.2f} m/s² at rest, not {GRAVITY}: "
-            "check the accelerometer's range setting, and calibrate it"
-        )
-    return None
+    return faults.wrong_scale(s.norm_m_s2)
 
 
 def _frame(s: SensorHealth) -> str | None:
     if s.tilt_deg > GRAVITY_TILT_LIMIT_DEG:
-        return f"orientation and gravity disagree by {s.tilt_deg:.0f} deg at rest: {s.convention}"
+        return faults.wrong_frame(s.tilt_deg, s.convention)
     return None
 
 
@@ -222,10 +210,7 @@ def _drift(s: SensorHealth) -> str | None:
 
 def _restarts(s: SensorHealth) -> str | None:
     if s.clock_restarts:
-        return (
-            f"its clock restarted {s.clock_restarts} times: check its power; "
-            "its heading may differ after a restart"
-        )
+        return f"{faults.clock_restarted(s.clock_restarts)}: check its power"
     return None
 
 
@@ -332,3 +317,6 @@ _PROBLEMS: dict[str, Callable[[SensorHealth], str | None]] = {
     "field": _field,
 }
 """Rules by name, most important first."""
+
+MAKE_POSES_WRONG = frozenset(("two devices", "same data", "no gravity", "unit", "scale", "frame"))
+"""Names of the problems that make poses wrong without any other sign."""

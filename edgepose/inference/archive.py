@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from edgepose.errors import ModelError
 from edgepose.inference.quantisation import suppress_quantisation_warning
 from edgepose.placements import PLACEMENTS
+from edgepose.utils.similar_names import choices
 
 if TYPE_CHECKING:
     import torch
@@ -91,8 +92,8 @@ def find_archive(name: str) -> Path:
             return path
     if Path(name).is_file():
         return Path(name)
-    names = ", ".join(path.stem for path in bundled_archives()) or "none"
-    raise ModelError(f"{name}: no such model; give one of {names}, or the path of an archive")
+    hint = choices(name, [path.stem for path in bundled_archives()], "give the path of an archive, or one of")
+    raise ModelError(f"{name}: no such model; {hint}")
 
 
 def _read_checksums(path: Path) -> set[str]:

@@ -12,11 +12,12 @@ from edgepose.calibration import load_calibration
 from edgepose.calibration.misfit import MisfitDetector
 from edgepose.calibration.rezero import HeadingRezero
 from edgepose.config import WearerConfig
+from edgepose.diagnostics.rig_monitor import RigMonitor
 from edgepose.errors import CalibrationError, EdgeposeError, FileFormatError, prefix_errors
 from edgepose.orientation.stage import OrientationStage
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.remote_control import RezeroRequests
-from edgepose.pipeline.rig_comparison import other_devices
+from edgepose.pipeline.rig_comparison import missing_heading_reset, other_devices
 from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
 from edgepose.placements import PLACEMENTS
 from edgepose.sinks.open import open_outputs
@@ -107,13 +108,18 @@ class OpenWearer:
             self._orient,
             self.notify if source.live else lambda text: None,
             on_pose,
-            MisfitDetector(self._calibration, self._other_devices),
+            MisfitDetector(self._calibration, self._differences),
+            RigMonitor(),
             self.notify,
             future / rate if source.live else None,
         )
 
-    def _other_devices(self) -> str | None:
-        return other_devices(self._calibration, self.source.devices)
+    def _differences(self) -> list[str]:
+        devices = self.source.devices
+        return [
+            *other_devices(self._calibration, devices),
+            *missing_heading_reset(self._calibration, devices),
+        ]
 
     def report(self, pipeline: WearerPipeline, rate: float, future: int) -> EdgeposeError | None:
         """Report the counts of a finished pipeline; return the error that ended it, if any."""

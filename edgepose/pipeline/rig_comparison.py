@@ -1,4 +1,4 @@
-"""Comparison of the devices in use with those that a calibration was made with."""
+"""Comparison of the devices in use with a calibration: other devices, headings that it does not align."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ from collections.abc import Mapping
 from typing import Any
 
 from edgepose.calibration import Calibration
+from edgepose.faults import no_common_heading
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import Device
+from firmware_protocols.registry import PROTOCOLS
 
 
-def other_devices(calibration: Calibration, devices: Mapping[int, Device]) -> str | None:
-    """Return a warning if devices have changed since the calibration; None if not, or if unknown.
+def other_devices(calibration: Calibration, devices: Mapping[int, Device]) -> list[str]:
+    """Return a warning if devices have changed since the calibration; nothing if not, or if unknown.
 
     Args:
         calibration: a calibration, whose metadata may name the devices it was made with.
@@ -24,12 +26,32 @@ def other_devices(calibration: Calibration, devices: Mapping[int, Device]) -> st
         if (then := before.get(placement)) is not None and _differs(then, now)
     ]
     if not different:
-        return None
+        return []
     more = f" (and {len(different) - 1} others)" if different[1:] else ""
-    return (
+    return [
         f"warning: the calibration was made with other sensors: {different[0]}{more}; "
         "calibrate again unless each is worn exactly as the other was"
-    )
+    ]
+
+
+def without_common_heading(devices: Mapping[int, Device]) -> str | None:
+    """Return a message on devices whose headings have no common zero; None if all have one."""
+    # Formats of text lines that the user describes are not in the table.
+    protocols = {device.protocol for device in devices.values() if device.protocol in PROTOCOLS}
+    apart = [name for name in protocols if not PROTOCOLS[name].common_heading]
+    return no_common_heading(apart) if apart else None
+
+
+def missing_heading_reset(calibration: Calibration | None, devices: Mapping[int, Device]) -> list[str]:
+    """Return a warning if headings have no common zero and the calibration does not align them.
+
+    Args:
+        calibration: of the wearer; None if there is none yet.
+        devices: devices in use now, by placement.
+    """
+    message = without_common_heading(devices)
+    aligned = calibration is not None and (calibration.filter != "none" or calibration.heading_offset.any())
+    return [] if message is None or aligned else [f"warning: {message}"]
 
 
 def _differs(then: Device, now: Device) -> bool:

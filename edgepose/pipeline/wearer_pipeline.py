@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from edgepose.calibration import apply_calibration
 from edgepose.calibration.misfit import MisfitDetector
 from edgepose.calibration.rezero import HeadingRezero
+from edgepose.diagnostics.rig_monitor import RigMonitor
 from edgepose.errors import EdgeposeError, as_edgepose_error
 from edgepose.imu import ImuFrame, ImuSample
 from edgepose.inference.engine import EngineInput, EngineOutput
@@ -90,6 +91,7 @@ class WearerPipeline:
         notify: Callable[[str], None] = lambda text: None,
         on_pose: Callable[[RunSummary], None] = lambda summary: None,
         misfits: MisfitDetector | None = None,
+        rig: RigMonitor | None = None,
         warn: Callable[[str], None] = lambda text: None,
         look_ahead_s: float | None = None,
     ) -> None:
@@ -103,14 +105,15 @@ class WearerPipeline:
             notify: called with one message per sensor that drops out or comes back.
             on_pose: called after each pose has been written.
             misfits: checks whether the calibration fits the wearer.
-            warn: called with one message per finding of `misfits`, and about poses that live outputs skip.
+            rig: checks the sensors as they measure.
+            warn: called with one message per finding of `misfits` and `rig`, and about skipped poses.
             look_ahead_s: time by which poses come later than their frames, seconds, if samples come at their
                 own pace; see `PoseWriter`.
         """
         self.summary, self.clock = RunSummary(), clock
         self.arrived = self._started = time.perf_counter()
         self._headings, self._sinks, self._orient, self._notify = headings, sinks, orient, notify
-        self._on_pose, self._misfits, self._warn = on_pose, misfits, warn
+        self._on_pose, self._misfits, self._rig, self._warn = on_pose, misfits, rig, warn
         self._writer = PoseWriter(sinks, look_ahead_s, warn)
         self._dropouts = DropoutMonitor()
         self._source_s = 0.0  # time on the source's clock at 0 of the clock of `arrived`
@@ -122,6 +125,9 @@ class WearerPipeline:
         self.arrived = time.perf_counter() - batch.backlog_s
         arrival_s = batch.now_s + batch.ahead_s
         self._source_s = arrival_s - self.arrived
+        if self._rig is not None:
+            for line in self._rig.add(batch.samples, batch.now_s):
+                self._warn(line)
         if batch.samples:
             self.clock.push(self._orient(batch.samples), arrival_s)
         return self._engine_inputs(self.clock.frames(batch.now_s))
@@ -129,9 +135,10 @@ class WearerPipeline:
     def flush(self) -> Iterator[EngineInput]:
         """Yield the network inputs of the last frames."""
         yield from self._engine_inputs(self.clock.flush())
-        if self._misfits is not None:
-            for line in self._misfits.at_end():
-                self._warn(line)
+        for line in [] if self._rig is None else self._rig.judge():
+            self._warn(line)
+        for line in [] if self._misfits is None else self._misfits.at_end():
+            self._warn(line)
 
     def emit(self, outputs: list[EngineOutput], arrived: float) -> None:
         """Write poses whose newest packet arrived at a time on the clock of `time.perf_counter`."""

@@ -216,6 +216,11 @@ class HostClocks:
         self._arrivals: dict[int, ArrivalClock] = {}
         self._wrap_us = wrap_us
 
+    @property
+    def restarts(self) -> dict[int, int]:
+        """Number of times that each sensor's clock was estimated from scratch."""
+        return {sensor: clock.resets for sensor, clock in self.devices.items()}
+
     def time(self, sensor: int, t_us: int | None, arrival_s: float) -> float:
         """Return the host time of a measurement, seconds; t_us is None if the device sends no time."""
         if t_us is not None:
@@ -234,10 +239,14 @@ class CaptureClock:
 
     Another sensor's clock that starts more than a second away from it, and any clock that jumps back or ahead
     (reboot; a pause over a minute), is set to the newest time reached.
+
+    Attributes:
+        restarts: number of times that each sensor's clock was set so after its first sample.
     """
 
     def __init__(self, wrap_us: int = WRAP_US) -> None:
         """Create the clocks; device times wrap at wrap_us."""
+        self.restarts: dict[int, int] = {}
         self._wrap_us = wrap_us
         self._now: float | None = None
         self._offsets: dict[int, float] = {}
@@ -251,6 +260,8 @@ class CaptureClock:
         result = unwrap(t_us, (now if last is None else last) - offset, self._wrap_us) + offset
         jumped = abs(result - now) > 1.0 if last is None else not -_BACK_S < result - last < 60.0
         if jumped:
+            if last is not None:
+                self.restarts[sensor] = self.restarts.get(sensor, 0) + 1
             self._offsets[sensor] = now - t_us * 1e-6
             result = now
         if last is not None:

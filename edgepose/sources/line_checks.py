@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 
+from edgepose import faults
 from edgepose.errors import DeviceError
 from edgepose.placements import PLACEMENTS
 from edgepose.sources.line_reader import LineReader
@@ -15,8 +16,6 @@ SILENCE_S = 5.0
 
 NOISE_S = 3.0
 """Longest time with data but no usable packet at the start, seconds."""
-
-_DUPLICATE_JUMPS = 20  # resets of a clock within a second that a single device does not make
 
 
 def check_start(line: LineReader, now_s: float, start_s: float) -> None:
@@ -41,11 +40,21 @@ def check_start(line: LineReader, now_s: float, start_s: float) -> None:
                 f"{spec.name}: packets come only from sensor ids {ids}; set the ids to {decoder.ids}, "
                 "or assign them to placements with --sensors"
             )
+        if decoder.refused is not None:
+            raise DeviceError(f"{spec.name}: {decoder.refused}")
         kind = "" if decoder.protocol is None else f"{decoder.protocol.name} "
         raise DeviceError(
             f"{spec.name}: {decoder.amount} {spec.unit} in {NOISE_S:g} s but no valid {kind}packet; "
             f"check {spec.check[1]}"
         )
+
+
+def warn_about_refused(line: LineReader) -> None:
+    """Log a warning, once, if a line has input that could be understood but not used."""
+    refused = None if line.refused_reported else line.decoder.refused
+    if refused is not None:
+        line.refused_reported = True
+        _log.warning("%s: %s", line.spec.name, refused)
 
 
 def warn_about_clock_resets(line: LineReader) -> None:
@@ -56,18 +65,14 @@ def warn_about_clock_resets(line: LineReader) -> None:
     devices = {} if line.clocks is None else line.clocks.devices
     for placement, clock in devices.items():
         before = line.clock_resets.get(placement, 0)
-        if clock.resets - before >= _DUPLICATE_JUMPS and not line.duplicate_ids:
+        if clock.resets - before >= faults.JUMPS_OF_TWO and not line.duplicate_ids:
             line.duplicate_ids = True
-            _log.warning(
-                "%s: the clock of the sensor for %s jumps back and forth; do two devices have the same id?",
-                line.spec.name,
-                PLACEMENTS[placement],
-            )
+            _log.warning("%s: %s: %s", line.spec.name, PLACEMENTS[placement], faults.two_devices())
         elif clock.resets > before:
             _log.warning(
-                "%s: the clock of the sensor for %s restarted; if it was switched off, its heading may have "
-                "changed: calibrate again",
+                "%s: %s: %s: calibrate again",
                 line.spec.name,
                 PLACEMENTS[placement],
+                faults.clock_restarted(),
             )
         line.clock_resets[placement] = clock.resets

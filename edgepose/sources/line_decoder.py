@@ -9,7 +9,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import Device, SourceCounters
-from edgepose.sources.protocol_detection import Chunk, Detector, decode
+from edgepose.sources.protocol_detection import Chunk, Detector, decode, refused_by
 from firmware_protocols.base import Decoder, DeviceInfo, Protocol
 from firmware_protocols.sample import Sample
 
@@ -88,6 +88,15 @@ class LineDecoder:
         """Devices that have sent samples, by placement."""
         protocol = "" if self.protocol is None else self.protocol.name
         return {placement: Device(protocol, self.name, sensor) for sensor, placement in self._known.items()}
+
+    @property
+    def refused(self) -> str | None:
+        """Input that could be understood but not used, and what to do; None if there is none."""
+        if self._detector is not None:
+            return self._detector.refused
+        assert self.protocol is not None
+        assert self._decoder is not None
+        return refused_by(self.protocol, self._decoder)
 
     @property
     def unknown_ids(self) -> list[int]:

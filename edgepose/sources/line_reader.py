@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
+import time
 from collections.abc import Callable, Sequence
 from math import inf
 from queue import SimpleQueue
@@ -106,6 +108,7 @@ class LineReader:
         clock_resets: resets of each device's clock at the last check, by placement.
         duplicate_ids: the user has been warned about two devices with one id.
         warned: the user has been warned that nothing usable comes.
+        refused_reported: the user has been warned about input that cannot be used.
     """
 
     def __init__(
@@ -134,6 +137,7 @@ class LineReader:
         self.clock_resets: dict[int, int] = {}
         self.duplicate_ids = False
         self.warned = False
+        self.refused_reported = False
         self._queue = queue
         self._now = now
         self._blocking = blocking
@@ -188,14 +192,9 @@ class LineReader:
             self._queue.put(Arrival(self, self._now(), _reading_error(self.spec, error), -inf))
 
     def _drain(self) -> None:
-        # Data buffered before the line was opened is of unknown age, and full buffers have lost parts of it.
-        start_s = self._now()
-        while self.transport is not None and (passed_s := self._now() - start_s) < BACKLOG_S:
-            try:
-                if not self.transport.read()[1] and passed_s >= _SETTLE_S:
-                    return
-            except LineDisconnectedError:  # the next read raises it again
-                return
+        if self.transport is not None:
+            with contextlib.suppress(LineDisconnectedError):  # the next read raises it again
+                discard_backlog(self.transport)
 
     def _reopen(self) -> None:
         disconnected_s = self._now()
@@ -224,6 +223,20 @@ class LineReader:
             self._thread.join()
         if self.transport is not None:
             self.transport.close()
+
+
+def discard_backlog(transport: Transport) -> None:
+    """Read and discard the data that was buffered before a line was opened.
+
+    Its age is unknown, and full buffers have lost parts of it.
+
+    Raises:
+        LineDisconnectedError: the port or bus no longer exists.
+    """
+    start_s = time.monotonic()
+    while (passed_s := time.monotonic() - start_s) < BACKLOG_S:
+        if not transport.read()[1] and passed_s >= _SETTLE_S:
+            return
 
 
 def _reading_error(spec: LineSpec, error: BaseException) -> EdgeposeError:

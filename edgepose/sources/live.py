@@ -16,7 +16,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.sources import POLL_S, Batch, Batches, Device, SourceCounters, sum_counters
 from edgepose.sources.clock_sync import DeviceClock
-from edgepose.sources.line_checks import check_start, warn_about_clock_resets
+from edgepose.sources.line_checks import check_start, warn_about_clock_resets, warn_about_refused
 from edgepose.sources.line_reader import Arrival, LineReader, LineSpec
 
 _log = logging.getLogger(__name__)
@@ -164,6 +164,8 @@ class LiveSource:
                     checked_s = now_s
                     for line in self._lines:
                         warn_about_clock_resets(line)
+                        if line.decoder.counters.packets:
+                            warn_about_refused(line)
         finally:
             for line in self._lines:
                 line.stop()

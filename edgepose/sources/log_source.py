@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import logging
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from math import inf
 from pathlib import Path
 from types import TracebackType
+from typing import Protocol
 
 from edgepose.errors import EdgeposeError
+from edgepose.faults import JUMPS_OF_TWO, clock_restarted, two_devices
 from edgepose.formats.ledger import Ledger
 from edgepose.imu import ImuSample
+from edgepose.placements import PLACEMENTS
 from edgepose.sources import Batch, Batches, Device, SourceCounters, sum_counters
 from edgepose.sources.clock_sync import DeviceClock
 from edgepose.sources.line_decoder import LineDecoder
@@ -18,6 +23,17 @@ from edgepose.sources.protocol_detection import Chunk
 
 ChunkReader = Callable[[Path, Ledger], Iterator[tuple[str, float, Chunk | None]]]
 """Yields the chunks of a file: name of the line, time in seconds, and data; None for data that is bad."""
+
+_log = logging.getLogger(__name__)
+
+
+class RestartCounts(Protocol):
+    """Counts of the restarts of devices' clocks."""
+
+    @property
+    def restarts(self) -> Counter[int]:
+        """Number of times that the clock of each placement's device has restarted."""
+
 
 SET_BACK_S = 0.5
 """A log's times that go back by more are those of a clock that was set back, seconds."""
@@ -34,6 +50,7 @@ class LogSource:
         realtime: bool,
         read_chunks: ChunkReader,
         make_decoder: Callable[[str], LineDecoder],
+        clocks: RestartCounts,
         blocking: bool = True,
     ) -> None:
         """Store the settings; iteration opens the file.
@@ -43,12 +60,13 @@ class LogSource:
             realtime: deliver it at its own pace.
             read_chunks: reads the file.
             make_decoder: makes the decoder of a line, given its name.
+            clocks: of the devices in the file.
             blocking: see `open_source`.
         """
         self._path = path
         self._realtime, self._blocking = realtime, blocking
         self._read_chunks = read_chunks
-        self._make_decoder = make_decoder
+        self._make_decoder, self._clocks = make_decoder, clocks
         self._decoders: dict[str, LineDecoder] = {}
         self._bad = 0
         self._ledger = Ledger(str(path), "line")
@@ -63,8 +81,12 @@ class LogSource:
 
     @property
     def clocks(self) -> Mapping[int, DeviceClock]:
-        """Always empty: most logs have no arrival times to compare device clocks with."""
-        return {}
+        """Clocks that have restarted, without drift: most logs have no arrival times to compare with."""
+        result = {}
+        for placement, times in self._clocks.restarts.items():
+            result[placement] = DeviceClock()
+            result[placement].resets = times
+        return result
 
     @property
     def devices(self) -> Mapping[int, Device]:
@@ -81,6 +103,8 @@ class LogSource:
         problems = [self._ledger.damage()]
         if self._bad:
             problems.append(f"{self._path}: ignored {self._bad} frames with an impossible time or id")
+        if self.counters.packets:
+            problems += [f"{self._path}: {text}" for text in self._refused]
         if self._untimed:
             problems.append(f"{self._path}: left out {self._untimed} samples before the first time")
         if self._set_back_s:
@@ -117,6 +141,9 @@ class LogSource:
             yield Batch(now_s, batch, backlog_s=late_s)
         if not self.counters.packets:
             raise EdgeposeError(f"{self._path}: {self._problem()}")
+        for placement, times in sorted(self._clocks.restarts.items()):
+            fault = two_devices() if times >= JUMPS_OF_TWO else clock_restarted(times)
+            _log.warning("%s: %s: %s", self._path, PLACEMENTS[placement], fault)
 
     def _samples(self) -> Iterator[ImuSample]:
         steady = _SteadyTime()
@@ -143,7 +170,13 @@ class LogSource:
     def _untimed(self) -> int:
         return sum(decoder.untimed for decoder in self._decoders.values())
 
+    @property
+    def _refused(self) -> list[str]:
+        return [text for decoder in self._decoders.values() if (text := decoder.refused) is not None]
+
     def _problem(self) -> str:
+        if self._refused:
+            return self._refused[0]
         if not self._decoders and (damage := self._ledger.damage()):
             return f"not a log of frames ({damage})"
         decoders = self._decoders.values()

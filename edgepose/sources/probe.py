@@ -9,8 +9,8 @@ from typing import NamedTuple
 from edgepose.errors import EdgeposeError
 from edgepose.sources.line_config import BAUD, can_line, serial_line
 from edgepose.sources.line_decoder import LISTEN_S
-from edgepose.sources.line_reader import LineDisconnectedError, LineSpec
-from edgepose.sources.protocol_detection import Detector
+from edgepose.sources.line_reader import LineDisconnectedError, LineSpec, discard_backlog
+from edgepose.sources.protocol_detection import DecodedChunks, Detector
 
 BAUDS = (BAUD, 921600, 460800, 230400, 57600, 38400, 9600)
 """Speeds to try, the most likely first, bit/s."""
@@ -22,12 +22,14 @@ class ProbeResult(NamedTuple):
     Attributes:
         protocol: name of the wire format; None if none could be decoded.
         amount: bytes or frames received.
+        refused: what could be understood but not used, see `Decoder.refused`.
         rates_hz: samples per second by sensor id.
     """
 
     protocol: str | None
     amount: int
     rates_hz: dict[int, float]
+    refused: str | None = None
 
 
 def probe_port(name: str) -> tuple[ProbeResult, int]:
@@ -40,7 +42,7 @@ def probe_port(name: str) -> tuple[ProbeResult, int]:
     for baud in BAUDS:
         result = probe_line(serial_line(name, "auto", baud, lambda found: {}))
         # A wrong speed produces wrong bytes, not none.
-        if result.protocol is not None or not result.amount:
+        if result.protocol is not None or not result.amount or result.refused is not None:
             return result, baud
     return result, BAUD
 
@@ -63,9 +65,9 @@ def probe_line(spec: LineSpec) -> ProbeResult:
     transport = spec.open()
     detector = Detector(spec.name, spec.protocols)
     amount = 0
-    start_s = time.monotonic()
-    end_s = start_s + LISTEN_S
     try:
+        discard_backlog(transport)
+        end_s = time.monotonic() + LISTEN_S
         while (now_s := time.monotonic()) < end_s:
             chunk, _ = transport.read()
             if chunk and not amount:
@@ -79,10 +81,22 @@ def probe_line(spec: LineSpec) -> ProbeResult:
         transport.close()
     found = detector.best(True)
     if found is None:
-        return ProbeResult(None, amount, {})
+        return ProbeResult(None, amount, {}, detector.refused)
     protocol, _, decoded = found
-    counts = Counter(sample.sensor for _, samples in decoded for sample in samples)
-    # n samples span n - 1 periods.
-    span_s = decoded[-1][0] - decoded[0][0]
-    rates = {sensor: max(n - 1, 0) / span_s if span_s else 0.0 for sensor, n in sorted(counts.items())}
+    rates = {sensor: _rate_hz(arrivals) for sensor, arrivals in sorted(_arrivals(decoded).items())}
     return ProbeResult(protocol.name, amount, rates)
+
+
+def _arrivals(decoded: DecodedChunks) -> dict[int, list[tuple[float, int]]]:
+    """Return the arrival time of each chunk, seconds, and its number of samples, by sensor id."""
+    result: dict[int, list[tuple[float, int]]] = {}
+    for arrival_s, samples in decoded:
+        for sensor, count in Counter(sample.sensor for sample in samples).items():
+            result.setdefault(sensor, []).append((arrival_s, count))
+    return result
+
+
+def _rate_hz(arrivals: list[tuple[float, int]]) -> float:
+    """Return the samples per second after the first chunk: n samples span n - 1 periods."""
+    span_s = arrivals[-1][0] - arrivals[0][0]
+    return sum(count for _, count in arrivals[1:]) / span_s if span_s > 0.0 else 0.0

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from edgepose.errors import ConfigError
+from edgepose.utils.similar_names import choices
 from firmware_protocols.registry import PROTOCOLS, Decoder, Protocol
 from firmware_protocols.sample import Sample
 
@@ -34,6 +35,11 @@ def decode(decoder: Decoder, chunk: Chunk) -> list[Sample]:
     return samples
 
 
+def refused_by(protocol: Protocol, decoder: Decoder) -> str | None:
+    """Return a decoder's `refused`, with the name of its protocol."""
+    return None if decoder.refused is None else f"{protocol.name}: {decoder.refused}"
+
+
 def protocol_named(name: str) -> Protocol:
     """Return the protocol of that name, or the text protocol that a TOML file of that name describes.
 
@@ -43,7 +49,7 @@ def protocol_named(name: str) -> Protocol:
     if name.endswith(".toml"):
         return _text_lines(Path(name))
     if name not in PROTOCOLS:
-        raise ConfigError(f"unknown protocol {name!r}; known are auto, {', '.join(PROTOCOLS)}")
+        raise ConfigError(f"unknown protocol {name!r}; {choices(name, ['auto', *PROTOCOLS])}")
     return PROTOCOLS[name]
 
 
@@ -143,6 +149,15 @@ class Detector:
                     "choose one with --protocol"
                 )
         return self._protocols[best], self.decoders[best], self._decoded[best]
+
+    @property
+    def refused(self) -> str | None:
+        """Input that a candidate could understand but not use, see `Decoder.refused`; None if none."""
+        reasons = [
+            refused_by(protocol, decoder)
+            for protocol, decoder in zip(self._protocols, self.decoders, strict=True)
+        ]
+        return next(filter(None, reasons), None)
 
     def _quantities(self, i: int) -> int:
         """Return the number of quantities in a decoder's last good packet."""

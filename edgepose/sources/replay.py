@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from math import isnan, nan
@@ -141,17 +142,18 @@ def open_file(
             protocol_named(protocol)  # raises for an unknown name, although a recording needs no protocol
         ids = None if sensor_map is None else sensor_map.serial_numbers()
         return RecordingSource(path, realtime, lenient, blocking, ids)
+    clocks = LogClocks()
     named = None if protocol == "auto" else protocol_named(protocol)
     if is_can_log(path) and (named is None or named.transport == "can"):
         from edgepose.sources.can_log import read_log
 
         protocols = candidate_protocols(protocol, "can", live=False)
-        make_decoder = _decoder_factory(path, protocols, sensor_map, _log_clock)
-        return LogSource(path, realtime, read_log, make_decoder, blocking)
+        make_decoder = _decoder_factory(path, protocols, sensor_map, clocks.log)
+        return LogSource(path, realtime, read_log, make_decoder, clocks, blocking)
     if path.suffix.lower() in CAPTURES or (named is not None and named.transport == "bytes"):
         protocols = candidate_protocols(protocol, "bytes", live=False)
-        make_decoder = _decoder_factory(path, protocols, sensor_map, _capture_clock)
-        return LogSource(path, realtime, _read_capture, make_decoder, blocking)
+        make_decoder = _decoder_factory(path, protocols, sensor_map, clocks.capture)
+        return LogSource(path, realtime, _read_capture, make_decoder, clocks, blocking)
     if not path.suffix and not path.exists():
         raise EdgeposeError(f"{path}: no such file or folder")
     if path.suffix.lower() in FOREIGN:
@@ -209,24 +211,39 @@ def _decoder_factory(
     return make
 
 
-def _log_clock(wrap_us: int) -> Clock:
-    return HostClocks(wrap_us).time
+class LogClocks:
+    """The clocks of all lines of a log or a capture."""
 
+    def __init__(self) -> None:
+        """Start without a line."""
+        self._clocks: list[HostClocks | CaptureClock] = []
 
-def _capture_clock(wrap_us: int) -> Clock:
-    """Return a clock of a capture: host time where arrivals are known, device time elsewhere."""
-    capture, host = CaptureClock(wrap_us), HostClocks(wrap_us)
-    last_s: dict[int, float] = {}
+    @property
+    def restarts(self) -> Counter[int]:
+        """Number of times that the clock of each placement's device has restarted."""
+        return sum((Counter(clocks.restarts) for clocks in self._clocks), Counter())
 
-    def time_of(sensor: int, t_us: int | None, arrival_s: float) -> float:
-        if not isnan(arrival_s):
-            return host.time(sensor, t_us, arrival_s)
-        # Devices may send a part of their measurements in packets without a time.
-        if t_us is not None:
-            last_s[sensor] = capture.time(sensor, t_us)
-        return last_s.get(sensor, nan)
+    def log(self, wrap_us: int) -> Clock:
+        """Return the clock of a line in a log with arrival times."""
+        host = HostClocks(wrap_us)
+        self._clocks.append(host)
+        return host.time
 
-    return time_of
+    def capture(self, wrap_us: int) -> Clock:
+        """Return a clock of a capture: host time where arrivals are known, device time elsewhere."""
+        capture, host = CaptureClock(wrap_us), HostClocks(wrap_us)
+        self._clocks += [capture, host]
+        last_s: dict[int, float] = {}
+
+        def time_of(sensor: int, t_us: int | None, arrival_s: float) -> float:
+            if not isnan(arrival_s):
+                return host.time(sensor, t_us, arrival_s)
+            # Devices may send a part of their measurements in packets without a time.
+            if t_us is not None:
+                last_s[sensor] = capture.time(sensor, t_us)
+            return last_s.get(sensor, nan)
+
+        return time_of
 
 
 def _read_capture(path: Path, ledger: Ledger) -> Iterator[tuple[str, float, bytes]]:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from edgepose.errors import ConfigError
 from edgepose.placements import PLACEMENTS
 from edgepose.sources.line_decoder import PlacementById
+from edgepose.utils.similar_names import choices
 from edgepose.utils.text_files import read_toml
 from firmware_protocols.registry import Protocol
 
@@ -142,7 +143,8 @@ def read_map(path: Path) -> SensorMap:
         raise ConfigError(f'{path}: ports must be tables, such as  [ports."/dev/ttyUSB0"]')
     unknown = [name for name in content if name not in PLACEMENTS]
     if unknown:
-        raise ConfigError(f"{path}: unknown placement {unknown[0]!r}; placements are {', '.join(PLACEMENTS)}")
+        hint = choices(unknown[0], [*PLACEMENTS, "ports"], "placements are")
+        raise ConfigError(f"{path}: unknown placement {unknown[0]!r}; {hint}")
     missing = [name for name in PLACEMENTS if name not in content]
     if missing:
         raise ConfigError(f"{path}: no entry for {', '.join(missing)}; all six sensors need one")
@@ -191,7 +193,7 @@ def _table(where: str, entry: object, keys: tuple[str, ...]) -> dict[str, Any]:
         raise ConfigError(f'{where}: must be a table, such as  {{ port = "/dev/ttyUSB0" }}')
     for key in entry:
         if key not in keys:
-            raise ConfigError(f"{where}: unknown key {key!r}; keys are {', '.join(keys)}")
+            raise ConfigError(f"{where}: unknown key {key!r}; {choices(key, keys, 'keys are')}")
     return entry
 
 

@@ -58,7 +58,7 @@ def test_a_measurement_byte_for_byte():
 def test_a_measurement_in_whole_numbers():
     fields = ["rate", "gyr", "temperature", "acc"]
     data = struct.pack("<I10h", 1, 9, 9, 9, 250, 0, -1000, 100, -200, 300, 2150)
-    (sample,) = LpmsDecoder(fields, floats=False).feed(frame(data))
+    (sample,) = LpmsDecoder(fields).feed(frame(data))
     assert sample == Sample(1, 2500, None, *sample[3:5], None, 21.5)
     assert sample.acc == pytest.approx((-0.25 * STANDARD_G, 0, STANDARD_G))
     assert sample.gyr == pytest.approx((0.1, -0.2, 0.3))
@@ -69,7 +69,7 @@ def test_a_measurement_in_whole_numbers():
 def test_round_trip(seed, floats, extra):
     fields = extra | {"quat", "acc", "mag", "rate", "temperature"}
     (sample,) = stream(1, seed)
-    (got,) = LpmsDecoder(fields, floats).feed(encode(sample, fields, floats))
+    (got,) = LpmsDecoder(fields).feed(encode(sample, fields, floats))
     assert abs(sum(a * b for a, b in zip(got.quat, sample.quat, strict=True))) == pytest.approx(1, abs=1e-7)
     for a, b in zip(got[3:6], sample[3:6], strict=True):
         assert a == pytest.approx(b, abs=0.006)
@@ -121,6 +121,21 @@ def test_other_settings_of_the_sensor_are_bad():
     assert decoder.feed(encode(stream(1)[0], ["quat", "acc"])) == []
     assert decoder.feed(frame(b"")) == []
     assert decoder.counters.bad == 2
+    assert LpmsDecoder().refused is None
+
+
+def test_other_settings_are_named():
+    """As LpmsControl sets them: everything, or 16 bit numbers."""
+    (sample,) = stream(1)
+    decoder = LpmsDecoder()
+    more = encode(sample, [*USUAL_FIELDS, "euler", "linear"])
+    assert decoder.feed(5 * more + encode(sample, FIELDS, floats=False)) == []
+    assert decoder.refused == (
+        "6 measurements came whole, but with 80 bytes instead of 56 (floats) or 30 (16 bit): set the sensor "
+        "to send angular rate, acceleration, field and quaternion, and nothing else"
+    )
+    (got,) = decoder.feed(encode(sample, floats=False))
+    assert got.acc == pytest.approx(sample.acc, abs=0.006)
 
 
 def test_a_false_length_holds_up_little():

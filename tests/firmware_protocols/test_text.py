@@ -339,3 +339,58 @@ def test_names_are_checked():
         encode(Sample(0), "razor")
     with pytest.raises(ValueError, match="need time, acceleration and angular rate"):
         encode(Sample(0), "artemis")
+
+
+# --- logs of other people's programs ----------------------------------------------------------------
+
+WIT = Pattern(
+    separator="\t",
+    units={"time": "clock", "acc": "g", "gyr": "deg/s"},
+    columns={
+        "time": "ChipTime",
+        **dict(zip(("w", "x", "y", "z"), ("q0()", "q1()", "q2()", "q3()"), strict=True)),
+        **dict(zip(("ax", "ay", "az"), ("ax(g)", "ay(g)", "az(g)"), strict=True)),
+    },
+)
+WIT_HEADER = (
+    "Start time:2023-03-04 21:27:11.700\nTime\tChipTime\tax(g)\tay(g)\taz(g)\tq0()\tq1()\tq2()\tq3()\n"
+)
+WIT_ROW = "2023-03-04 21:27:11.010\t{}\t0.0000\t0.0000\t1.0000\t0.6000\t0.0000\t0.8000\t0.0000\n"
+
+
+@pytest.mark.parametrize("clock", ["2023-03-04 21:27:11.250", "2023-03-04T21:27:11,250", "21:27:11.250"])
+@pytest.mark.parametrize("comma", [False, True])
+def test_a_clock_with_a_date_and_decimal_commas(clock, comma):
+    """WitMotion's program on computers with an English and with a German region."""
+    date, _, numbers = WIT_ROW.format(clock).split("\t", 2)
+    line = "\t".join([date, clock, numbers.replace(".", ",") if comma else numbers])
+    decoder = TextDecoder(WIT)
+    (sample,) = decoder.feed((WIT_HEADER + line).encode())
+    assert sample.time_us == ((21 * 60 + 27) * 60 + 11) * 1_000_000 + 250_000
+    assert sample.acc == pytest.approx((0, 0, 9.80665))
+    assert sample.quat == (0.6, 0.0, 0.8, 0.0)
+    assert decoder.refused is None
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("21:27:11.250", "noon", "line 3: time is 'noon', which is no time in the unit clock"),
+        ("1.0000", "1,000.0", "line 3: az is '1,000.0', which is no number"),
+        ("0.8000", "1.8000", "line 3: the quaternion is not of length 1"),
+        ("\t0.8000", "", "line 3: it has 8 columns instead of 9"),
+        ("1.0000", "1_0", "line 3: az is '1_0', which is no number"),
+    ],
+)
+def test_the_reason_why_no_line_can_be_read(old, new, says):
+    decoder = TextDecoder(WIT)
+    row = WIT_ROW.format("21:27:11.250").replace(old, new)
+    assert decoder.feed((WIT_HEADER + 3 * row).encode()) == []
+    assert decoder.refused == f"3 lines cannot be read, the first: {says}"
+    assert decoder.counters.bad == 3
+
+
+def test_a_comma_that_separates_is_no_decimal_comma():
+    decoder = TextDecoder(Pattern(columns={"ax": "a", "ay": "b", "az": "c"}))
+    assert decoder.feed(b"a,b,c\n1,5,2\n1,5,2,5\n")[0].acc == (1.0, 5.0, 2.0)
+    assert decoder.counters.bad == 1

@@ -133,12 +133,12 @@ def test_quaternion_has_its_scalar_last():
 def test_both_kinds_on_one_line():
     rng = random.Random(6)
     decoder = VectorNavDecoder()
-    stream = b"".join(
-        encode_binary(random_sample(rng)) if rng.random() < 0.5 else encode_ascii(random_sample(rng))
-        for _ in range(60)
-    )
-    assert len(decoder.feed(stream)) == 60
-    assert decoder.counters.bad == 0
+    binary = [rng.random() < 0.5 for _ in range(60)]
+    stream = b"".join((encode_binary if kind else encode_ascii)(random_sample(rng)) for kind in binary)
+    # The lines repeat the outputs, from the first output on.
+    wanted = len(binary) - binary[binary.index(True) :].count(False)
+    assert len(decoder.feed(stream)) == wanted
+    assert (decoder.counters.bad, decoder.counters.skipped) == (0, 60 - wanted)
 
 
 SIZES = {  # group, then the bits that all devices have
@@ -262,3 +262,26 @@ def test_what_cannot_be_sent():
         encode_ascii(Sample(0), "VNQTN")
     with pytest.raises(ValueError, match="cannot send"):
         encode_binary(Sample(0, -5))
+
+
+def test_lines_beside_binary_outputs_are_one_device():
+    """As delivered, lines come at 40 Hz; binary outputs that are switched on come in addition."""
+    sample = Sample(0, 10_000, (0.6, 0.0, 0.8, 0.0), (0.1, 0.2, 9.81), (0.1, 0.2, 0.3), (10.0, 20.0, 30.0))
+    binary, line = encode_binary(sample), encode_ascii(sample, "VNYMR")
+    decoder = VectorNavDecoder()
+    got = decoder.feed((2 * binary + line) * 50)
+    assert len(got) == decoder.counters.packets == 100
+    assert all(s.time_us is not None for s in got)
+    assert (decoder.counters.skipped, decoder.counters.bad) == (50, 0)
+    # Binary outputs are switched off: the lines count once that is certain.
+    assert 0 < len(decoder.feed(line * 150)) < 150
+
+
+def test_the_form_with_more_quantities_counts():
+    sample = Sample(0, 10_000, (0.6, 0.0, 0.8, 0.0), (0.1, 0.2, 9.81), (0.1, 0.2, 0.3), (10.0, 20.0, 30.0))
+    line, orientation = encode_ascii(sample, "VNQMR"), encode_binary(Sample(0, 10_000, sample.quat))
+    decoder = VectorNavDecoder()
+    got = decoder.feed((line + orientation) * 50)
+    assert all(s.acc is not None for s in got)
+    assert len(got) == 50
+    assert decoder.counters.skipped == 50

@@ -45,7 +45,8 @@ def scaled(vector, unit):
 
 
 def read_xsens_xbus(wire, vector):
-    (sample,) = xsens.XbusDecoder().feed(wire)
+    decoder = xsens.XbusDecoder()
+    (sample,) = [*decoder.feed(wire), *decoder.flush()]
     got = {f"{item:04X}": list(values) for item, values in xsens.mtdata2_items(wire[4:-1])}
     if "1010" in got:
         got["1010"] = struct.pack(">IH6B", *got["1010"]).hex()

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_protocols import witmotion, witmotion_can, witmotion_modbus
+from firmware_protocols import witmotion, witmotion_ble, witmotion_can, witmotion_modbus
+from firmware_protocols.rotation import rotate
 from firmware_protocols.sample import STANDARD_G, Counters, Sample
 from firmware_protocols.witmotion import WitDecoder
 from firmware_protocols.witmotion_can import WitCanDecoder
@@ -383,3 +384,53 @@ def test_random_can_frames_never_raise(frames):
     for frame in frames:
         decoder.feed(*frame)
     assert decoder.counters.bytes == sum(len(data) for _, data, _ in frames)
+
+
+# --- Bluetooth models -----------------------------------------------------------------------------
+
+
+def ble(n):
+    return [s._replace(time_us=None, mag=None, temperature=None) for s in stream(n)]
+
+
+def test_a_bluetooth_frame_byte_for_byte():
+    # The order of the manual: acceleration, rate, angles; 1 g up, 90 deg about X.
+    frame = bytes.fromhex("5561 0000 0008 0000 0100 feff 0000 0040 0000 0000")
+    decoder = witmotion_ble.WitBleDecoder()
+    assert decoder.feed(frame) == []  # until the next one shows that no byte is missing
+    (sample,) = decoder.feed(frame[:2])
+    assert sample.acc == pytest.approx((0, STANDARD_G, 0))
+    assert sample.gyr == pytest.approx((math.radians(2000 / 32768), -math.radians(4000 / 32768), 0))
+    assert rotate(sample.quat, sample.acc) == pytest.approx((0, 0, STANDARD_G), abs=1e-6)
+    assert decoder.feed(frame[2:-1]) == decoder.flush() == []
+    assert decoder.counters.bad == 0
+
+
+def test_bluetooth_frames_and_answers_in_any_chunks():
+    answer = bytes.fromhex("5571 3a00 6801 6900 7a00 0000 0000 0000 0000 0000")
+    data = b"".join(witmotion_ble.encode(s) + answer * (i % 3 == 0) for i, s in enumerate(ble(40)))
+    decoder = witmotion_ble.WitBleDecoder()
+    got = [*decoder.feed(data), *decoder.flush()]
+    assert len(got) == decoder.counters.packets == 40
+    assert (decoder.counters.bad, decoder.counters.skipped) == (0, 14)
+    pieces = witmotion_ble.WitBleDecoder()
+    assert [s for i in range(len(data)) for s in pieces.feed(data[i : i + 1])] + pieces.flush() == got
+    assert pieces.counters == decoder.counters
+
+
+def test_a_byte_lost_costs_its_bluetooth_frame():
+    frames = [witmotion_ble.encode(s) for s in ble(60)]
+    whole = witmotion_ble.WitBleDecoder()
+    expected = [*whole.feed(b"".join(frames)), *whole.flush()]
+    rng = random.Random(3)
+    cut = set(rng.sample(range(1, 58), 12))
+    for i in cut:
+        at = rng.randrange(20)
+        frames[i] = frames[i][:at] + frames[i][at + 1 :]
+    decoder = witmotion_ble.WitBleDecoder()
+    got = [*decoder.feed(b"".join(frames)), *decoder.flush()]
+    # Without its start, a frame does not vouch for the one before.
+    near = cut | {i - 1 for i in cut}
+    assert all(sample in expected for sample in got)
+    assert all(expected[i] in got for i in range(60) if i not in near)
+    assert decoder.counters.bad > 0

@@ -30,6 +30,12 @@ def angle(a, b):
     return 2 * min(math.dist(a, b), math.dist(a, [-x for x in b]))
 
 
+def decode_whole(line, decoder=None):
+    """Samples of a line that ends here."""
+    decoder = decoder or XbusDecoder()
+    return [*decoder.feed(line), *decoder.flush()]
+
+
 def payloads(stream):
     """Payloads of back to back frames with short lengths."""
     while stream:
@@ -89,7 +95,7 @@ def test_every_item_of_a_recorded_packet(vector):
 @pytest.mark.parametrize("vector", SERIAL, ids=lambda v: v["id"])
 def test_sample_of_a_recorded_packet(vector):
     decoder = XbusDecoder()
-    (sample,) = decoder.feed(bytes.fromhex(vector["hex"]))
+    (sample,) = decode_whole(bytes.fromhex(vector["hex"]), decoder)
     expect = vector["expect"]
     assert decoder.counters.packets == 1
     assert decoder.counters.bad == decoder.counters.skipped == 0
@@ -241,7 +247,7 @@ def test_long_packet():
     many = b"".join(b"\xc0\x20\x0c" + bytes(12) for _ in range(30))
     line = encode_xbus(MTDATA2, many + b"\x10\x20\x02\x00\x07")
     assert line[3] == 0xFF
-    (sample,) = XbusDecoder().feed(line)
+    (sample,) = decode_whole(line)
     assert sample.mag == (0, 0, 0)
 
 
@@ -271,7 +277,7 @@ def test_repeated_packets_and_a_restart():
     lines = [encode_mtdata2(s, i) for i, s in enumerate(samples(6))]
     assert len(decoder.feed(b"".join([*lines, lines[5], lines[3]]))) == 6
     assert decoder.counters.late == 2
-    assert decoder.feed(encode_mtdata2(Sample(0, 200, (1.0, 0, 0, 0)), 40_000))
+    assert decode_whole(encode_mtdata2(Sample(0, 200, (1.0, 0, 0, 0)), 40_000), decoder)
     assert decoder.counters.restarts == 1
     assert decoder.counters.lost == 0
 
@@ -286,7 +292,7 @@ def test_other_messages_are_skipped():
 @pytest.mark.parametrize("quat", [(0.0, 0, 0, 0), (math.nan, 0, 0, 0), (0.3, 0, 0, 0), (math.inf, 0, 0, 0)])
 def test_no_orientation_is_invented(quat):
     decoder = XbusDecoder()
-    (sample,) = decoder.feed(encode_mtdata2(Sample(0, 0, quat, (1.0, 2.0, 3.0)), 1))
+    (sample,) = decode_whole(encode_mtdata2(Sample(0, 0, quat, (1.0, 2.0, 3.0)), 1), decoder)
     assert sample.quat is None
     assert sample.acc == (1, 2, 3)
     assert not decoder.feed(encode_mtdata2(Sample(0, 100, quat, (math.nan, 0, 0)), 2))
@@ -305,7 +311,7 @@ def test_needed_item_of_wrong_size():
 def test_any_items_with_a_good_checksum(items):
     payload = b"".join((kind | low).to_bytes(2, "big") + bytes([len(d)]) + d for kind, low, d in items)
     decoder = XbusDecoder()
-    decoder.feed(encode_xbus(MTDATA2, payload))
+    decode_whole(encode_xbus(MTDATA2, payload), decoder)
     assert decoder.counters.packets + decoder.counters.skipped + decoder.counters.bad == 1
     for item, _ in mtdata2_items(payload):
         assert 0 <= item <= 0xFFFF
@@ -324,6 +330,58 @@ def test_what_cannot_be_sent():
         encode_xbus(MTDATA2, bytes(3000))
     with pytest.raises(ValueError, match="fill"):
         list(mtdata2_items(b"\x20\x10\x10\x00"))
+
+
+# --- messages that are split ----------------------------------------------------------------------
+
+
+def split(sample, first_count, second_count, parts=(("quat",), ("acc", "gyr"))):
+    """The quantities of a sample in messages of their own."""
+    counts = [first_count, *[second_count] * (len(parts) - 1)]
+    return [
+        encode_mtdata2(Sample(0, sample.time_us)._replace(**{n: getattr(sample, n) for n in names}), count)
+        for names, count in zip(parts, counts, strict=True)
+    ]
+
+
+@pytest.mark.parametrize(("own_counts", "timed"), [(False, True), (False, False), (True, True)])
+@pytest.mark.parametrize("parts", [(("quat",), ("acc", "gyr")), (("acc", "gyr"), ("quat",))])
+def test_messages_of_one_instant_are_one_sample(own_counts, timed, parts):
+    sent = [s if timed else s._replace(time_us=None) for s in samples(20)]
+    decoder = XbusDecoder()
+    got = []
+    for i, sample in enumerate(sent):
+        counts = (2 * i, 2 * i + 1) if own_counts else (i, i)
+        got += [decoder.feed(line) for line in split(sample, *counts, parts)]
+    assert [len(part) for part in got] == [0, 1] * 20  # complete with the last of its messages
+    for sample, (result,) in zip(sent, got[1::2], strict=True):
+        agree(result, sample._replace(mag=None, temperature=None), 1e-5)
+    counters = decoder.counters
+    assert (counters.packets, counters.late, counters.lost, counters.bad) == (20, 0, 0, 0)
+
+
+def test_a_lost_part_costs_its_sample_alone():
+    lines = [line for i, s in enumerate(samples(20)) for line in split(s, i, i)]
+    del lines[20]  # an orientation
+    got = decode_whole(b"".join(lines))
+    assert [s.quat is None for s in got] == [i == 10 for i in range(20)]
+    assert all(s.acc is not None for s in got)
+    assert [s.time_us for s in got] == [s.time_us for s in samples(20)]
+
+
+def test_three_messages_and_one_that_is_new():
+    parts = (("quat",), ("acc", "gyr"), ("mag",))
+    sent = [s._replace(mag=(0.1, 0.2, 0.3)) for s in samples(10)]
+    got = decode_whole(b"".join(line for i, s in enumerate(sent) for line in split(s, i, i, parts)))
+    # That the field follows is known from the second instant on.
+    assert [s.time_us for s in got] == [s.time_us for s in sent]
+    assert [s.mag is not None for s in got] == [False] + [True] * 9
+
+
+def test_orientation_alone_is_not_delayed():
+    decoder = XbusDecoder()
+    got = [decoder.feed(encode_mtdata2(Sample(0, 10_000 * i, (1.0, 0, 0, 0)), i)) for i in range(5)]
+    assert [len(part) for part in got] == [0, 2, 1, 1, 1]
 
 
 # --- CAN ------------------------------------------------------------------------------------------

@@ -93,7 +93,7 @@ def check(
     """
     from edgepose.calibration import load_calibration
     from edgepose.diagnostics.sensor_health import SensorHealthMonitor
-    from edgepose.pipeline.rig_comparison import other_devices
+    from edgepose.pipeline.rig_comparison import missing_heading_reset, other_devices
     from edgepose.sources import open_source
 
     loaded = None if calibration is None else load_calibration(calibration)
@@ -115,7 +115,8 @@ def check(
                 page.draw([title[:width], *table, *_wrapped(warnings, width)])
 
         state, error = _listen(opened, health, source.file is None, seconds, lambda: stop.asked, watch)
-        if loaded is not None and (difference := other_devices(loaded, opened.devices)) is not None:
+        differences = [] if loaded is None else other_devices(loaded, opened.devices)
+        for difference in [*differences, *missing_heading_reset(loaded, opened.devices)]:
             _log.warning("%s", difference.removeprefix("warning: "))
     if page is not None:
         for warning in warnings:
@@ -123,6 +124,8 @@ def check(
     if opened.damage:
         say(f"warning: {opened.damage}")
         warnings.append(opened.damage)
+    if error is not None and not as_json and not any(sensor.samples for sensor, _ in state.sensors):
+        raise error  # a table of sensors that sent nothing would hide the reason
     if as_json:
         show(_json(source.name, state, warnings))
     else:
@@ -240,6 +243,9 @@ _COLUMNS = (
 )
 
 
+_NOTHING = "no packet came from any sensor: switch them on, and check --port or --can, --baud and --protocol"
+
+
 def _lines(state: State, width: int | None) -> list[str]:
     """Return a headline, a row for each sensor and advice, fitted into `width` columns (None: any width)."""
     fine = len(state.sensors) - state.problems
@@ -249,6 +255,8 @@ def _lines(state: State, width: int | None) -> list[str]:
         f"{counters.packets} good, {counters.lost} lost, {counters.bad} bad, {counters.unknown} unknown"
     )
     advice = [f"{sensor.placement}: {finding.advice}" for sensor, finding in state.sensors if finding.advice]
+    if not any(sensor.samples for sensor, _ in state.sensors):
+        advice = [_NOTHING]
     return [headline[:width], "", *_rows(state, width), *([""] if advice else []), *_wrapped(advice, width)]
 
 

@@ -121,6 +121,8 @@ def _describe(finding: ProbeResult, unit: str, speed: str) -> str:
     if finding.protocol is None:
         if not finding.amount:
             return "nothing arrives"
+        if finding.refused is not None:
+            return f"{finding.refused}{speed and ' (' + speed.strip() + ')'}"
         return (
             f"{finding.amount} {unit} arrived, in no known protocol; the device may be set to another speed"
         )

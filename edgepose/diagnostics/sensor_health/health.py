@@ -6,11 +6,13 @@ import dataclasses
 import math
 from collections.abc import Iterable, Mapping
 
+from edgepose.calibration.checks import GRAVITY_TILT_LIMIT_DEG
 from edgepose.calibration.sensor_to_segment import Calibration
 from edgepose.diagnostics.sensor_health.columns import row_of
 from edgepose.diagnostics.sensor_health.comparison import HeadingComparison, compare_values
 from edgepose.diagnostics.sensor_health.report import SensorHealth
 from edgepose.diagnostics.sensor_health.sensor import Sensor
+from edgepose.faults import shared_convention
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
 from edgepose.sources.clock_sync import DeviceClock
@@ -62,7 +64,15 @@ class SensorHealthMonitor:
                     "clock_restarts": clocks[i].resets,
                 }
             result.append(dataclasses.replace(sensor.health(name, now_s), **fields))
-        return result
+        tilted = {
+            health.placement: sensor.fitting_conventions()
+            for sensor, health in zip(self._sensors, result, strict=True)
+            if health.tilt_deg > GRAVITY_TILT_LIMIT_DEG
+        }
+        conventions = shared_convention(tilted)
+        return [
+            dataclasses.replace(health, convention=conventions.get(health.placement)) for health in result
+        ]
 
     def _fold(self) -> None:
         for sensor in self._sensors:

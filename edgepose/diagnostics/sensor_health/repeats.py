@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose import rotations as rot
-from edgepose.calibration.checks import GRAVITY
 from edgepose.diagnostics.sensor_health.columns import (
     ACC,
     FEWEST,
@@ -20,6 +19,7 @@ from edgepose.diagnostics.sensor_health.columns import (
     TIME,
     deviation,
 )
+from edgepose.imu import GRAVITY
 from edgepose.rotations import Array
 
 FROZEN_S = 1.0

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose import rotations as rot
-from edgepose.calibration.checks import GRAVITY, GRAVITY_TILT_LIMIT_DEG, diagnose_gravity_direction, tilt_deg
+from edgepose.calibration.checks import fitting_conventions, tilt_deg
 from edgepose.diagnostics.sensor_health.columns import ACC, GYR, QUANTITIES, QUAT, TIME, deviation
+from edgepose.imu import GRAVITY
 from edgepose.rotations import Array
 
 REST_S, REST_ACC, REST_GYR_DEG_S, REST_TURN_DEG = 1.5, 0.5, 2.0, 1.0
@@ -56,7 +57,6 @@ class RestResult(NamedTuple):
     bias_deg_s: float = math.nan
     gravity_error_m_s2: float = math.nan
     tilt_deg: float = math.nan
-    convention: str | None = None
 
 
 class Rests:
@@ -129,12 +129,13 @@ class Rests:
             return result
         forces = np.stack([kept.force for kept in self._rests])
         tilt = max(map(tilt_deg, forces))
-        convention = None
-        if tilt > GRAVITY_TILT_LIMIT_DEG:
-            quats = np.stack([kept.quat for kept in self._rests])
-            convention = diagnose_gravity_direction(quats, np.stack([kept.acc for kept in self._rests]))
         error = float(np.linalg.norm(forces - [0.0, 0.0, GRAVITY], axis=1).max())
-        return result._replace(gravity_error_m_s2=error, tilt_deg=tilt, convention=convention)
+        return result._replace(gravity_error_m_s2=error, tilt_deg=tilt)
+
+    def fitting_conventions(self) -> list[str]:
+        """Return the conventions in which gravity would point upwards in all rests."""
+        quats, acc = (np.stack([getattr(rest, name) for rest in self._rests]) for name in ("quat", "acc"))
+        return fitting_conventions(quats, acc)
 
 
 def is_table(rests: Sequence[Rest]) -> bool:

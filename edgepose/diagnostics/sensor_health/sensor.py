@@ -37,6 +37,7 @@ class Sensor:
         self._fresh = 0  # rows at the end of the window that have not been measured
         self._timing, self._completeness = Timing(), Completeness()
         self._rests, self._repeats, self._gyro = Rests(), Repeats(), GyroAgreement()
+        self._two_devices_deg: float | None = None  # angle between devices that have alternated
 
     def fold(self) -> None:
         """Measure the pending samples."""
@@ -67,6 +68,9 @@ class Sensor:
         has, period_s = self._completeness.has, self._timing.period_s
         still = self._rests.update(rows, has, period_s)
         self._repeats.update(rows, still, new, period_s)
+        if has["orientation"]:
+            apart_deg = detect_alternating_devices(rows[-max(new, FEWEST) :, QUAT])
+            self._two_devices_deg = self._two_devices_deg or apart_deg
         if has["orientation"] and has["gyroscope"]:
             self._gyro.update(rows[-new - 1 :], period_s)
 
@@ -89,13 +93,9 @@ class Sensor:
             **self._repeats.result()._asdict(),
             **self._gyro.result()._asdict(),
             **measure_field(self.window)._asdict(),
-            two_devices_deg=self._two_devices_deg(),
+            two_devices_deg=self._two_devices_deg,
         )
 
-    def _two_devices_deg(self) -> float | None:
-        """Return the angle between two devices that alternate under one name; None if it is one device."""
-        if not self._completeness.has["orientation"]:
-            return None
-        quats = self.window[-200:, QUAT]
-        quats = quats[np.isfinite(quats).all(axis=1)]
-        return detect_alternating_devices(quats) if len(quats) >= FEWEST else None
+    def fitting_conventions(self) -> list[str]:
+        """Return the conventions that would explain the gravity of its rests; there must be one."""
+        return self._rests.fitting_conventions()

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import FileFormatError
+from edgepose.faults import clock_restarted
 from edgepose.formats.ledger import Ledger
 from edgepose.formats.registered import FileFormat
 from edgepose.imu import ImuSample, Recording, SensorData
@@ -212,11 +213,8 @@ class SampleTable:
         check(np.abs(norm - 1.0) > 0.1, "has a quaternion that is not of unit length")
         reached = np.maximum.accumulate(np.concatenate([[before], np.where(good, times, -inf)]))[:-1]
         back = good & (times < reached - _RESTART_S)
-        check(
-            back,
-            "goes back in time by more than a second; sort the rows by time_s or, if the sensor was "
-            "restarted there, split the recording",
-        )
+        advice = f"{clock_restarted()}: split the recording there, or sort the rows by time_s"
+        check(back, f"goes back in time by more than a second: {advice}")
         check(good & (times < reached), "goes back in time; sort the rows by time_s")
         if not good.all():
             rows, norm = rows[good], norm[good]

@@ -20,6 +20,7 @@ from edgepose.formats.tables import COMMENTS, SEPARATORS, encoding_of, tidied
 from edgepose.imu import ImuSample, Recording
 from edgepose.placements import PLACEMENTS
 from edgepose.utils.counted_lines import MAX_LINE, CountedLines
+from edgepose.utils.similar_names import choices
 
 COLUMNS = "time_s,sensor,qw,qx,qy,qz,ax,ay,az,gx,gy,gz,mx,my,mz"
 """Header of the file."""
@@ -170,7 +171,8 @@ def _parse_row(cells: list[str], cut: bool, names: Sequence[str]) -> tuple[str, 
     time_s, sensor, *rest = cells
     sensor = sensor.strip('"')  # some programs quote text; quoted line breaks are not supported
     if sensor not in names:
-        raise ValueError(f"names an unknown sensor {shorten(sensor)}; the names are {', '.join(names)}")
+        hint = choices(sensor, names, "the names are")
+        raise ValueError(f"names an unknown sensor {shorten(sensor)}; {hint}")
     if cut and (rest[-1] or rest[-2]):
         # The last number may lack digits.
         raise ValueError("has no line end")

@@ -12,6 +12,7 @@ from edgepose.formats.recordings.base import RecordingFormat, recording_from_sam
 from edgepose.formats.tables import open_table
 from edgepose.imu import ImuSample, Recording
 from edgepose.placements import PLACEMENTS
+from edgepose.utils.similar_names import choices
 from firmware_protocols.sample import Sample
 from firmware_protocols.ximu3 import Ximu3Decoder
 
@@ -90,9 +91,8 @@ def by_placement(folder: Path, sensors: Sequence[Path], ids: Mapping[int, str] |
         how = f"in the names of its {'folders' if sensors[0].is_dir() else 'files'}"
         how = how if ids is None else "with a serial number of --sensors"
         names = ", ".join(sensor.name for sensor in sensors)
-        raise FileFormatError(
-            f"{folder}: no placement {how} ({names}); placements are {', '.join(PLACEMENTS)}"
-        )
+        hint = choices(_words(sensors[0].name).strip("_"), PLACEMENTS, "placements are")
+        raise FileFormatError(f"{folder}: no placement {how} ({names}); {hint}")
     return result
 
 
@@ -101,8 +101,12 @@ def placement_of(name: str, ids: Mapping[int, str] | None) -> str | None:
     if ids is not None:
         numbers = [int(number, 16) for number in _SERIAL_NUMBER.findall(name)]
         return next((ids[number] for number in numbers if number in ids), None)
-    words = re.sub(r"[^a-z]+", "_", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower())
-    return next((placement for placement in PLACEMENTS if f"_{placement}_" in f"_{words}_"), None)
+    return next((placement for placement in PLACEMENTS if f"_{placement}_" in f"_{_words(name)}_"), None)
+
+
+def _words(name: str) -> str:
+    """Return the words of a name in small letters, joined by underscores."""
+    return re.sub(r"[^a-z]+", "_", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower())
 
 
 def _samples(index: int, folder: Path, problems: list[str]) -> Iterator[ImuSample]:

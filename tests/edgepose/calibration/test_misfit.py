@@ -115,15 +115,15 @@ def test_other_devices_are_told(calibrated):
     noted = {name: Device("native", "/dev/ttyUSB0", i)._asdict() for i, name in enumerate(PLACEMENTS)}
     made = replace(calibration, metadata={"devices": noted})
     same = {i: Device("native", "/dev/ttyUSB0", i) for i in range(6)}
-    assert other_devices(made, same) is None
-    assert other_devices(calibration, same) is None  # nobody knows
-    assert other_devices(made, {i: device._replace(line=None) for i, device in same.items()}) is None
-    line = other_devices(made, same | {2: Device("native", "/dev/ttyUSB0", 7)})
+    assert other_devices(made, same) == []
+    assert other_devices(calibration, same) == []  # nobody knows
+    assert other_devices(made, {i: device._replace(line=None) for i, device in same.items()}) == []
+    (line,) = other_devices(made, same | {2: Device("native", "/dev/ttyUSB0", 7)})
     assert "left_lower_leg was native id 2 on /dev/ttyUSB0 and is native id 7 on /dev/ttyUSB0" in line
-    line = other_devices(made, {i: device._replace(protocol="xsens") for i, device in same.items()})
+    (line,) = other_devices(made, {i: device._replace(protocol="xsens") for i, device in same.items()})
     assert "left_forearm was native id 0 on /dev/ttyUSB0 and is xsens id 0" in line
     assert "(and 5 others)" in line
-    assert "ttyUSB1" in other_devices(made, {0: Device("native", "/dev/ttyUSB1", 0)})
+    assert "ttyUSB1" in other_devices(made, {0: Device("native", "/dev/ttyUSB1", 0)})[0]
 
 
 @pytest.mark.parametrize(
@@ -131,7 +131,7 @@ def test_other_devices_are_told(calibrated):
 )
 def test_devices_that_somebody_has_edited(calibrated, noted):
     made = replace(load_calibration(calibrated), metadata={"devices": noted})
-    assert other_devices(made, {4: Device("native", "a", 1)}) is None
+    assert other_devices(made, {4: Device("native", "a", 1)}) == []
 
 
 def test_a_capture_keeps_its_devices(command, wearer, tmp_path):

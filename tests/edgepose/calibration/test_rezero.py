@@ -137,6 +137,18 @@ def test_a_start_without_headings_waits_for_the_pose():
     assert walk.said[-1].startswith("headings found; tilt off by left_forearm 0.0, ")
 
 
+def test_a_wish_before_the_first_headings_is_answered():
+    walk = Walk(hold_first=True)
+    walk.wishes = [3.0, 3.0]
+    walk.go(0.5, worn(STRAIGHT), shake=1.0)
+    assert walk.said[1:] == [
+        "re-zero ignored: no headings have been found yet; stand straight, arms hanging, palms to the "
+        "thighs, facing forward"
+    ]
+    walk.go(START_HOLD_S + 1.0, worn(STRAIGHT, DRIFT))
+    assert walk.said[-1].startswith("headings found; ")
+
+
 # --- wishes by datagram -------------------------------------------------------------------------------------
 
 OSC = b"/edgepose/rezero\0\0\0\0"

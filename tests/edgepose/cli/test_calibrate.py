@@ -160,7 +160,7 @@ def test_warnings_go_to_stderr_and_into_the_file(tmp_path: Path) -> None:
     file.write_text("".join(",".join(row) + "\n" for row in scaled))
     result = run("--file", file, "--hold", 2, "--out", tmp_path / "calib.json")
     assert result.exit_code == 0, result
-    assert result.stderr == "warning: head measures 1.00 m/s^2 at rest, not 9.81: check its units and scale\n"
+    assert result.stderr == "warning: head: it reads 1 at rest, which is in g: send m/s², 9.81 at rest\n"
     assert len(cal.load_calibration(tmp_path / "calib.json").metadata["warnings"]) == 1
 
 
@@ -468,6 +468,8 @@ def test_devices_without_a_common_heading(tmp_path: Path, words: tuple[str, ...]
     noted = times_header({}) + "".join(times_row(1.7e9 + 0.01 * k, at) for k, at in enumerate(end))
     times_path(rig).write_text(noted)
     result = run("--file", rig, "--protocol", "haritorax", "--out", tmp_path / "c.json", *words)
-    says = "sensors of haritorax have no common heading: add --heading-reset motion, live or mounting"
+    says = (
+        "sensors of haritorax have no common heading: calibrate with --heading-reset motion, live or mounting"
+    )
     text = str(result.exception) + result.output
     assert (says in text) == (not words)

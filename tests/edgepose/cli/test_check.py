@@ -81,7 +81,7 @@ def test_a_recording_without_a_sensor_and_with_one_in_g(command, tmp_path):
     found = rows(result.stdout)
     assert found["head"][-2:] == ["no", "packets"]
     assert found["pelvis"][-1] == "unit"
-    assert re.search(r"^head: nothing came", result.stdout, re.MULTILINE)
+    assert re.search(r"^head: no packet came from it", result.stdout, re.MULTILINE)
     assert re.search(r"^pelvis: it reads 1.0\d+ at rest, which is in g", result.stdout, re.MULTILINE)
     assert result.stdout.startswith("3 s: 4 of 6 sensors fine")
 

@@ -250,7 +250,7 @@ def test_a_calibration_without_a_sensor(fail, wearer, tmp_path):
 
 def test_an_unknown_model(fail):
     text = fail(model="nonsense")
-    assert "nonsense: no such model; give one of birnn, rnn" in text
+    assert "nonsense: no such model; give the path of an archive, or one of birnn, rnn" in text
 
 
 def test_an_archive_that_is_none(fail, wearer, tmp_path):

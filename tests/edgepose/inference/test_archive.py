@@ -144,7 +144,7 @@ def test_find(tmp_path, made, monkeypatch):
     assert archive.find_archive(str(made)) == made
     monkeypatch.chdir(made.parent)
     assert archive.find_archive("small.pt") == Path("small.pt")
-    with pytest.raises(EdgeposeError, match="no such model; give one of"):
+    with pytest.raises(EdgeposeError, match="no such model; give the path of an archive, or one of"):
         archive.find_archive(str(tmp_path / "none.pt"))
     for path in archive.bundled_archives():
         assert archive.find_archive(path.stem) == path

@@ -1,11 +1,13 @@
 """`edgepose devices --probe`: what is on a port or bus that nobody has described."""
 
 import re
+import time
 
 import pytest
 
 from edgepose.errors import EdgeposeError
 from edgepose.sources.probe import BAUDS, probe_bus, probe_port
+from firmware_protocols import lpms
 from firmware_protocols.registry import PROTOCOLS
 from firmware_protocols.sample import Sample
 from tests.support.ports import Port, Sender
@@ -19,6 +21,7 @@ class Devices(Sender):
         super().__init__(*ports, rate=rate)
         self.protocol, self.ids, self.noise = PROTOCOLS.get(name), ids, noise
         self.port = self.line.name
+        self.sent = 0
         self.encode = self.protocol and self.protocol.encoder()
 
     def send(self, k):
@@ -31,6 +34,7 @@ class Devices(Sender):
             if self.protocol.transport == "can":
                 wire = b"".join(b"t%03X%d%s\r" % (i, len(d), d.hex().encode()) for i, d, *_ in wire)
             self.line.write(wire)
+        self.sent = k + 1
 
 
 def test_what_is_on_ports_and_buses(command, monkeypatch):
@@ -56,13 +60,33 @@ def test_what_is_on_ports_and_buses(command, monkeypatch):
     assert ", id 9 at " in says[3]
 
 
-def test_rates():
-    with Devices("xsens", rate=50) as device:
-        finding, baud = probe_port(device.port)
+@pytest.mark.parametrize("bus", [False, True])
+def test_rates_do_not_count_what_had_waited(bus, monkeypatch):
+    monkeypatch.setenv("CAN_CONFIG", '{"sleep_after_open": 0.01}')
+    with Devices("hipnuc-canopen" if bus else "xsens", ids=(8,) if bus else (0,), rate=50) as device:
+        while device.sent < 60:  # a second of data that nobody has read
+            time.sleep(0.01)
+        before = device.sent
+        start_s = time.monotonic()
+        finding, baud = (probe_bus(f"slcan:{device.port}"), BAUDS[0]) if bus else probe_port(device.port)
+        true_hz = (device.sent - before) / (time.monotonic() - start_s)
     assert baud == BAUDS[0]
-    assert finding.protocol == "xsens"
-    assert list(finding.rates_hz) == [0]
-    assert finding.rates_hz[0] > 0
+    assert finding.protocol == ("hipnuc-canopen" if bus else "xsens")
+    ((sensor, rate_hz),) = finding.rates_hz.items()
+    assert sensor == (8 if bus else 0)
+    # A busy machine slows the sender down.
+    assert rate_hz == pytest.approx(true_hz, rel=0.15)
+
+
+def test_sensors_with_other_settings_are_named(command):
+    """A protocol at the right speed whose content is not what poses need."""
+    more = [*lpms.USUAL_FIELDS, "euler"]
+    with Devices("lpms", ids=(1,)) as device:
+        device.encode = lambda sample, seq: lpms.encode(sample, more)
+        result = command("devices", "--probe", device.port)
+    assert result.returncode == 0
+    assert " measurements came whole, but with 68 bytes instead of 56 (floats) or 30" in result.stdout
+    assert "another speed" not in result.stdout
 
 
 def test_noise_is_listened_to_at_all_speeds(monkeypatch):

@@ -89,7 +89,7 @@ def test_two_hubs_and_a_bus(read):
         (PORTS.replace("USB3", "USB2"), "right_lower_leg and left_lower_leg are the same device"),
         (IDS.replace("23", "20"), "right_lower_leg and left_forearm are the same device"),
         (PORTS.replace('port = "/dev/ttyUSB1"', 'port = "/dev/ttyUSB0", id = 3'), "are the same device"),
-        (PORTS.replace('port = "/dev/ttyUSB1"', 'prot = "x"'), "right_forearm: unknown key 'prot'; keys are"),
+        (PORTS.replace('port = "/dev/ttyUSB1"', 'prot = "x"'), "unknown key 'prot'; did you mean 'port'"),
         (PORTS.replace('{ port = "/dev/ttyUSB1" }', "1"), "right_forearm: must be a table"),
         (PORTS.replace('port = "/dev/ttyUSB1"', ""), "right_forearm: no device named; give its port"),
         (PORTS.replace('"/dev/ttyUSB1"', "1"), "right_forearm: port must be text in quotes, not 1"),

@@ -1,0 +1,60 @@
+"""Watch over a rig at the start of a run, for faults of sensors that make poses wrong without any sign."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+from edgepose.diagnostics.rules import MAKE_POSES_WRONG, diagnose
+from edgepose.diagnostics.sensor_health import SensorHealthMonitor
+from edgepose.imu import ImuSample
+
+WATCHED_S = 60.0
+"""Length of the watch, seconds: its cost is small, but there is little left to see after that."""
+
+_EVERY_S = 2.0
+
+
+class RigMonitor:
+    """Judges samples as `edgepose check` does, and reports each fault once, in the same words."""
+
+    def __init__(self) -> None:
+        """Start the watch with the first samples."""
+        self._health: SensorHealthMonitor | None = SensorHealthMonitor()
+        self._start_s = self._next_s = math.nan
+        self._now_s = math.nan
+        self._reported: set[tuple[str, str]] = set()
+
+    def add(self, samples: Iterable[ImuSample], now_s: float) -> list[str]:
+        """Take samples as they were measured, and return a line on each fault that has become clear.
+
+        Args:
+            samples: of any sensors.
+            now_s: time up to which all samples have been added, seconds.
+        """
+        if self._health is None:
+            return []
+        self._health.add(samples)
+        self._now_s = now_s
+        if math.isnan(self._start_s):
+            self._start_s, self._next_s = now_s, now_s + _EVERY_S
+        if now_s < self._next_s:
+            return []
+        self._next_s = now_s + _EVERY_S
+        lines = self.judge()
+        if now_s - self._start_s > WATCHED_S:
+            self._health = None
+        return lines
+
+    def judge(self) -> list[str]:
+        """Return a line on each fault that has not been reported yet."""
+        if self._health is None or math.isnan(self._now_s):
+            return []
+        lines = []
+        for sensor in self._health.report(self._now_s):
+            finding = diagnose(sensor)
+            key = (sensor.placement, finding.name)
+            if finding.name in MAKE_POSES_WRONG and key not in self._reported:
+                self._reported.add(key)
+                lines.append(f"warning: {sensor.placement}: {finding.advice}")
+        return lines
