@@ -345,11 +345,18 @@ def convert_poses(
     return len(read.frames), float(read.time_s[-1] - read.time_s[0]), damage
 
 
-def describe(result: Result) -> str:
-    """Describe the result of a conversion in a few words, with its problem."""
+def outcome(result: Result) -> str:
+    """Return the outcome of a conversion in a few words."""
     if result.skipped:
         return "skipped, already exists"
     if not result.samples:
-        return f"failed: {result.problem}"
+        return "failed"
     few = "" if result.sensors == len(PLACEMENTS) else f", {result.sensors} of {len(PLACEMENTS)} sensors"
-    return f"damaged{few}: {result.problem}" if result.problem else f"ok{few}"
+    return f"damaged{few}" if result.problem else f"ok{few}"
+
+
+def describe(result: Result) -> str:
+    """Return the outcome of a conversion with its problem, without the name of the source."""
+    if result.problem is None:
+        return outcome(result)
+    return f"{outcome(result)}: {result.problem.replace(f'{result.job.source}: ', '')}"

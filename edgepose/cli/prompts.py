@@ -46,7 +46,10 @@ class Prompter:
 
     def __call__(self, text: str) -> None:
         """Write one line."""
-        (terminal.say if self.err else terminal.show)(text)
+        if self.err:
+            terminal.say(text)
+        else:
+            terminal.show(terminal.wrapped(text, self.stream))
 
 
 def wait_for_all_sensors(batches: Iterator[Batch], say: Prompter) -> Iterator[Batch]:

@@ -15,6 +15,7 @@ def open_outputs(
     outputs: OutputConfig,
     rate: float = 60.0,
     stopped: Callable[[], bool] = lambda: False,
+    wearer: str = "",
 ) -> list[Sink]:
     """Open the sinks of one wearer. No file appears or is replaced before all of them are open.
 
@@ -23,6 +24,7 @@ def open_outputs(
         outputs: the outputs to open.
         rate: poses per second.
         stopped: whether the run is to end, see `SinkContext`.
+        wearer: the wearer's name, for messages.
 
     Raises:
         EdgeposeError: a file or address cannot be written to.
@@ -40,6 +42,7 @@ def open_outputs(
         std=outputs.std,
         overwrite=outputs.overwrite,
         stopped=stopped,
+        wearer=wearer,
     )
     targets = {name: getattr(outputs, name) for name in SINKS if name != "view"} | dict(outputs.sinks)
     sinks = []

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import logging
 import socket
 import subprocess
 import sys
 from importlib.util import find_spec
+from threading import Thread
+from typing import IO
 
 from edgepose.errors import EdgeposeError
 from edgepose.pose import PoseFrame
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.sinks.udp import UdpSink
+
+_log = logging.getLogger(__name__)
 
 STOP_S = 5.0
 """Longest time to wait for the viewer to exit, seconds."""
@@ -25,11 +30,12 @@ def check_viewer() -> None:
 class ViewSink(Sink):
     """Starts `edgepose view` and sends it each pose as a datagram; the viewer shows the newest one."""
 
-    def __init__(self, height_m: float) -> None:
-        """Start the viewer, which prints the address of its page on standard error.
+    def __init__(self, height_m: float, wearer: str = "") -> None:
+        """Start the viewer; its messages, such as the address of its page, are logged.
 
         Args:
             height_m: stature of the figure, metres.
+            wearer: name before the messages.
 
         Raises:
             EdgeposeError: a package that the viewer needs is not installed.
@@ -40,8 +46,14 @@ class ViewSink(Sink):
             port = free.getsockname()[1]
         command = [sys.executable, "-m", "edgepose", "view", "--udp", f"127.0.0.1:{port}", "--with-parent"]
         self._viewer = subprocess.Popen(
-            [*command, "--height", str(height_m)], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+            [*command, "--height", str(height_m)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
         )
+        assert self._viewer.stderr is not None
+        Thread(target=_log_lines, args=(self._viewer.stderr, wearer), daemon=True).start()
         self._datagrams = UdpSink("127.0.0.1", port, "binary")
 
     def write(self, pose: PoseFrame) -> None:
@@ -59,6 +71,13 @@ class ViewSink(Sink):
             self._viewer.wait()
 
 
+def _log_lines(lines: IO[str], wearer: str) -> None:
+    # Written by the viewer itself they would appear in the middle of the run's status line.
+    with lines:
+        for line in lines:
+            _log.warning("%s%s", f"{wearer}: " if wearer else "", line.rstrip().removeprefix("edgepose: "))
+
+
 def open_sink(target: bool, context: SinkContext) -> Sink:
     """Open a `ViewSink`."""
-    return ViewSink(context.height)
+    return ViewSink(context.height, context.wearer)
