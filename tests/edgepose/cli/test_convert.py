@@ -288,7 +288,7 @@ def test_fifty_files_one_of_them_broken_by_two_processes(command, tmp_path):
         ("7.csv", "damaged: .*1 bad rows left out.* row 21 has 1 col"),
         ("deeper/9.npz", "failed: not a complete NPZ file"),
     ):
-        (line,) = (line for line in result.stderr.splitlines() if f"{name}: " in line)
+        (line,) = (line for line in result.stderr.splitlines() if f"{folder / name}: " in line)
         assert re.search(rf"^\d+ of 50  {folder / name}: {reason}", line)
     written = sorted(path for path in out.rglob("*") if path.is_file())
     assert len(written) == 49
