@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +16,6 @@ from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.missing_frames import fill_missing_frames
 from edgepose.formats.poses.npz_amass import write_npz as write_poses_npz
 from edgepose.formats.poses.registry import is_poses, pose_suffixes, salvage_poses
-from edgepose.formats.recordings.base import recording_from_samples
 from edgepose.formats.recordings.csv import write_csv
 from edgepose.formats.recordings.npz import write_npz
 from edgepose.formats.recordings.registry import (
@@ -26,18 +23,16 @@ from edgepose.formats.recordings.registry import (
     find_format,
     find_whole,
     recording_suffixes,
-    salvage_recording,
 )
-from edgepose.imu import ImuSample, Recording
+from edgepose.imu import Recording
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseSequence
 from edgepose.sinks.base import Sink
 from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.csv import CsvSink
 from edgepose.skeleton import default_body
-from edgepose.sources import open_source
-from edgepose.sources.replay import CAN_LOGS, CAPTURES, is_can_log, is_recording
-from edgepose.sources.sensor_map import read_map
+from edgepose.sources.replay import CAN_LOGS, CAPTURES, is_can_log
+from edgepose.sources.whole_file import read_file
 from edgepose.utils.durable_files import replace_file
 
 WRITERS: dict[str, Callable[[Path, Recording], None]] = {"csv": write_csv, "npz": write_npz}
@@ -197,7 +192,7 @@ def convert(job: Job, options: Options = _DEFAULTS) -> Result:
                 raise EdgeposeError(f"{job.source}: --filter is for recordings, not for poses; leave it out")
             _make_folder(job.target.parent)
             return Result(job, *convert_poses(job.source, job.target, options.height_m, options.overwrite))
-        recording = _read(job.source, options.protocol, options.sensors)
+        recording = read_file(job.source, options.protocol, options.sensors)
         data = recording.sensors.values()
         if not data:
             raise EdgeposeError(recording.damage or f"{job.source}: no samples")
@@ -233,29 +228,6 @@ def _make_folder(folder: Path) -> None:
     except OSError as error:
         reason = error.strerror or error
         raise EdgeposeError(f"cannot make the folder {folder}: {reason}; choose another --out") from None
-
-
-def _read(path: Path, protocol: str, sensors: Path | None) -> Recording:
-    if is_recording(path):
-        return salvage_recording(path, None if sensors is None else read_map(sensors).serial_numbers())
-    problems: list[str] = []
-    rows = list(_samples(path, protocol, sensors, problems))
-    # File names need not be valid text.
-    name = os.fsencode(path.name).decode(errors="replace")
-    recording = recording_from_samples(rows, {"source": name}, name=str(path), salvage=True)
-    problems += [recording.damage] if recording.damage else []
-    return recording._replace(damage="; ".join(problems) or None)
-
-
-def _samples(path: Path, protocol: str, sensors: Path | None, problems: list[str]) -> Iterator[ImuSample]:
-    """Yield the samples of a capture or a log; an error ends them and is added to the problems."""
-    with open_source(file=path, protocol=protocol, sensors=sensors) as source:
-        try:
-            yield from chain.from_iterable(batch.samples for batch in source)
-        except EdgeposeError as error:
-            problems.append(str(error))
-        if source.damage:
-            problems.append(source.damage)
 
 
 def convert_all(jobs: Sequence[Job], options: Options = _DEFAULTS, workers: int = 1) -> Iterator[Result]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from math import inf
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 
 from edgepose.errors import EdgeposeError
 from edgepose.formats.ledger import Ledger
@@ -35,6 +35,7 @@ class LogSource:
         read_chunks: ChunkReader,
         make_decoder: Callable[[str], LineDecoder],
         blocking: bool = True,
+        metadata: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         """Store the settings; iteration opens the file.
 
@@ -44,7 +45,9 @@ class LogSource:
             read_chunks: reads the file.
             make_decoder: makes the decoder of a line, given its name.
             blocking: see `open_source`.
+            metadata: see `Source.metadata`.
         """
+        self.metadata = metadata
         self._path = path
         self._realtime, self._blocking = realtime, blocking
         self._read_chunks = read_chunks

@@ -64,14 +64,14 @@ def salvage_recording(path: Path | str, ids: Mapping[int, str] | None = None) ->
 
 
 def read_sensors(path: Path | str, names: Sequence[str]) -> Recording:
-    """Read a recording of any of the named sensors, like `read_recording` for the six placements.
+    """Read the good part of a recording of any of the named sensors.
 
     Only CSV and NPZ can contain other sensors than the six.
 
     Raises:
         FileFormatError: it cannot be read, or is not a recording of such sensors.
     """
-    return _read(Path(path), ReadOptions(tuple(names)))
+    return _read(Path(path), ReadOptions(tuple(names), salvage=True))
 
 
 def missing_sensors(recording: Recording) -> list[str]:
