@@ -11,10 +11,10 @@ import click
 from edgepose.cli.terminal.messages import progress_bar, say
 from edgepose.errors import EdgeposeError
 
-CONFIGS = Path(__file__).parent.parent / "training" / "configs"
-
 
 def _config_path(name: str) -> Path:
+    from edgepose_export.training.config import CONFIGS
+
     shipped = CONFIGS / f"{name}.toml"
     return shipped if shipped.is_file() else Path(name)
 
@@ -24,7 +24,8 @@ def _config_path(name: str) -> Path:
     "--config",
     required=True,
     metavar="NAME|FILE",
-    help="Shipped config, such as birnn or dip-rnn (docs/research/training.md lists all), or a TOML file.",
+    help="Shipped config, such as birnn or dip-rnn (docs/research/training.md in the repository lists all), "
+    "or a TOML file.",
 )
 @click.option(
     "--data",
