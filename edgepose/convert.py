@@ -168,20 +168,32 @@ def _expand(source: Path, out: Path) -> Iterator[tuple[Path, Path]]:
 
 
 def _find_recordings(folder: Path, out: Path, endings: tuple[str, ...]) -> Iterator[Path]:
-    """Yield the recordings in a folder, except those in the output folder."""
+    """Yield the recordings in a folder, except those in the output folder.
+
+    A folder below it that cannot be listed is yielded itself, so that its conversion fails, not the others.
+    """
     if find_format(folder) is not None:
         yield folder
     else:
         check_no_part(folder)
     for path in folder.iterdir():
-        if find_whole(path) is not None:
-            continue
-        if path.is_dir():
-            if not path.is_symlink() and path.resolve() != out:
-                yield from _find_recordings(path, out, endings)
-        # Reading a pipe could block forever.
-        elif not path.is_fifo() and (path.suffix.lower() in endings or is_can_log(path)):
-            yield path
+        try:
+            found = list(_find_recordings_at(path, out, endings))
+        except OSError:
+            found = [path]
+        yield from found
+
+
+def _find_recordings_at(path: Path, out: Path, endings: tuple[str, ...]) -> Iterator[Path]:
+    """Yield a file if it is a recording, or the recordings in a folder."""
+    if find_whole(path) is not None:
+        return
+    if path.is_dir():
+        if not path.is_symlink() and path.resolve() != out:
+            yield from _find_recordings(path, out, endings)
+    # Reading a pipe could block forever.
+    elif not path.is_fifo() and (path.suffix.lower() in endings or is_can_log(path)):
+        yield path
 
 
 def convert(job: Job, options: Options = _DEFAULTS) -> Result:

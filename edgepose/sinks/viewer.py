@@ -75,7 +75,9 @@ def _log_lines(lines: IO[str], wearer: str) -> None:
     # Written by the viewer itself they would appear in the middle of the run's status line.
     with lines:
         for line in lines:
-            _log.warning("%s%s", f"{wearer}: " if wearer else "", line.rstrip().removeprefix("edgepose: "))
+            message = line.rstrip().removeprefix("edgepose: ")
+            if message != "stopped":  # by the end of the run, while it was starting
+                _log.warning("%s%s", f"{wearer}: " if wearer else "", message)
 
 
 def open_sink(target: bool, context: SinkContext) -> Sink:

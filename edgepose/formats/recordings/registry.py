@@ -128,6 +128,7 @@ def _read(path: Path, options: ReadOptions) -> Recording:
         format = find_format(path)
         if format is None:
             if path.is_dir():
+                next(path.iterdir(), None)  # raises OSError if it cannot be listed
                 raise FileFormatError(
                     f"{path}: unknown kind of file (Is a directory with no recording in it); give the folder "
                     "that holds the files or folders of all sensors"
