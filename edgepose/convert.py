@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +16,6 @@ from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.missing_frames import fill_missing_frames
 from edgepose.formats.poses.npz_amass import write_npz as write_poses_npz
 from edgepose.formats.poses.registry import is_poses, pose_suffixes, salvage_poses
-from edgepose.formats.recordings.base import recording_from_samples
 from edgepose.formats.recordings.csv import write_csv
 from edgepose.formats.recordings.npz import write_npz
 from edgepose.formats.recordings.registry import (
@@ -26,18 +23,16 @@ from edgepose.formats.recordings.registry import (
     find_format,
     find_whole,
     recording_suffixes,
-    salvage_recording,
 )
-from edgepose.imu import ImuSample, Recording
+from edgepose.imu import Recording
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseSequence
 from edgepose.sinks.base import Sink
 from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.csv import CsvSink
 from edgepose.skeleton import default_body
-from edgepose.sources import open_source
-from edgepose.sources.replay import CAN_LOGS, CAPTURES, is_can_log, is_recording
-from edgepose.sources.sensor_map import read_map
+from edgepose.sources.replay import CAN_LOGS, CAPTURES, is_can_log
+from edgepose.sources.whole_file import read_file
 from edgepose.utils.durable_files import replace_file
 
 WRITERS: dict[str, Callable[[Path, Recording], None]] = {"csv": write_csv, "npz": write_npz}
@@ -174,20 +169,32 @@ def _expand(source: Path, out: Path) -> Iterator[tuple[Path, Path]]:
 
 
 def _find_recordings(folder: Path, out: Path, endings: tuple[str, ...]) -> Iterator[Path]:
-    """Yield the recordings in a folder, except hidden ones and those in the output folder."""
+    """Yield the recordings in a folder, except hidden ones and those in the output folder.
+
+    A folder below it that cannot be listed is yielded itself, so that its conversion fails, not the others.
+    """
     if find_format(folder) is not None:
         yield folder
     else:
         check_no_part(folder)
     for path in folder.iterdir():
-        if _is_hidden(path) or find_whole(path) is not None:
-            continue
-        if path.is_dir():
-            if not path.is_symlink() and path.resolve() != out:
-                yield from _find_recordings(path, out, endings)
-        # Reading a pipe could block forever.
-        elif not path.is_fifo() and (path.suffix.lower() in endings or is_can_log(path)):
-            yield path
+        try:
+            found = list(_find_recordings_at(path, out, endings))
+        except OSError:
+            found = [path]
+        yield from found
+
+
+def _find_recordings_at(path: Path, out: Path, endings: tuple[str, ...]) -> Iterator[Path]:
+    """Yield a file if it is a recording, or the recordings in a folder."""
+    if _is_hidden(path) or find_whole(path) is not None:
+        return
+    if path.is_dir():
+        if not path.is_symlink() and path.resolve() != out:
+            yield from _find_recordings(path, out, endings)
+    # Reading a pipe could block forever.
+    elif not path.is_fifo() and (path.suffix.lower() in endings or is_can_log(path)):
+        yield path
 
 
 def _is_hidden(path: Path) -> bool:
@@ -203,7 +210,7 @@ def convert(job: Job, options: Options = _DEFAULTS) -> Result:
                 raise EdgeposeError(f"{job.source}: --filter is for recordings, not for poses; leave it out")
             _make_folder(job.target.parent)
             return Result(job, *convert_poses(job.source, job.target, options.height_m, options.overwrite))
-        recording = _read(job.source, options.protocol, options.sensors)
+        recording = read_file(job.source, options.protocol, options.sensors)
         data = recording.sensors.values()
         if not data:
             raise EdgeposeError(recording.damage or f"{job.source}: no samples")
@@ -239,29 +246,6 @@ def _make_folder(folder: Path) -> None:
     except OSError as error:
         reason = error.strerror or error
         raise EdgeposeError(f"cannot make the folder {folder}: {reason}; choose another --out") from None
-
-
-def _read(path: Path, protocol: str, sensors: Path | None) -> Recording:
-    if is_recording(path):
-        return salvage_recording(path, None if sensors is None else read_map(sensors).serial_numbers())
-    problems: list[str] = []
-    rows = list(_samples(path, protocol, sensors, problems))
-    # File names need not be valid text.
-    name = os.fsencode(path.name).decode(errors="replace")
-    recording = recording_from_samples(rows, {"source": name}, name=str(path), salvage=True)
-    problems += [recording.damage] if recording.damage else []
-    return recording._replace(damage="; ".join(problems) or None)
-
-
-def _samples(path: Path, protocol: str, sensors: Path | None, problems: list[str]) -> Iterator[ImuSample]:
-    """Yield the samples of a capture or a log; an error ends them and is added to the problems."""
-    with open_source(file=path, protocol=protocol, sensors=sensors) as source:
-        try:
-            yield from chain.from_iterable(batch.samples for batch in source)
-        except EdgeposeError as error:
-            problems.append(str(error))
-        if source.damage:
-            problems.append(source.damage)
 
 
 def convert_all(jobs: Sequence[Job], options: Options = _DEFAULTS, workers: int = 1) -> Iterator[Result]:
@@ -351,11 +335,18 @@ def convert_poses(
     return len(read.frames), float(read.time_s[-1] - read.time_s[0]), damage
 
 
-def describe(result: Result) -> str:
-    """Describe the result of a conversion in a few words, with its problem."""
+def outcome(result: Result) -> str:
+    """Return the outcome of a conversion in a few words."""
     if result.skipped:
         return "skipped, already exists"
     if not result.samples:
-        return f"failed: {result.problem}"
+        return "failed"
     few = "" if result.sensors == len(PLACEMENTS) else f", {result.sensors} of {len(PLACEMENTS)} sensors"
-    return f"damaged{few}: {result.problem}" if result.problem else f"ok{few}"
+    return f"damaged{few}" if result.problem else f"ok{few}"
+
+
+def describe(result: Result) -> str:
+    """Return the outcome of a conversion with its problem, without the name of the source."""
+    if result.problem is None:
+        return outcome(result)
+    return f"{outcome(result)}: {result.problem.replace(f'{result.job.source}: ', '')}"

@@ -5,7 +5,7 @@ are in radians, except those whose names end in `_deg`, which are for people to 
 """
 
 from edgepose.calibration.body_frame import body_from_inertial, check_body_frame
-from edgepose.calibration.checks import HoldSummary, MovedError, check_hold
+from edgepose.calibration.checks import HoldError, HoldSummary, MovedError, check_hold
 from edgepose.calibration.functional import EXERCISE_S, ROUTINE, WeakMotionError, headings_from_motion
 from edgepose.calibration.heading_reset import (
     HeadingReset,
@@ -35,6 +35,7 @@ __all__ = [
     "Calibration",
     "HeadingReset",
     "Hold",
+    "HoldError",
     "HoldSummary",
     "MovedError",
     "SensorHold",

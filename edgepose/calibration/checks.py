@@ -22,6 +22,7 @@ from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array, tilt_deg
 
 SPREAD_LIMIT_DEG = 3.0  # RMS about the mean over a hold; standing people sway 0.1 - 0.5
+GAP_LIMIT_S = 0.5  # longest time without a sample within a hold; radios lose some tenths of a second
 DRIFT_LIMIT_DEG = 5.0  # first against last quarter of a hold
 RATE_LIMIT_DEG_S = (
     20.0  # RMS of the angular rate without its mean, which may be bias; standing people 0.3 - 3
@@ -31,8 +32,12 @@ GRAVITY_TILT_LIMIT_DEG = 10.0
 _EARLIER = (2, 3)  # samples back of one device among those of two
 
 
-class MovedError(CalibrationError):
-    """A hold with movement in it; the wearer can try again."""
+class HoldError(CalibrationError):
+    """A hold that cannot be used; the wearer can try again."""
+
+
+class MovedError(HoldError):
+    """A hold with movement in it."""
 
 
 class HoldSummary(NamedTuple):
@@ -62,6 +67,7 @@ def check_hold(hold: Hold, advice: str = "stand still and repeat") -> HoldSummar
 
     Raises:
         MovedError: sensors moved; names all of them and their movement.
+        HoldError: sensors were silent for a part of it; names them.
         CalibrationError: any other fault of the hold; names the sensors and what to do.
     """
     check_reported(hold)
@@ -71,6 +77,7 @@ def check_hold(hold: Hold, advice: str = "stand still and repeat") -> HoldSummar
             f"too few samples in the hold ({', '.join(few)}; at least {MIN_SAMPLES}): "
             "check the rate and the link, or hold longer"
         )
+    _check_gaps(hold)
     broken = [
         f"{name} ({bad} of {len(s.quat)})"
         for name, s in sensor_names(hold)
@@ -100,6 +107,19 @@ def check_hold(hold: Hold, advice: str = "stand still and repeat") -> HoldSummar
         raise MovedError(f"moved during the hold: {', '.join(moved)}; {advice}")
     force, warnings = _gravity(hold, quats)
     return HoldSummary([len(s.quat) for s in hold], mean, np.degrees(spread), force, warnings)
+
+
+def _check_gaps(hold: Hold) -> None:
+    """Raise HoldError if a sensor sent nothing for a part of a hold."""
+    start, end = min(s.time_s.min() for s in hold), max(s.time_s.max() for s in hold)
+    gaps = [np.diff(np.sort([start, *s.time_s, end])).max() for s in hold]
+    if silent := [
+        f"{n} for {gap:.1f} s" for n, gap in zip(PLACEMENTS, gaps, strict=True) if gap > GAP_LIMIT_S
+    ]:
+        raise HoldError(
+            f"silent during a part of the hold: {', '.join(silent)}; check power and link, and hold again or "
+            "choose another part of the recording"
+        )
 
 
 def _not_rotations(quat: Array) -> int:

@@ -102,7 +102,7 @@ def stillest_start(hold: Hold, seconds: float) -> float:
         # The largest eigenvalue of the mean of q q^T is the mean of cos^2(angle / 2) about the mean rotation.
         largest = np.linalg.eigvalsh((sums[j] - sums[i]) / np.maximum(count, 1)[:, None, None])[:, -1]
         angle = 2.0 * np.arcsin(np.sqrt(np.clip(1.0 - largest, 0.0, 1.0)))
-        enough = max(MIN_SAMPLES, count.max(initial=0) / 2)
+        enough = max(MIN_SAMPLES, 0.8 * count.max(initial=0))
         spread = np.maximum(spread, np.where(count < enough, np.inf, angle))
     if not np.isfinite(spread).any():
         raise CalibrationError(

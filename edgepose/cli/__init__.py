@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import traceback
+import warnings
 from importlib.metadata import entry_points
 from io import StringIO
 from pathlib import Path
@@ -120,6 +121,9 @@ def main() -> NoReturn:
     # When torch reads int8 weights it logs deprecation warnings, which a user cannot act on.
     os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
     debug = "--debug" in sys.argv[1:]
+    if not debug and not sys.warnoptions:
+        # From numpy, with the path of a module; absurd numbers are reported by checks of the input.
+        warnings.simplefilter("ignore", RuntimeWarning)
     try:
         sys.exit(cli.main(standalone_mode=False) or 0)
     except click.ClickException as error:

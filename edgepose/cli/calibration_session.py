@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from edgepose import calibration
 from edgepose.calibration import HeadingReset, Hold, HoldSummary
+from edgepose.cli.options.recording_time import RecordingTime
 from edgepose.cli.prompts import Prompter, record_hold, record_motion, wait_for_all_sensors, wait_for_enter
 from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
@@ -20,6 +21,9 @@ from edgepose.orientation.stage import OrientationStage
 from edgepose.pipeline.rig_comparison import without_common_heading
 from edgepose.sources import Device, open_source
 from edgepose.sources.replay import is_recording
+
+END_S = 0.1
+"""Longest time from the last sample of a recording to its end, seconds."""
 
 ROUTINE_S = 30.0
 """Length of the motion that is taken from a recording without --motion, seconds."""
@@ -38,9 +42,9 @@ class CalibrationPlan:
         pose: pose of the hold.
         body_frame: the direction that the wearer faces; None is the default for the heading reset.
         heading_reset: "live", "motion", "mounting[:AXIS]" or a file; None for none.
-        motion: start and end of the movements in a recording, seconds.
+        motion: start and end of the movements in a recording.
         hold_s: length of the hold, seconds.
-        from_s: start of the hold in a recording, seconds; None looks for the stillest part.
+        start: start of the hold in a recording; None looks for the stillest part.
         countdown_s: time before each live hold, seconds.
         mounting: how the sensors are worn, in the order of PLACEMENTS, if the heading reset needs it.
     """
@@ -48,9 +52,9 @@ class CalibrationPlan:
     pose: str
     body_frame: str | None
     heading_reset: str | None
-    motion: tuple[float, float] | None
+    motion: tuple[RecordingTime, RecordingTime] | None
     hold_s: float
-    from_s: float | None
+    start: RecordingTime | None
     countdown_s: float
     mounting: Sequence[str] = ()
 
@@ -125,20 +129,39 @@ def measure_recorded(
     reset = _side_by_side(source, plan, orient, say)
     everything, damage, devices = _read(source, orient)
     _check_north(orient, plan, devices)
-    still, start_s = _window(source.name, (everything, damage), plan.from_s, plan.hold_s, say)
-    if plan.from_s is None:
+    still, start_s = _window(source.name, (everything, damage), plan.start, plan.hold_s, say)
+    if plan.start is None:
         say("If the wearer stood in the pose at another time, give its start with --from.")
     summary = calibration.check_hold(still, "choose a still part with --from, or record again")
     if plan.heading_reset == "motion":
-        end_s = start_s + plan.hold_s
-        moving = calibration.trim(everything, *(plan.motion or (end_s, end_s + ROUTINE_S)))
-        if not all(len(sensor.time_s) for sensor in moving):
-            raise EdgeposeError(
-                f"{source.name}: not all six sensors report during the movements; give their time with "
-                "--motion FROM:TO, or use another --heading-reset"
-            )
+        moving = _movements(source.name, everything, plan, start_s + plan.hold_s)
         reset = calibration.headings_from_motion(moving, summary.orientation)
     return Measured(summary, reset or _mounted(plan, summary), start_s, devices)
+
+
+def _movements(name: str, everything: Hold, plan: CalibrationPlan, hold_end_s: float) -> Hold:
+    """Return the part of a recording with the movements of a heading reset.
+
+    Raises:
+        EdgeposeError: the recording does not contain it, or a sensor reports nothing in it.
+    """
+    span = hold_end_s, hold_end_s + ROUTINE_S
+    if plan.motion is not None:
+        first_s, last_s = _extent(everything)
+        start_s, end_s = (time.on_clock(first_s) for time in plan.motion)
+        span = start_s, end_s
+        if not first_s - 1e-6 <= start_s < end_s <= last_s + END_S:
+            raise EdgeposeError(
+                f"{name}: it does not contain {start_s:g} to {end_s:g} s; it lasts from {first_s:.2f} to "
+                f"{last_s:.2f} s, choose --motion within that"
+            )
+    moving = calibration.trim(everything, *span)
+    if not all(len(sensor.time_s) for sensor in moving):
+        raise EdgeposeError(
+            f"{name}: not all six sensors report during the movements; give their time with "
+            "--motion FROM:TO, or use another --heading-reset"
+        )
+    return moving
 
 
 def _side_by_side(
@@ -224,21 +247,25 @@ def _serial_numbers(sensors: Path | None) -> Mapping[int, str] | None:
 
 
 def _window(
-    name: str, read: tuple[Hold, str | None], from_s: float | None, seconds: float, say: Prompter
+    name: str, read: tuple[Hold, str | None], at: RecordingTime | None, seconds: float, say: Prompter
 ) -> tuple[Hold, float]:
     """Return the hold in a recording, and its start on the recording's clock, seconds."""
     everything, damage = read
     if damage:
         say(f"warning: {damage}")
-    start = calibration.stillest_start(everything, seconds) if from_s is None else from_s
-    first = min((s.time_s[0] for s in everything if len(s.time_s)), default=0.0)
-    last = max((s.time_s[-1] for s in everything if len(s.time_s)), default=0.0)
-    # The last sample is a little earlier than the end.
-    if from_s is not None and not first - 1e-6 <= start <= last - seconds + 0.1:
+    first, last = _extent(everything)
+    start = calibration.stillest_start(everything, seconds) if at is None else at.on_clock(first)
+    if at is not None and not first - 1e-6 <= start <= last - seconds + END_S:
         raise EdgeposeError(
             f"{name}: it does not contain {seconds:g} s from {start:g} s on; it lasts from {first:.2f} to "
             f"{last:.2f} s, choose --from and --hold within that"
         )
-    why = "" if from_s is not None else ", the first of the stillest parts"
+    why = "" if at is not None else ", the first of the stillest parts"
     say(f"{name}: hold from {start:.2f} to {start + seconds:.2f} s{why}.")
     return calibration.trim(everything, start, start + seconds), start
+
+
+def _extent(everything: Hold) -> tuple[float, float]:
+    """Return the times of the first and the last sample of all sensors; 0 if there are none."""
+    times = [sensor.time_s for sensor in everything if len(sensor.time_s)]
+    return min((t.min() for t in times), default=0.0), max((t.max() for t in times), default=0.0)

@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from edgepose import calibration
-from edgepose.calibration import Hold, MovedError, WeakMotionError
+from edgepose.calibration import Hold, HoldError, MovedError, WeakMotionError
 from edgepose.cli.terminal import messages as terminal
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
@@ -46,7 +46,10 @@ class Prompter:
 
     def __call__(self, text: str) -> None:
         """Write one line."""
-        (terminal.say if self.err else terminal.show)(text)
+        if self.err:
+            terminal.say(text)
+        else:
+            terminal.show(terminal.wrapped(text, self.stream))
 
 
 def wait_for_all_sensors(batches: Iterator[Batch], say: Prompter) -> Iterator[Batch]:
@@ -95,10 +98,10 @@ def record_hold(
         countdown_s: time before the hold, seconds.
         hold_s: length of the hold, seconds.
         say: shows prompts.
-        check: evaluates the hold; if it raises MovedError, the hold is repeated.
+        check: evaluates the hold; if it raises HoldError, the hold is repeated.
 
     Raises:
-        MovedError: there was movement in every repetition.
+        HoldError: there was movement, or a silent sensor, in every repetition.
         EdgeposeError: the source ended too early.
     """
     say(_INSTRUCTIONS[pose])
@@ -110,10 +113,10 @@ def record_hold(
         samples = _with_progress(batches, hold_s, say)
         try:
             return check(calibration.hold_from_samples(samples))
-        except MovedError as error:
+        except HoldError as error:
             if not left:
                 raise
-            say(f"Not still: {error}. Trying again.")
+            say(f"{'Not still: ' if isinstance(error, MovedError) else ''}{error}. Trying again.")
     raise AssertionError("the last repeat returns or raises")
 
 

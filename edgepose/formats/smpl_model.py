@@ -11,6 +11,7 @@ import numpy as np
 from edgepose.errors import FileFormatError
 from edgepose.placements import PLACEMENTS
 from edgepose.skeleton import MAX_HEIGHT, MIN_HEIGHT, PARENTS, Array, Body, default_body
+from edgepose.utils.safe_npz import open_npz
 from edgepose.utils.safe_pickle import InertObject, numbers, read_pickle
 
 _WHAT = "SMPL model file (.npz or .pkl)"
@@ -19,8 +20,8 @@ _ADVICE = (
     "arrays as .npz"
 )
 SPARSE = ("csc_matrix", "csr_matrix", "csc_array", "csr_array")
-MIN_BONE = 0.005
-"""Shortest believable distance between a joint and its parent, metres."""
+MIN_BONE, MAX_BONE = 0.005, 1.0
+"""Shortest and longest believable distance between a joint and its parent, metres."""
 
 
 # --- arrays -------------------------------------------------------------------------------------------------
@@ -138,13 +139,20 @@ def read_smpl(path: str | Path) -> Body:
     joints = _joints(model, vertices, path)
     offsets = np.zeros_like(joints)
     offsets[1:] = joints[1:] - joints[list(PARENTS[1:])]
+    far = np.abs(offsets).max(axis=1) > MAX_BONE
+    if far.any():
+        raise FileFormatError(
+            f"{path}: joint {int(np.argmax(far))} is more than {MAX_BONE:g} m from its parent; SMPL "
+            "models are in metres"
+        )
     sensors, height = _sensors(offsets)
     if vertices is not None:
         height = float(np.ptp(vertices[:, 1]))
     if not MIN_HEIGHT <= height <= MAX_HEIGHT:
         raise FileFormatError(f"{path}: the body is {height:.3g} m tall; SMPL models are in metres with Y up")
-    if np.any(np.linalg.norm(offsets[1:], axis=1) < MIN_BONE):
-        joint = 1 + int(np.argmin(np.linalg.norm(offsets[1:], axis=1)))
+    lengths = np.linalg.norm(offsets[1:], axis=1)
+    if np.any(lengths < MIN_BONE):
+        joint = 1 + int(np.argmin(lengths))
         raise FileFormatError(f"{path}: joint {joint} coincides with its parent; these are not SMPL's joints")
     return Body(offsets, sensors, height)
 
@@ -152,7 +160,7 @@ def read_smpl(path: str | Path) -> Body:
 def _read_npz(path: Path) -> dict[Any, Any]:
     wanted = ("J", "J_regressor", "v_template", "kintree_table")
     try:
-        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+        with open_npz(path) as file:
             # With J in the file the regressor, which may be a pickled sparse matrix, is not needed.
             names = [
                 name
@@ -160,7 +168,7 @@ def _read_npz(path: Path) -> dict[Any, Any]:
                 if name in file.files and not (name == "J_regressor" and "J" in file.files)
             ]
             return {name: file[name] for name in names}
-    except OSError:
+    except (OSError, FileFormatError):
         raise
     except Exception as error:  # a broken archive can raise any exception
         reason = str(error).partition("\n")[0]

@@ -81,7 +81,7 @@ class OpenWearer:
             EdgeposeError: an output cannot be written to.
         """
         with prefix_errors(self._config.name):
-            self._sinks = open_outputs(stack, self._config.outputs, rate, stopped)
+            self._sinks = open_outputs(stack, self._config.outputs, rate, stopped, wearer=self._config.name)
 
     def pipeline(
         self, rate: float, future: int, several: bool, on_pose: Callable[[RunSummary], None]

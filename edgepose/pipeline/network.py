@@ -102,6 +102,12 @@ class Network:
 
         return self.config.online == "window" and is_windowed(self.info.metadata)
 
+    @property
+    def faster(self) -> list[str]:
+        """Flags of `edgepose run`, not in use yet, with which the poses take less time."""
+        flags = ["--online stream"] if self.windowed else []
+        return flags if self.kind == "rnn" else [*flags, "--model rnn"]
+
     def load(
         self, wearers: Sequence[WearerConfig], notify: Callable[[str], None]
     ) -> tuple[Engine | MultiWearerEngine, str]:

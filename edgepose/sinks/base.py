@@ -76,6 +76,7 @@ class SinkContext(NamedTuple):
         translation: poses have a translation.
         overwrite: replace existing files.
         stopped: whether the run is to end; a reader that has stopped reading is then not waited for.
+        wearer: the wearer's name, for messages; empty for a single wearer.
     """
 
     body: Body
@@ -86,6 +87,7 @@ class SinkContext(NamedTuple):
     translation: bool = False
     overwrite: bool = False
     stopped: Callable[[], bool] = lambda: False
+    wearer: str = ""
 
 
 SinkFactory = Callable[[Any, SinkContext], Sink]

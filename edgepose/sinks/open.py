@@ -21,6 +21,7 @@ def open_outputs(
     *,
     body: Body | None = None,
     translation: bool = False,
+    wearer: str = "",
 ) -> list[Sink]:
     """Open the sinks of one wearer. No file appears or is replaced before all of them are open.
 
@@ -31,6 +32,7 @@ def open_outputs(
         stopped: whether the run is to end, see `SinkContext`.
         body: the wearer's body; None for the default body of the configured height.
         translation: every pose has a translation.
+        wearer: the wearer's name, for messages.
 
     Returns:
         The sinks in the order in which each pose should be written to them.
@@ -48,6 +50,7 @@ def open_outputs(
         translation=translation,
         overwrite=outputs.overwrite,
         stopped=stopped,
+        wearer=wearer,
     )
     targets = sorted(outputs.targets, key=_rank)
     sinks = [stack.enter_context(sink_factory(name)(target, context)) for name, target in targets]

@@ -11,17 +11,21 @@ from edgepose.formats.recordings.registry import read_sensors
 from edgepose.imu import Recording
 from edgepose.placements import PLACEMENTS, SITES
 from edgepose.sip.measurements import SensorMount, mounts, mounts_from_hold
+from edgepose.sources.replay import is_recording
+from edgepose.sources.whole_file import read_file
 
 DEFAULT_HOLD_S = 4.0
 
 
 def read(path: Path, calibration: Calibration) -> Recording:
-    """Read a recording of any sensors of SITES, with orientations from the calibration's filter.
+    """Read the sensors of a file, any of SITES, with orientations from the calibration's filter.
+
+    Raw captures and logs of CAN buses hold the six placements; their protocol is detected.
 
     Raises:
         EdgeposeError: no such recording, or it allows no orientations.
     """
-    recording = read_sensors(path, tuple(SITES))
+    recording = read_sensors(path, tuple(SITES)) if is_recording(path) else read_file(path)
     if not recording.sensors:
         raise EdgeposeError(f"{path}: the recording has no samples")
     if calibration.filter == "none":

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from edgepose import rotations as rot
 from edgepose.calibration import GRAVITY, POSES, Calibration
+from edgepose.calibration.checks import GAP_LIMIT_S
 from edgepose.errors import EdgeposeError
 from edgepose.imu import GAP_S, Recording, SensorData
 from edgepose.placements import PLACEMENTS, SITES
@@ -95,11 +96,14 @@ def mounts_from_hold(
     for name in names:
         data = recording.sensors[name]
         times, quats = _oriented(name, data)
-        inside = quats[(times >= start_s) & (times < end_s)]
-        if len(inside) < _LEAST_HOLD:
+        held = (times >= start_s) & (times < end_s)
+        inside = quats[held]
+        longest_gap_s = np.diff(np.concatenate([[start_s], np.sort(times[held]), [end_s]])).max()
+        if len(inside) < _LEAST_HOLD or longest_gap_s > GAP_LIMIT_S:
             raise EdgeposeError(
-                f"{name}: {len(inside)} orientations from {start_s:g} to {end_s:g} s; say with --hold-from "
-                "when the wearer holds the calibration's pose"
+                f"{name}: {len(inside)} orientations from {start_s:g} to {end_s:g} s, at most "
+                f"{longest_gap_s:.1f} s apart; say with --hold-from when the wearer holds the calibration's "
+                "pose"
             )
         r_is = rot.quat_to_matrix(rot.mean_rotation(inside))
         found[name] = SensorMount(r_ti, rot.transpose(_held_bone(calibration.pose, name)) @ r_ti @ r_is)

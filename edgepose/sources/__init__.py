@@ -99,6 +99,10 @@ class Source(AbstractContextManager["Source"], Protocol):
         """Devices that have sent samples so far, by placement; empty for recordings."""
 
     @property
+    def metadata(self) -> Mapping[str, str]:
+        """Facts about the input that its file states, such as when it was started; empty if it is live."""
+
+    @property
     def damage(self) -> str | None:
         """One line for the user if part of the input was bad although the rest of it was delivered."""
 

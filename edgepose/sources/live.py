@@ -111,6 +111,11 @@ class LiveSource:
         }
 
     @property
+    def metadata(self) -> Mapping[str, str]:
+        """Always empty: what arrives says nothing about itself."""
+        return {}
+
+    @property
     def damage(self) -> str | None:
         """Always None: problems are reported when they happen."""
         return None

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from math import inf
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Protocol
 
 from edgepose.errors import EdgeposeError
@@ -52,6 +52,7 @@ class LogSource:
         make_decoder: Callable[[str], LineDecoder],
         clocks: RestartCounts,
         blocking: bool = True,
+        metadata: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         """Store the settings; iteration opens the file.
 
@@ -62,7 +63,9 @@ class LogSource:
             make_decoder: makes the decoder of a line, given its name.
             clocks: of the devices in the file.
             blocking: see `open_source`.
+            metadata: see `Source.metadata`.
         """
+        self.metadata = metadata
         self._path = path
         self._realtime, self._blocking = realtime, blocking
         self._read_chunks = read_chunks

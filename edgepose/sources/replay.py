@@ -14,7 +14,7 @@ from types import TracebackType
 from edgepose.errors import EdgeposeError
 from edgepose.formats.ledger import Ledger
 from edgepose.formats.recordings.base import iter_samples
-from edgepose.formats.recordings.raw_capture import read_capture
+from edgepose.formats.recordings.raw_capture import capture_metadata, read_capture
 from edgepose.formats.recordings.registry import (
     find_format,
     read_recording,
@@ -97,6 +97,11 @@ class RecordingSource:
         return {}
 
     @property
+    def metadata(self) -> Mapping[str, str]:
+        """Metadata of the recording."""
+        return {} if self._recording is None else self._recording.metadata
+
+    @property
     def damage(self) -> str | None:
         """Description of the bad part of the file; the rest of it is delivered."""
         return self._recording.damage if self._recording else None
@@ -153,7 +158,9 @@ def open_file(
     if path.suffix.lower() in CAPTURES or (named is not None and named.transport == "bytes"):
         protocols = candidate_protocols(protocol, "bytes", live=False)
         make_decoder = _decoder_factory(path, protocols, sensor_map, clocks.capture)
-        return LogSource(path, realtime, _read_capture, make_decoder, clocks, blocking)
+        return LogSource(
+            path, realtime, _read_capture, make_decoder, clocks, blocking, capture_metadata(path)
+        )
     if not path.suffix and not path.exists():
         raise EdgeposeError(f"{path}: no such file or folder")
     if path.suffix.lower() in FOREIGN:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.lib.npyio import NpzFile
+from numpy.typing import NDArray
 
 from edgepose.errors import FileFormatError
 
@@ -62,8 +64,32 @@ def member_names(path: Path) -> set[str]:
         return set(archive.namelist())
 
 
+class Arrays(Mapping[str, NDArray[Any]]):
+    """The arrays of an open file by name; a member that is none raises ValueError when it is accessed."""
+
+    def __init__(self, file: NpzFile) -> None:
+        """Wrap a file that numpy has opened."""
+        self._file = file
+        self.files = file.files
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """Unpack an array."""
+        array = self._file[name]
+        if not isinstance(array, np.ndarray):  # numpy returns the bytes of other members
+            raise ValueError(f"{name!r} is not an array")
+        return array
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the names."""
+        return iter(self.files)
+
+    def __len__(self) -> int:
+        """Return the number of members."""
+        return len(self.files)
+
+
 @contextmanager
-def open_npz(path: Path) -> Iterator[NpzFile]:
+def open_npz(path: Path) -> Iterator[Arrays]:
     """Open a file for reading arrays, which are unpacked on access.
 
     Raises:
@@ -78,4 +104,4 @@ def open_npz(path: Path) -> Iterator[NpzFile]:
             check_size(path, sum(member.file_size for member in archive.infolist()))
         file.seek(0)
         with np.load(file, allow_pickle=False) as arrays:
-            yield arrays
+            yield Arrays(arrays)

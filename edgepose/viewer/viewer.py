@@ -12,7 +12,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import redirect_stdout, suppress
+from contextlib import redirect_stdout
 from typing import Any
 
 import numpy as np
@@ -107,15 +107,20 @@ def sensor_table(held: NDArray[np.bool_], rate: float) -> str:
 
 
 class Viewer:
-    """A page with a scene, controls and a text, served from construction until `close`."""
+    """A page with a scene, controls and a text, served from construction until `close`.
 
-    def __init__(self, host: str, port: int, body: Body) -> None:
+    Attributes:
+        port: TCP port of the page.
+    """
+
+    def __init__(self, host: str, port: int, body: Body, next_free: bool = False) -> None:
         """Serve the page.
 
         Args:
             host: address of this machine for browsers.
             port: TCP port.
             body: of the figures.
+            next_free: use the next free port if this one is taken.
 
         Raises:
             EdgeposeError: viser is not installed, or the port is taken.
@@ -126,10 +131,11 @@ class Viewer:
             raise EdgeposeError(
                 "the viewer needs viser: install it with pip install 'edgepose[view]'"
             ) from error
-        _check_free(host, port)
+        _check_free(host, 0 if next_free else port)
         # viser prints a greeting to standard output, which belongs to the caller.
         with redirect_stdout(io.StringIO()):
             self._server: Any = viser.ViserServer(host=host, port=port, label="edgepose", verbose=False)
+        self.port: int = self._server.get_port()  # viser takes the next free one
         self._body = body
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
         self._server.scene.set_up_direction("+y")
@@ -331,17 +337,8 @@ def _grounded_positions(poses: PoseSequence, body: Body) -> Array | None:
     return poses.translation - [poses.translation[0, 0], lowest, poses.translation[0, 2]]
 
 
-def free_port(host: str, first: int, count: int = 20) -> int:
-    """Return the first port from `first` on that can be used; `first` if none of `count` can."""
-    for port in range(first, first + count):
-        with suppress(EdgeposeError):
-            _check_free(host, port)
-            return port
-    return first
-
-
 def _check_free(host: str, port: int) -> None:
-    """Raise if the port cannot be used; viser would silently take the next free one."""
+    """Raise EdgeposeError if no page can be served there; 0 stands for any port."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         socket.create_server((host, port), family=family).close()

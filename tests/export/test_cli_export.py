@@ -155,6 +155,32 @@ def test_metadata(made):
     json.loads(text, parse_constant=lambda name: pytest.fail(name))
 
 
+def test_a_folder_without_held_out_takes(made, tmp_path):
+    """One's own recordings have other names: `train` takes every tenth for validation."""
+    folder, _, _ = made
+    take = folder / "recordings" / "07_01.npz"
+    for name in ("monday", "tuesday"):
+        (tmp_path / "own").mkdir(exist_ok=True)
+        (tmp_path / "own" / f"{name}.npz").write_bytes(take.read_bytes())
+    to = ("export", folder / "run" / "best.pt", "--out", tmp_path / "a.pt")
+    said = edgepose(*to, "--measure", tmp_path / "own")
+    assert "has no recordings of cmu-walk-run, cmu-02, bandai-styles; measuring on validation" in said.stderr
+    assert set(archive.read_info(tmp_path / "a.pt").metadata["measures"]) == {"validation"}
+    assert "### validation" in (tmp_path / "a.md").read_text()
+    said = edgepose("evaluate", "--model", "rnn-cmu", "--data", tmp_path / "own")
+    assert "measuring on validation" in said.stderr
+    assert said.stdout.startswith("\nvalidation\n")
+
+
+def test_a_held_out_part_that_is_missing_is_named(made, tmp_path):
+    folder, _, _ = made
+    take = folder / "recordings" / "07_01.npz"
+    (tmp_path / "07_01.npz").write_bytes(take.read_bytes())
+    said = edgepose("evaluate", "--model", "rnn-cmu", "--data", tmp_path)
+    assert "has no recordings of cmu-02, bandai-styles; measuring on cmu-walk-run" in said.stderr
+    assert said.stdout.startswith("\ncmu-walk-run\n")
+
+
 def test_card(made):
     folder, _, _ = made
     card = (folder / "new" / "tiny.md").read_text(encoding="utf-8")
@@ -178,6 +204,10 @@ def test_card(made):
         "edgepose export",
     ):
         assert text in card
+    # The recipe is the one that was followed, not that of the shipped models.
+    assert "edgepose train --config CONFIG --data RECORDINGS --out RUN\n" in card
+    assert "--out tiny.pt --past 20 --future 5 --measure RECORDINGS\n" in card
+    assert "cgspeed" not in card
     mean, deviation, frames = about["measures"]["cmu-02"]["offline, whole take"]["sip_error_deg"]
     row = next(line for line in card.split("### cmu-02")[1].splitlines() if "offline" in line)
     assert row.startswith(f"| offline, whole take | {mean:.2f} ± {deviation:.2f} |")

@@ -1,13 +1,15 @@
 import logging
 import os
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from firmware_protocols import registry
 from firmware_protocols.base import Decoder, Protocol
-from firmware_protocols.registry import PROTOCOLS
+from firmware_protocols.registry import PROTOCOLS, protocol_names
 from firmware_protocols.sample import Sample
 
 
@@ -204,3 +206,27 @@ def test_the_help_names_formats_of_other_packages_without_importing_them(install
         "print('boots' in text, 'boots_protocol' in sys.modules)"
     )
     assert printed_by(script) == "True False\n"
+
+
+def test_protocols_that_the_documentation_names():
+    """A name behind --protocol, or in the column of that name, is one that the command line knows."""
+    root = Path(__file__).parents[2]
+    pages = [root / "README.md", *(root / "docs").rglob("*.md"), *(root / "firmware_protocols").rglob("*.md")]
+    named = set()
+    for page in pages:
+        text = page.read_text(encoding="utf-8")
+        found = re.findall(r"--protocol[ =]([a-z][\w./-]*)|^protocol = \"(.*?)\"", text, re.MULTILINE)
+        named |= {one or other for one, other in found}
+        for head, *rows in _tables(text):
+            if "`--protocol`" in head:
+                cells = [row[head.index("`--protocol`")] for row in rows[1:]]
+                named |= {name for cell in cells for name in re.findall("`([^`]+)`", cell)}
+    named = {name for name in named if not name.endswith(".toml")}
+    assert {"xsens", "openlog-dmp", "auto"} <= named
+    assert named <= {*protocol_names(), "auto"}
+
+
+def _tables(text):
+    """The tables of a page, as rows of cells."""
+    for table in re.findall(r"(?:^\|.*\|\n)+", text, re.MULTILINE):
+        yield [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from edgepose.cli.terminal.messages import say, show
+from edgepose.cli.terminal.messages import has_terminal, progress_bar, say, show
 
 if TYPE_CHECKING:
     from edgepose.benchmarks.filter_comparison import Score
@@ -151,11 +150,11 @@ def orientation(data: Path, as_json: bool) -> None:
 
 def _with_progress(trials: Iterable[list[Score]], count: int) -> Iterator[list[Score]]:
     """Yield the scores of each trial, and show a progress bar on a terminal, a line per trial elsewhere."""
-    if sys.stderr.isatty():
-        with click.progressbar(
-            trials, length=count, label="Filtering", file=sys.stderr, show_pos=True
-        ) as bar:
-            yield from bar
+    if has_terminal():
+        with progress_bar(count, "Filtering") as bar:
+            for scores in trials:
+                yield scores
+                bar.update(1)
         return
     for number, scores in enumerate(trials, start=1):
         yield scores

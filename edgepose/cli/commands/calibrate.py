@@ -24,6 +24,7 @@ from edgepose.cli.calibration_session import (
 )
 from edgepose.cli.options.gathered import gathered
 from edgepose.cli.options.outputs import check_files, overwrite_option
+from edgepose.cli.options.recording_time import RecordingTime, RecordingTimeType
 from edgepose.cli.options.source import filter_options, source_options
 from edgepose.cli.prompts import Prompter
 from edgepose.cli.terminal import messages as terminal
@@ -49,15 +50,17 @@ def _heading_reset(ctx: click.Context, param: click.Parameter, value: str | None
     return value
 
 
-def _span(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[float, float] | None:
+def _span(
+    ctx: click.Context, param: click.Parameter, value: str | None
+) -> tuple[RecordingTime, RecordingTime] | None:
     if value is None:
         return None
-    try:
-        start, end = map(float, value.split(":"))
-    except ValueError:
-        start = end = math.nan
-    if not -math.inf < start < end < math.inf:
+    parts = value.split(":")
+    if len(parts) != 2:
         raise click.BadParameter(f"{value!r} is not FROM:TO, two times in seconds such as 12.5:40")
+    start, end = (RecordingTimeType().convert(part, param, ctx) for part in parts)
+    if start.since_start == end.since_start and start.seconds >= end.seconds:
+        raise click.BadParameter(f"{value!r} is not FROM:TO, its end is not after its start")
     return start, end
 
 
@@ -93,7 +96,8 @@ _PLAN_FLAGS = [
         callback=_span,
         metavar="FROM:TO",
         help="Start and end of the movements for --heading-reset motion on the clock of --file, "
-        f"seconds.  [default: up to {ROUTINE_S:g} s from the end of the hold on]",
+        f"seconds; with a plus sign, since its start.  [default: up to {ROUTINE_S:g} s from the end of the "
+        "hold on]",
     ),
     click.option(
         "--hold",
@@ -105,9 +109,11 @@ _PLAN_FLAGS = [
     ),
     click.option(
         "--from",
-        "from_s",
-        type=float,
-        help="Start of the hold on the clock of --file, seconds.  [default: the first of the stillest parts]",
+        "start",
+        type=RecordingTimeType(),
+        metavar="[+]SECONDS",
+        help="Start of the hold on the clock of --file, seconds; with a plus sign, since its start.  "
+        "[default: the first of the stillest parts]",
     ),
     click.option(
         "--countdown",
@@ -151,7 +157,7 @@ def calibrate(
       edgepose calibrate --port /dev/ttyUSB0
       edgepose calibrate --port COM3 --filter kalman --heading-reset motion
       edgepose calibrate --sensors rig.toml --pose t-pose
-      edgepose calibrate --file walk.csv --from 2.5 --body-frame heading:0
+      edgepose calibrate --file walk.csv --from +2.5 --body-frame heading:0
     """
     _check_use(source, plan)
     inputs = {"--file": source.file, "--sensors": source.sensors, "--heading-reset": plan.side_by_side}
@@ -192,8 +198,8 @@ def calibrate(
 
 def _check_use(source: SourceConfig, plan: CalibrationPlan) -> None:
     """Raise click.UsageError if flags exclude each other."""
-    if source.live and (plan.from_s is not None or plan.motion is not None):
-        flag = "--motion" if plan.from_s is None else "--from"
+    if source.live and (plan.start is not None or plan.motion is not None):
+        flag = "--motion" if plan.start is None else "--from"
         raise click.UsageError(f"{flag} needs a recording that is read at once: --file without --realtime")
     if plan.heading_reset == "live" and not source.live:
         raise click.UsageError(

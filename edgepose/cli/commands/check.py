@@ -77,7 +77,9 @@ class State(NamedTuple):
 def check(
     ctx: click.Context, source: SourceConfig, seconds: float | None, calibration: Path | None, as_json: bool
 ) -> None:
-    """Show the health of each sensor, and how to fix problems. docs/guide/check.md explains the findings.
+    """Show the health of each sensor, and how to fix problems.
+
+    docs/guide/check.md in the repository explains the findings.
 
     The sensors may lie on a table or be worn. Hold them still for some seconds: gravity, noise and bias only
     show at rest. Then turn each one to and fro: gyroscope and orientation can only be compared in motion.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +10,7 @@ import click
 
 from edgepose.cli.options.outputs import overwrite_option
 from edgepose.cli.options.source import protocol_option, sensors_option
-from edgepose.cli.terminal.messages import printable, say, show
+from edgepose.cli.terminal.messages import has_terminal, printable, progress_bar, say, show
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.registry import READERS as POSES
 from edgepose.formats.recordings.registry import READERS as RECORDINGS
@@ -118,7 +117,7 @@ def convert(
     failed = sum(result.problem is not None for result in done.values())
     if failed:
         raise EdgeposeError(
-            f"{failed} of {len(planned)} recordings not converted, or only in part; see the table"
+            f"{failed} of {len(planned)} recordings not converted, or only in part; see the messages above"
         )
 
 
@@ -138,28 +137,28 @@ def _check_targets(jobs: Sequence[Job], to: str, overwrite: bool) -> None:
 
 
 def _with_progress(results: Iterable[Result], count: int) -> Iterator[Result]:
-    """Yield the results, and show a progress bar on a terminal, a line per result elsewhere."""
+    """Yield the results, and show a bar and problems on a terminal, a line per result elsewhere."""
     from edgepose.convert import describe
 
-    if sys.stderr.isatty():
-        with click.progressbar(length=count, label="Converting", file=sys.stderr, show_pos=True) as bar:
-            for result in results:
-                yield result
-                bar.update(1)
-        return
-    for number, result in enumerate(results, start=1):
-        yield result  # before the line, so that after Ctrl-C the table has every result that was shown
-        say(_one_line(f"{number} of {count}  {result.job.source}: {describe(result)}"))
+    with progress_bar(count, "Converting") as bar:
+        for number, result in enumerate(results, start=1):
+            yield result  # before its line, so that after Ctrl-C the table has every result that was shown
+            line = f"{result.job.source}: {describe(result)}"
+            if not has_terminal():
+                say(_one_line(f"{number} of {count}  {line}"))
+            elif result.problem is not None:
+                say(_one_line(line))
+            bar.update(1)
 
 
 def _table(results: Sequence[Result]) -> str:
-    from edgepose.convert import describe
+    from edgepose.convert import outcome
 
     width = max([len("file"), *(len(str(result.job.source)) for result in results)])
     lines = [f"{'file':{width}}  {'samples':>9}  {'seconds':>9}  result"]
     for result in results:
         counts = f"{result.samples:9d}  {result.seconds:9.1f}" if result.samples else f"{'-':>9}  {'-':>9}"
-        lines.append(_one_line(f"{result.job.source!s:{width}}  {counts}  {describe(result)}"))
+        lines.append(_one_line(f"{result.job.source!s:{width}}  {counts}  {outcome(result)}"))
     return "\n".join(lines)
 
 

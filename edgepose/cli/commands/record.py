@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from datetime import datetime, timezone
 from math import inf
@@ -65,7 +65,7 @@ def record(source: SourceConfig, out: str, seconds: float | None, overwrite: boo
         recorder.check_free(out, overwrite)
         opened = stack.enter_context(open_source(**source.arguments()))
         stop = stack.enter_context(StopSignal())
-        output = recorder.open_output(out, _metadata(source), overwrite)
+        output = recorder.open_output(out, _metadata(source, opened.metadata), overwrite)
         say(f"recording to {out}; Ctrl-C ends it. Sample counts are in the order {', '.join(PLACEMENTS)}")
         summary = recorder.record(
             opened,
@@ -81,15 +81,13 @@ def record(source: SourceConfig, out: str, seconds: float | None, overwrite: boo
         raise EdgeposeError(opened.damage)
 
 
-def _metadata(source: SourceConfig) -> dict[str, str]:
-    return {
-        "program": f"edgepose {__version__}",
-        "source": source.name,
-        "protocol": source.protocol,
-        "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "frame": "Z up",
-        "units": "s, m/s^2, rad/s, uT",
-    }
+def _metadata(source: SourceConfig, of_file: Mapping[str, str]) -> dict[str, str]:
+    """Return the metadata of a recording; what the file that is read says of itself is kept."""
+    written = {"program": f"edgepose {__version__}", "frame": "Z up", "units": "s, m/s^2, rad/s, uT"}
+    about = {"source": source.name, "protocol": source.protocol}
+    if source.file is not None:
+        return {**about, **of_file, **written}
+    return {**about, "started": datetime.now(timezone.utc).isoformat(timespec="seconds"), **written}
 
 
 def _progress(source: Source) -> Callable[[RecordSummary], None]:

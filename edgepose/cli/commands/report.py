@@ -36,7 +36,7 @@ def report(poses: Path, out: Path | None, height: float, overwrite: bool) -> Non
     \b
     Examples:
       edgepose report poses.csv
-      edgepose report walk.npz --out walk.html --height 1.68
+      edgepose report poses.npz --out anna.html --height 1.68
     """
     from edgepose.analysis.report import write_report
     from edgepose.formats.poses.registry import read_poses

@@ -64,7 +64,7 @@ def run(wearers: list[WearerConfig], settings: NetworkConfig) -> None:
         for wearer in opened:
             wearer.open_outputs(stack, network.rate_hz, lambda: stop.asked)
         say(_headline(network, precision, len(wearers), keys.listening))
-        pipelines = run_wearers(opened, engine, network, live, lambda: stop.asked, _progress())
+        pipelines = run_wearers(opened, engine, network, live, lambda: stop.asked, _progress(network))
     end_status()
     report_wearers(wearers, opened, pipelines, network)
 
@@ -79,7 +79,7 @@ def _headline(network: Network, precision: str, wearer_count: int, has_keys: boo
     )
 
 
-def _progress() -> Callable[[RunSummary], None]:
+def _progress(network: Network) -> Callable[[RunSummary], None]:
     """Return a callback that updates one line on a terminal; elsewhere it writes a line every 10 s."""
     every_s = 1.0 if has_terminal() else 10.0
     shown_s, poses, warned = time.monotonic(), 0, False
@@ -90,8 +90,8 @@ def _progress() -> Callable[[RunSummary], None]:
         if summary.backlog_s > BEHIND_S and not warned:
             warned = True
             say(
-                f"this machine does not keep up: poses are "
-                f"{summary.backlog_s:.1f} s late; use --model rnn, --online stream, or end other programs"
+                f"this machine does not keep up: poses are {summary.backlog_s:.1f} s late; "
+                f"{''.join(f'use {flag}, or ' for flag in network.faster)}end other programs"
             )
         if now_s - shown_s >= every_s:
             rate = (summary.poses - poses) / (now_s - shown_s)

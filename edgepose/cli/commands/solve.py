@@ -14,6 +14,7 @@ import click
 from edgepose.cli.options.body import BodyFlags, body_options
 from edgepose.cli.options.gathered import gathered
 from edgepose.cli.options.outputs import check_files, file_output_options
+from edgepose.cli.options.recording_time import RecordingTime, RecordingTimeType
 from edgepose.cli.terminal.messages import end_status, has_terminal, say, status
 from edgepose.config import OutputConfig
 from edgepose.errors import EdgeposeError
@@ -55,7 +56,7 @@ class SolverFlags:
     method: Method
     weights: Weights
     prior: Path | None
-    hold_from: float | None
+    hold_from: RecordingTime | None
     rate: float
     evaluations: int
     jobs: int
@@ -79,9 +80,11 @@ def _solver_options(command: Callable[..., Any]) -> Callable[..., Any]:
         ),
         click.option(
             "--hold-from",
-            type=float,
-            help="Start of a hold of the calibration's pose on the clock of IN, seconds; required with "
-            "sensors other than the six.  [default: as calibrated, if from this file]",
+            type=RecordingTimeType(),
+            metavar="[+]SECONDS",
+            help="Start of a hold of the calibration's pose on the clock of IN, seconds; with a plus sign, "
+            "since its start. Required with sensors other than the six.  "
+            "[default: as calibrated, if from this file]",
         ),
         click.option(
             "--rate",
@@ -229,7 +232,9 @@ def _measure(path: Path, calibration_path: Path, solver: SolverFlags) -> tuple[M
     data = read(path, calibration)
     if solver.method == "sip" and all(sensor.acc is None for sensor in data.sensors.values()):
         raise EdgeposeError(f"{path}: no sensor has accelerations, which sip needs; use --method sop")
-    mounts = mounted(path, data, calibration, solver.hold_from)
+    first_s = min(float(sensor.time_s[0]) for sensor in data.sensors.values())
+    hold_from_s = None if solver.hold_from is None else solver.hold_from.on_clock(first_s)
+    mounts = mounted(path, data, calibration, hold_from_s)
     return measure(data, mounts, solver.rate), data.damage
 
 

@@ -85,12 +85,11 @@ def view(
 
 def _open(host: str, port: int, body: Body, for_run: bool = False) -> Viewer:
     """Open the page; for `edgepose run`, which has no flag for its port, on the next one that is free."""
-    from edgepose.viewer.viewer import Viewer, free_port
+    from edgepose.viewer.viewer import Viewer
 
-    port = free_port(host, port) if for_run else port
-    viewer = Viewer(host, port, body)
+    viewer = Viewer(host, port, body, next_free=for_run)
     name = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
-    say(f"open http://{name}:{port} in a browser" + ("" if for_run else "; Ctrl-C ends the view"))
+    say(f"open http://{name}:{viewer.port} in a browser" + ("" if for_run else "; Ctrl-C ends the view"))
     return viewer
 
 

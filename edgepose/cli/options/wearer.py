@@ -58,7 +58,7 @@ def wearer_options(command: click.Command) -> click.Command:
         metavar="FILE",
         type=click.Path(path_type=Path),
         help="TOML file whose keys are the flags of one wearer; repeat it for several wearers, who share the "
-        "network. See docs/guide/sensors.md.",
+        "network. See docs/guide/sensors.md in the repository.",
     )
     run = command.callback
     assert run is not None

@@ -11,6 +11,10 @@ import os
 import select
 import stat
 import sys
+import textwrap
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import IO, Any
 
 import click
@@ -18,7 +22,12 @@ import click
 _WAIT_MS = 1000
 """Longest wait for a slow reader of standard error, milliseconds."""
 
+_LEAST_COLUMNS = 20
+"""Narrowest terminal that messages are fitted into; some report a width of 0."""
+
 _status = False  # whether the cursor stands at the end of a status line
+_bar = False  # whether a progress bar is shown, which is drawn again below a message
+_lock = threading.RLock()  # threads of outputs write messages, too
 
 
 def printable(text: str) -> str:
@@ -27,10 +36,42 @@ def printable(text: str) -> str:
 
 
 def say(text: str) -> None:
-    """Write a message to standard error, over the status line if there is one."""
+    """Write a message to standard error, over the status line or progress bar if there is one."""
     global _status
-    click.echo(("\r\033[K" if _status else "") + printable(text), err=True)
-    _status = False
+    with _lock:
+        click.echo(("\r\033[K" if _status or _bar else "") + wrapped(printable(text), sys.stderr), err=True)
+        _status = False
+
+
+def wrapped(text: str, stream: IO[str]) -> str:
+    """Return text whose lines fit the terminal of a stream, broken between words; unchanged elsewhere."""
+    columns = _columns(stream)
+    if columns is None:
+        return text
+    return "\n".join(piece for line in text.split("\n") for piece in _pieces(line, columns))
+
+
+def _pieces(line: str, columns: int) -> list[str]:
+    if len(line) <= columns:
+        return [line]
+    return textwrap.wrap(
+        line,
+        columns,
+        subsequent_indent="  ",
+        replace_whitespace=False,
+        break_long_words=False,  # names and addresses stay whole, so that they can be copied
+        break_on_hyphens=False,
+    )
+
+
+def _columns(stream: IO[str]) -> int | None:
+    """Return the width of the terminal that a stream leads to; None if it leads elsewhere."""
+    if not stream.isatty():
+        return None
+    try:
+        return max(_LEAST_COLUMNS, os.get_terminal_size(stream.fileno()).columns or 80)
+    except OSError:  # the terminal is gone
+        return None
 
 
 def show(text: str) -> None:
@@ -42,26 +83,44 @@ def show(text: str) -> None:
 def status(text: str) -> None:
     """Show the progress of a command: on a terminal in one status line, elsewhere as a new line."""
     global _status
-    if not has_terminal():
-        click.echo(printable(text), err=True)
-        return
-    columns = max(20, os.get_terminal_size(2).columns or 80)
-    click.echo(f"\r{printable(text)[: columns - 1]}\033[K", nl=False, err=True)
-    _status = True
+    columns = _columns(sys.stderr)
+    with _lock:
+        if columns is None:
+            click.echo(printable(text), err=True)
+            return
+        click.echo(f"\r{printable(text)[: columns - 1]}\033[K", nl=False, err=True)
+        _status = True
 
 
 def end_status() -> None:
     """Keep the status line, if there is one, and continue below it."""
     global _status
-    if _status:
-        click.echo(err=True)
-    _status = False
+    with _lock:
+        if _status:
+            click.echo(err=True)
+        _status = False
 
 
-def clear_bar() -> None:
-    """Make the next message overwrite click's progress bar, which is then drawn again below it."""
-    global _status
-    _status = has_terminal()
+@contextmanager
+def progress_bar(length: int, label: str, hidden: bool = False) -> Iterator[Any]:
+    """Show a progress bar on a terminal, below all messages.
+
+    Args:
+        length: number of steps.
+        label: shown before the bar.
+        hidden: show none.
+
+    Yields:
+        An object with a method `update(steps)`.
+    """
+    global _bar
+    hidden = hidden or not has_terminal()
+    with click.progressbar(length=length, label=label, show_pos=True, file=sys.stderr, hidden=hidden) as bar:
+        _bar = not hidden
+        try:
+            yield bar
+        finally:
+            _bar = False
 
 
 def has_terminal() -> bool:

@@ -7,6 +7,7 @@ walk.bin up to its end. A capture without times, from another program, can be re
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -18,6 +19,7 @@ COLUMNS = "time_s,end"
 """Header of the times."""
 
 _CHUNK = 1 << 16
+_LONGEST_LINE, _MOST_ENTRIES = 1000, 100  # of the metadata
 
 
 class Piece(NamedTuple):
@@ -45,6 +47,16 @@ def times_header(metadata: Mapping[str, str]) -> str:
 def times_row(arrival_s: float, end: int) -> str:
     """Format one line of the arrival times; the time keeps all its digits."""
     return f"{arrival_s!r},{end}\n"
+
+
+def capture_metadata(path: Path) -> dict[str, str]:
+    """Return the metadata of a capture; empty if it has no file of arrival times, or an unreadable one."""
+    metadata: dict[str, str] = {}
+    with contextlib.suppress(OSError), times_path(path).open(encoding="utf-8", errors="replace") as file:
+        while (line := file.readline(_LONGEST_LINE)).startswith("#") and len(metadata) < _MOST_ENTRIES:
+            key, _, value = line[1:].partition(":")
+            metadata[key.strip()] = value.strip()
+    return metadata
 
 
 def read_capture(path: Path) -> Iterator[Piece]:

@@ -71,14 +71,14 @@ def salvage_recording(path: Path | str, ids: Mapping[int, str] | None = None) ->
 
 
 def read_sensors(path: Path | str, names: Sequence[str]) -> Recording:
-    """Read a recording of any of the named sensors, like `read_recording` for the six placements.
+    """Read the good part of a recording of any of the named sensors.
 
     Only CSV and NPZ can contain other sensors than the six.
 
     Raises:
         FileFormatError: it cannot be read, or is not a recording of such sensors.
     """
-    return _read(Path(path), ReadOptions(tuple(names)))
+    return _read(Path(path), ReadOptions(tuple(names), salvage=True))
 
 
 def missing_sensors(recording: Recording) -> list[str]:
@@ -135,6 +135,7 @@ def _read(path: Path, options: ReadOptions) -> Recording:
         format = find_format(path)
         if format is None:
             if path.is_dir():
+                next(path.iterdir(), None)  # raises OSError if it cannot be listed
                 raise FileFormatError(
                     f"{path}: unknown kind of file (Is a directory with no recording in it); give the folder "
                     "that holds the files or folders of all sensors"

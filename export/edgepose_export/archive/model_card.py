@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 from edgepose_export.evaluation.uncertainty import EXPECTED
 from edgepose_export.networks.registry import NETWORKS
+from edgepose_export.training.config import CONFIGS, config_values, read_config
 
 _INPUTS = {
     "root": "in the pelvis frame",
     "tilt": "in the pelvis frame, with the tilt and acceleration of the pelvis itself",
     "heading": "without the heading of the pelvis",
     "sequence": "in the pelvis frame of the first frame",
+}
+
+
+_PARTS = {
+    "cmu-walk-run": "`cmu-walk-run` is CMU subjects 07, 08 and 09",
+    "cmu-02": "`cmu-02` is CMU subject 02 (bending, punching, sword play, washing)",
+    "bandai-styles": "`bandai-styles` is Bandai-Namco's styles exhausted and tired",
+    "validation": "`validation` is the takes by which the end of training was chosen",
 }
 
 
@@ -64,9 +74,8 @@ def _accuracy(metadata: dict[str, Any]) -> list[str]:
         *lines,
         *_deviations(metadata["deviations"]),
         *_precisions(metadata["precisions"]),
-        "The parts: `cmu-walk-run` is CMU subjects 07, 08 and 09; `cmu-02` is CMU subject 02 (bending, "
-        "punching, sword play, washing); `bandai-styles` is Bandai-Namco's styles exhausted and tired. None "
-        "of these takes or styles is in the training set.",
+        f"The parts: {'; '.join(_PARTS[part] for part in metadata['measures'])}. None of these takes or "
+        "styles is in the training set.",
         "",
     ]
 
@@ -74,6 +83,8 @@ def _accuracy(metadata: dict[str, Any]) -> list[str]:
 def _reproduction(metadata: dict[str, Any]) -> list[str]:
     """Return the section with the commands that make the archive."""
     name = metadata["name"]
+    if metadata["training"]["config"] != _shipped_config(name):
+        return _own_reproduction(metadata)
     several = metadata["training"].get("checkpoints", 1) > 1
     with_bandai = "Bandai-Namco" in metadata["training"]["summary"]
     bandai = ", and both Bandai-Namco Research motion datasets" if with_bandai else ""
@@ -94,6 +105,35 @@ def _reproduction(metadata: dict[str, Any]) -> list[str]:
         f"subjects 01, 02, 03, 05 - 09 and a few more takes (cgspeed's conversion){bandai}. The whole "
         "config is in the archive's metadata."
         + (" OTHERS are earlier checkpoints, see docs/research/training-history.md." * several),
+    ]
+
+
+def _shipped_config(name: str) -> dict[str, Any] | None:
+    """Return the config of a shipped model; None if there is none of that name."""
+    path = CONFIGS / f"{name}.toml"
+    # As JSON, like the archive's: tuples become lists.
+    return json.loads(json.dumps(config_values(read_config(path)))) if path.is_file() else None
+
+
+def _own_reproduction(metadata: dict[str, Any]) -> list[str]:
+    """Return the section with the commands for a network of a user's own, as far as they are known."""
+    several = metadata["training"].get("checkpoints", 1) > 1
+    window = f" --past {metadata['past']} --future {metadata['future']}" if metadata["future"] else ""
+    flags = "" if metadata["precision"] == "f32" else f" --precision {metadata['precision']}"
+    flags += " --rounded" * metadata.get("rounded", False) + " --measure RECORDINGS" * bool(
+        metadata["measures"]
+    )
+    return [
+        "## Reproduce",
+        "",
+        "```",
+        "edgepose train --config CONFIG --data RECORDINGS --out RUN",
+        f"edgepose export RUN/checkpoint.pt {'OTHERS ' * several}--out {metadata['name']}.pt{window}{flags}",
+        "```",
+        "",
+        "CONFIG is a TOML file with the config in the archive's metadata; RECORDINGS is a folder of the "
+        "motion data named above, written by `edgepose synthesize`."
+        + (" OTHERS are the checkpoints that were averaged with it." * several),
     ]
 
 

@@ -55,7 +55,8 @@ class _Model(NamedTuple):
     multiple=True,
     type=click.Choice(["cmu-walk-run", "cmu-02", "bandai-styles", "validation", "all", "published"]),
     help="Part of the split; all: every take below --data; published: files of DIP-IMU or TotalCapture as "
-    "downloaded; may be repeated  [default: the three held-out parts]",
+    "downloaded; may be repeated  [default: the three held-out parts, "
+    "or those of them that --data has; else validation]",
 )
 @click.option(
     "--online",
@@ -131,7 +132,6 @@ def evaluate(
     if heat_map and len(names) > 1:
         raise click.UsageError("--heat-map takes one --model")
     from edgepose.analysis.figures import check_picture
-    from edgepose_export.training.splits import HELD_OUT
 
     for picture in (histogram, heat_map, reliability):
         if picture:
@@ -139,13 +139,27 @@ def evaluate(
     models = [_model(name, trust, modes, past, future, table) for name in names]
     if len({model.name for model in models}) < len(models):  # files with the same name in several folders
         models = [model._replace(name=name) for model, name in zip(models, names, strict=True)]
-    chosen = parts or HELD_OUT
+    chosen = parts or default_parts(data)
     if heat_map:
         _heat_map(models[0], data, chosen, every, heat_map, overwrite)
     else:
         _tables(models, data, chosen, baselines, table, histogram, overwrite)
     if reliability:
         _reliability(models, data, chosen, reliability, overwrite)
+
+
+def default_parts(data: Path) -> tuple[str, ...]:
+    """Return the parts to measure of a folder, and say which it lacks.
+
+    Raises:
+        EdgeposeError: it has nothing to measure.
+    """
+    from edgepose_export.training.dataset import measured_parts
+
+    present, lacking = measured_parts(data)
+    if lacking:
+        say(f"{data} has no recordings of {', '.join(lacking)}; measuring on {', '.join(present)}")
+    return tuple(present)
 
 
 def _model(

@@ -16,6 +16,7 @@ from edgepose.inference.quantisation import PRECISIONS
 from edgepose.output_files import check_output
 from edgepose.skeleton import JOINTS
 from edgepose.utils.durable_files import write_whole
+from edgepose_export.cli.evaluate import default_parts
 
 if TYPE_CHECKING:
     import numpy as np
@@ -79,7 +80,8 @@ class _Trained(NamedTuple):
     "data",
     type=click.Path(path_type=Path, exists=True, file_okay=False),
     help="Folder written by `edgepose synthesize`: fit the standard deviations to the errors on its "
-    "validation takes, measure the archive on its held-out takes and add the results to the card.",
+    "validation takes, measure the archive on its held-out takes, or on those for validation if it has none, "
+    "and add the results to the card.",
 )
 @click.option(
     "--beside",
@@ -198,10 +200,9 @@ def _precisions(
     from edgepose_export.cli.progress import labelled
     from edgepose_export.evaluation.evaluate import modes_of
     from edgepose_export.evaluation.quantisation import compare
-    from edgepose_export.training.splits import HELD_OUT
 
     (mode,) = (mode for mode in modes_of(metadata) if mode.name == "stream")
-    return compare(script, data, HELD_OUT, mode, labelled("measuring precisions"))
+    return compare(script, data, metadata["measures"], mode, labelled("measuring precisions"))
 
 
 def _std_scale(module: torch.jit.ScriptModule, metadata: dict[str, Any], data: Path) -> NDArray[np.float64]:
@@ -230,8 +231,8 @@ def _measures(path: Path, data: Path, others: Mapping[str, Archive]) -> dict[str
     from edgepose_export.evaluation import evaluate as evaluation
     from edgepose_export.evaluation.baselines import learn
     from edgepose_export.evaluation.uncertainty import errors_and_deviations, reliability
-    from edgepose_export.training.splits import HELD_OUT
 
+    parts = default_parts(data)
     info = read_info(path)
     module, modes = load(info, trust=True), evaluation.modes_of(info.metadata)
     trained = learn(evaluation.takes_of(data, "train", labelled("training baselines")))
@@ -240,10 +241,10 @@ def _measures(path: Path, data: Path, others: Mapping[str, Archive]) -> dict[str
         streamed = [mode for mode in evaluation.modes_of(about) if mode.name == "stream"]
         for row, method in evaluation.archive_methods(other, streamed).items():
             methods[f"{name}, {row}"] = method
-    columns = evaluation.columns_of_parts(methods, data, HELD_OUT, labelled("measuring"))
+    columns = evaluation.columns_of_parts(methods, data, parts, labelled("measuring"))
     (mode,) = (mode for mode in modes if mode.name == "stream")
     deviations = {}
-    for part in HELD_OUT:
+    for part in parts:
         takes = evaluation.takes_of(data, part, labelled("measuring deviations"))
         result = reliability(*errors_and_deviations(module, info.metadata, takes, mode))
         deviations[part] = {"within": list(result.within), "scale": result.scale, "values": result.values}

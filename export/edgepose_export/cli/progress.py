@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TypeVar
 
-import click
-
-from edgepose.cli.terminal.messages import say
+from edgepose.cli.terminal.messages import has_terminal, progress_bar, say
 
 T = TypeVar("T")
 
@@ -19,9 +16,11 @@ PLAIN_EVERY_S = 10.0
 
 def progress(items: Sequence[T], label: str) -> Iterator[T]:
     """Yield the items and report on stderr how many are done."""
-    if sys.stderr.isatty():
-        with click.progressbar(items, label=label, show_pos=True, file=sys.stderr) as bar:
-            yield from bar
+    if has_terminal():
+        with progress_bar(len(items), label) as bar:
+            for item in items:
+                yield item
+                bar.update(1)
         return
     last = time.monotonic()
     for i, item in enumerate(items):

@@ -20,6 +20,9 @@ from edgepose.utils.output_targets import check_free
 
 KINDS = (".bvh", ".amc", ".npz")
 
+MOST_HOLD_FRAMES = 100_000
+"""Longest time of standing before a motion, samples of a sensor."""
+
 LICENSES = {
     "cmu": "CMU Graphics Lab Motion Capture Database (mocap.cs.cmu.edu, NSF EIA-0196217), free for all use",
     "bandai-namco": "Bandai-Namco Research Motiondataset, CC BY-NC 4.0",
@@ -115,6 +118,10 @@ def synthesize(
     from edgepose.skeleton import default_body
     from edgepose_export.cli.progress import progress
 
+    if hold * rate > MOST_HOLD_FRAMES:
+        raise click.UsageError(
+            f"--hold {hold:g} at --rate {rate:g} takes too much memory: at most {MOST_HOLD_FRAMES} samples"
+        )
     if body_path and height:
         raise click.UsageError("--body sets the height: omit --height")
     body = read_smpl(body_path) if body_path else default_body(height or 1.75)

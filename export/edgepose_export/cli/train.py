@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import click
 
-from edgepose.cli.terminal.messages import clear_bar, say
+from edgepose.cli.terminal.messages import progress_bar, say
 from edgepose.errors import EdgeposeError
-
-CONFIGS = Path(__file__).parent.parent / "training" / "configs"
 
 
 def _config_path(name: str) -> Path:
+    from edgepose_export.training.config import CONFIGS
+
     shipped = CONFIGS / f"{name}.toml"
     return shipped if shipped.is_file() else Path(name)
 
@@ -25,7 +24,8 @@ def _config_path(name: str) -> Path:
     "--config",
     required=True,
     metavar="NAME|FILE",
-    help="Shipped config, such as birnn or dip-rnn (docs/research/training.md lists all), or a TOML file.",
+    help="Shipped config, such as birnn or dip-rnn (docs/research/training.md in the repository lists all), "
+    "or a TOML file.",
 )
 @click.option(
     "--data",
@@ -147,13 +147,11 @@ def _fit(trainer, out: Path, report: Callable[[str], None]) -> None:  # type: ig
         elapsed = time.monotonic() - started
         speed = (step - first) * config.sequences * config.window / elapsed
         left = (config.steps - step) * elapsed / (step - first) / 60
-        clear_bar()
         report(
             f"step {step} of {config.steps}: loss {loss:.4f}, "
             f"validation {validation:.4f}, {speed / 1e3:.1f} k frames/s, {left:.0f} min left"
         )
 
-    hidden = trainer.processes.rank > 0 or not sys.stderr.isatty()
-    with click.progressbar(length=config.steps, label="training", file=sys.stderr, hidden=hidden) as bar:
+    with progress_bar(config.steps, "training", hidden=trainer.processes.rank > 0) as bar:
         bar.update(first)
         fit(trainer, out, lambda step, loss: bar.update(1), report_validation)

@@ -13,6 +13,9 @@ from edgepose_export.networks.registry import NETWORKS
 from edgepose_export.networks.shape import NetworkShape
 from edgepose_export.synthesis.augmentation import Augmentation
 
+CONFIGS = Path(__file__).parent / "configs"
+"""Folder with the configs of the shipped models."""
+
 
 @dataclass(frozen=True)
 class TrainConfig:

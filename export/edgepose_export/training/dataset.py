@@ -20,7 +20,7 @@ from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import PARENTS, forward_kinematics
 from edgepose.utils.safe_npz import BROKEN, open_npz
 from edgepose_export.synthesis.virtual_imus import INERTIAL_FROM_BODY
-from edgepose_export.training.splits import SPLITS, part_of
+from edgepose_export.training.splits import HELD_OUT, SPLITS, part_of
 
 SEATED = ".seated"
 """End of the names of takes with legs made by `edgepose_export.synthesis.sitting`."""
@@ -93,11 +93,18 @@ def read_take(path: Path) -> Take:
 def take_paths(folder: Path, part: str) -> list[Path]:
     """Return the files of one part of the split below a folder, sorted by name; the part "all" is every take.
 
+    If no name belongs to the validation part, as with a user's own recordings, every tenth take for training
+    is used for it.
+
     Raises:
         EdgeposeError: there is no such file.
     """
     takes = sorted(folder.rglob("*.npz"), key=lambda path: path.stem)
     paths = [path for path in takes if part in ("all", part_of(path.stem))]
+    if part in ("train", "validation") and all(part_of(path.stem) != "validation" for path in takes):
+        own = [path for path in takes if part_of(path.stem) == "train"]
+        if len(own) > 1:
+            paths = [path for i, path in enumerate(own) if bool(i % 10) == (part == "train")]
     if paths:
         return paths
     if not takes:
@@ -110,19 +117,35 @@ def take_paths(folder: Path, part: str) -> list[Path]:
 
 
 def training_paths(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Return the files of takes to train on, and of takes for validation.
-
-    If no name belongs to the validation part (with a user's own recordings), every tenth take is used for it.
+    """Return the files of takes to train on, and of takes for validation, see `take_paths`.
 
     Raises:
         EdgeposeError: there are fewer than two takes, or none to train on.
     """
     paths = take_paths(folder, "train")
-    if any(part_of(path.stem) == "validation" for path in folder.rglob("*.npz")):
+    try:
         return paths, take_paths(folder, "validation")
-    if len(paths) < 2:
-        raise EdgeposeError(f"{folder}: one recording is not enough: another is needed for validation")
-    return [path for i, path in enumerate(paths) if i % 10], paths[::10]
+    except EdgeposeError:
+        raise EdgeposeError(
+            f"{folder}: one recording is not enough: another is needed for validation"
+        ) from None
+
+
+def measured_parts(folder: Path) -> tuple[list[str], list[str]]:
+    """Return the parts of a folder to measure models on, and those that it lacks.
+
+    They are the held-out parts; if there is none, as with a user's own recordings, the validation part.
+
+    Raises:
+        EdgeposeError: the folder has neither.
+    """
+    found = {part_of(path.stem) for path in folder.rglob("*.npz")}
+    present = [part for part in HELD_OUT if part in found]
+    lacking = [part for part in HELD_OUT if part not in found]
+    if not present:
+        take_paths(folder, "validation")
+        present = ["validation"]
+    return present, lacking
 
 
 class PackedTakes(NamedTuple):

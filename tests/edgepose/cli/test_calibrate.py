@@ -6,6 +6,7 @@ import json
 import math
 import os
 import pty
+import re
 import subprocess
 import sys
 import time
@@ -111,6 +112,34 @@ def test_stdout_gets_the_calibration_and_nothing_else() -> None:
     assert "hold from 41.00 to 42.00 s.\n" in result.stderr
 
 
+def test_a_start_since_the_first_sample() -> None:
+    result = run("--file", REAL, "--out", "-", "--hold", 1, "--from", "+1.5")
+    assert result.exit_code == 0, result
+    assert json.loads(result.stdout)["metadata"]["from_s"] == pytest.approx(41.5)
+
+
+@pytest.mark.parametrize("silent", [(10.0, 11.0), (10.8, 11.5), (11.9, 13.0)])
+def test_a_hold_is_covered_by_the_samples_of_every_sensor(
+    tmp_path: Path, silent: tuple[float, float]
+) -> None:
+    """A sensor that is silent at the beginning, in the middle or at the end of a hold was not held there."""
+    path = write_recording(tmp_path / "pose.csv", lambda t: worn(cal.POSES["straight"]))
+    rows = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(row for row in rows if not _from(row, "head", *silent)))
+    message = error_of(run("--file", path, "--from", 10, "--hold", 2.5, "--out", tmp_path / "c.json"))
+    assert re.fullmatch(
+        r"silent during a part of the hold: head for (1\.0|0\.7|0\.6) s; check power and link, and hold "
+        "again or choose another part of the recording",
+        message,
+    )
+    assert not (tmp_path / "c.json").exists()
+
+
+def _from(row: str, sensor: str, start_s: float, end_s: float) -> bool:
+    time_s, name, *_ = row.split(",")
+    return name == sensor and start_s <= float(time_s) < end_s
+
+
 def test_a_raw_capture(tmp_path: Path) -> None:
     quats = worn(cal.POSES["straight"], np.zeros(6))
     file = tmp_path / "capture.bin"
@@ -169,6 +198,7 @@ def test_warnings_go_to_stderr_and_into_the_file(tmp_path: Path) -> None:
     [
         (["--from", 42], "it does not contain 4 s from 42 s on; it lasts from 40.00 to 42.9"),
         (["--from", 10, "--hold", 1], "it does not contain 1 s from 10 s"),
+        (["--from", "+2.5", "--hold", 1], "it does not contain 1 s from 42.5 s on; it lasts from 40.00"),
         (["--hold", 60], "no 60 s in which all six sensors reported: they overlap for 3.0 s"),
         (
             ["--heading-reset", REAL, "--hold", 2],
@@ -196,7 +226,10 @@ def test_recordings_that_do_not_do(arguments: list[object], message: str) -> Non
         (["--port", "x", "--heading-reset", "motion", "--motion", "1:2"], "--motion needs a recording"),
         (["--file", REAL, "--motion", "1:2"], "--motion needs --heading-reset motion"),
         (["--file", REAL, "--heading-reset", "motion", "--motion", "2:1"], "'2:1' is not FROM:TO"),
-        (["--file", REAL, "--heading-reset", "motion", "--motion", "nan:1"], "'nan:1' is not FROM:TO"),
+        (
+            ["--file", REAL, "--heading-reset", "motion", "--motion", "nan:1"],
+            "'nan' is not a time in seconds",
+        ),
         (["--file", REAL, "--heading-reset", "motion", "--pose", "t-pose"], "starts with hanging arms"),
         (["--file", REAL, "--heading-reset", "mounting:up"], "an axis is x, y or z"),
         (["--file", REAL, "--filter", "madgwick"], "'madgwick' is not one of 'none', 'kalman', 'vqf'"),
@@ -451,7 +484,7 @@ def test_the_recording_is_not_written_over(tmp_path: Path) -> None:
 def test_movements_that_are_not_in_the_recording(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "walk.csv", lambda t: worn(np.tile(np.eye(3), (6, 1, 1))))
     words = ("--heading-reset", "motion", "--motion", "500:520", "--out", tmp_path / "c.json")
-    assert "with --motion FROM:TO" in error_of(run("--file", path, "--hold", 1, *words))
+    assert "choose --motion within that" in error_of(run("--file", path, "--hold", 1, *words))
 
 
 @pytest.mark.parametrize("words", [(), ("--heading-reset", "mounting:z")])

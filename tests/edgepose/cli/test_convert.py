@@ -214,7 +214,7 @@ def test_an_xio_session_by_serial_numbers(command, tmp_path):
     written = xio_session(tmp_path / "walk", names)
     result = command("convert", tmp_path / "walk", "--to", "csv", "--out", tmp_path)
     assert result.returncode == 1
-    assert "no placement in the names of its folders" in result.stdout
+    assert "no placement in the names of its folders" in result.stderr
     sensors = tmp_path / "map.toml"
     sensors.write_text("".join(f"{name} = {{ id = 0x64F0000{i} }}\n" for i, name in enumerate(PLACEMENTS)))
     result = command("convert", tmp_path / "walk", "--sensors", sensors, "--to", "csv", "--out", tmp_path)
@@ -276,18 +276,20 @@ def test_fifty_files_one_of_them_broken_by_two_processes(command, tmp_path):
     result = command("convert", folder, "--to", "npz", "--out", out, "--jobs", 2)
     assert result.returncode == 1
     assert result.stderr.splitlines()[-1] == (
-        "edgepose: 2 of 50 recordings not converted, or only in part; see the table"
+        "edgepose: 2 of 50 recordings not converted, or only in part; see the messages above"
     )
     assert len(result.stderr.splitlines()) == 51
     lines = result.stdout.splitlines()[1:]
     assert len(lines) == 50
     assert sum(line.endswith(" 60        0.1  ok") for line in lines) == 48
-    (damaged,) = (line for line in lines if " damaged: " in line)
-    assert re.search(
-        rf"^{folder / '7.csv'} +59 +0\.1  damaged: .*1 bad rows left out.* row 21 has 1 col", damaged
-    )
-    (failed,) = (line for line in lines if " failed: " in line)
-    assert re.search(rf"^{folder / 'deeper' / '9.npz'} +- +-  failed: .*not a complete NPZ file", failed)
+    assert re.search(rf"^{folder / '7.csv'} +59 +0\.1  damaged$", result.stdout, re.MULTILINE)
+    assert re.search(rf"^{folder / 'deeper' / '9.npz'} +- +-  failed$", result.stdout, re.MULTILINE)
+    for name, reason in (
+        ("7.csv", "damaged: .*1 bad rows left out.* row 21 has 1 col"),
+        ("deeper/9.npz", "failed: not a complete NPZ file"),
+    ):
+        (line,) = (line for line in result.stderr.splitlines() if f"{folder / name}: " in line)
+        assert re.search(rf"^\d+ of 50  {folder / name}: {reason}", line)
     written = sorted(path for path in out.rglob("*") if path.is_file())
     assert len(written) == 49
     for path in written:
@@ -334,7 +336,7 @@ def test_a_disk_that_fills_up(tmp_path):
     )
     assert process.returncode == 1
     assert (
-        f"failed: cannot write recording to {tmp_path / 'six-sites-3s.csv'}: File too large" in process.stdout
+        f"failed: cannot write recording to {tmp_path / 'six-sites-3s.csv'}: File too large" in process.stderr
     )
     assert list(tmp_path.iterdir()) == []
 
@@ -454,7 +456,7 @@ def test_no_place_to_write_and_no_standard_input(command, tmp_path):
     result = command("convert", REAL, "--to", "csv", "--out", tmp_path / "a.csv" / "b")
     assert result.returncode == 1
     folder = re.escape(str(tmp_path / "a.csv" / "b"))
-    assert re.search(rf"failed: cannot make the folder {folder}: .*; choose another --out\n", result.stdout)
+    assert re.search(rf"failed: cannot make the folder {folder}: .*; choose another --out\n", result.stderr)
     words = [sys.executable, "-m", "edgepose", "convert", "-", "--to", "csv", "--out", str(tmp_path / "o")]
     closed = ["sh", "-c", 'exec "$@" <&-', "sh", *words]
     result = processes.run(closed, text=True, capture_output=True, check=False)

@@ -267,6 +267,21 @@ def mind_permissions() -> None:
         libc.prctl(24, capability, 0, 0, 0)  # PR_CAPBSET_DROP
 
 
+def test_a_folder_that_cannot_be_listed_costs_only_itself(wearer, tmp_path):
+    (tmp_path / "in" / "closed").mkdir(parents=True)
+    for folder in ("in", "in/closed"):
+        (tmp_path / folder / "a.npz").write_bytes(wearer.short.read_bytes())
+    (tmp_path / "in" / "closed").chmod(0)
+    try:
+        words = ["convert", "in", "--to", "csv", "--out", "out"]
+        result = edgepose(words, cwd=tmp_path, preexec_fn=mind_permissions)
+    finally:
+        (tmp_path / "in" / "closed").chmod(0o755)
+    assert result.returncode == 1
+    assert "in/closed: failed: cannot read it: Permission denied\n" in result.stderr
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.csv"]
+
+
 def test_read_only_folder(case):
     out, words = case
     out.write_bytes(OLD)

@@ -184,6 +184,26 @@ def two_outputs(first: Output, second: Output) -> Output:
     )
 
 
+def test_a_recording_made_from_a_file_keeps_what_the_file_says_of_itself(command, tmp_path):
+    """Its start is the recording's own, not that of the copy; without one none is made up."""
+    about = {"started": "2024-05-06T07:08:09+00:00", "source": "/dev/ttyUSB7", "wearer": "anna"}
+    with Rig() as rig, open_source(port=rig.port) as source:
+        record(source, open_output(str(tmp_path / "walk.bin"), about), 0.5)
+    copies = {
+        "0.csv": ("record", tmp_path / "0.csv", "--file", tmp_path / "walk.bin"),
+        "1.npz": ("record", tmp_path / "1.npz", "--file", tmp_path / "0.csv"),
+        "walk.csv": ("convert", tmp_path / "walk.bin", "--to", "csv", "--out", tmp_path),
+    }
+    for name, words in copies.items():
+        assert command(*words).returncode == 0
+        assert about.items() <= read_recording(tmp_path / name).metadata.items(), words
+    times_path(tmp_path / "walk.bin").unlink()
+    assert command("record", tmp_path / "2.csv", "--file", tmp_path / "walk.bin").returncode == 0
+    found = read_recording(tmp_path / "2.csv").metadata
+    assert "started" not in found
+    assert found["source"] == str(tmp_path / "walk.bin")
+
+
 @pytest.mark.parametrize(("protocol", "seconds"), [("auto", 1.5), ("native", 0.7)])
 def test_a_capture_decoded_again_equals_the_samples(tmp_path, protocol, seconds):
     live: list[ImuSample] = []

@@ -12,12 +12,16 @@ import pytest
 
 from edgepose.analysis import metrics
 from edgepose.formats.poses.registry import read_poses
+from edgepose.formats.recordings.base import iter_samples
 from edgepose.formats.recordings.csv import write_csv
 from edgepose.formats.recordings.npz import write_npz
+from edgepose.formats.recordings.raw_capture import times_header, times_path, times_row
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import Recording, SensorData
 from edgepose.rotations import rotvec_to_matrix
 from edgepose.skeleton import default_body, forward_kinematics
+from firmware_protocols import native
+from firmware_protocols.native_packet import Packet
 from tests.support import processes
 
 PLAIN = ("--evaluations", 12)
@@ -123,10 +127,37 @@ def test_numbers_that_are_none_are_told(command, wearer, tmp_path, number):
     cells[6] = number
     lines[40] = ",".join(cells)
     path.write_text("\n".join(lines) + "\n")
-    result = command("solve", path, "--calibration", wearer.calibration, "--csv", tmp_path / "poses.csv")
+    out = tmp_path / "poses.csv"
+    result = command("solve", path, "--calibration", wearer.calibration, "--csv", out, *PLAIN)
     assert result.returncode == 1
     assert "row 41" in result.stderr
     assert "NaN or absurd" in result.stderr
+    assert len(read_poses(out).frames) == 180, "a bad row costs only itself"
+
+
+def test_a_raw_capture_is_solved_like_a_recording(command, wearer, tmp_path):
+    """The bytes of a port, with their arrival times."""
+    samples = list(iter_samples(read_recording(wearer.short)))
+    data = [
+        native.encode(Packet(s.sensor, k // 6, int(s.time_s * 1e6), s.quat, s.acc))
+        for k, s in enumerate(samples)
+    ]
+    ends = np.cumsum([len(packet) for packet in data])
+    capture = tmp_path / "walk.bin"
+    capture.write_bytes(b"".join(data))
+    rows = [times_row(1.7e9 + s.time_s, int(end)) for s, end in zip(samples, ends, strict=True)]
+    times_path(capture).write_text(times_header({}) + "".join(rows))
+    result = command(
+        "solve", capture, "--calibration", wearer.calibration, "--csv", tmp_path / "a.csv", *PLAIN
+    )
+    assert result.returncode == 0, result.stderr
+    result = command(
+        "solve", wearer.short, "--calibration", wearer.calibration, "--csv", tmp_path / "b.csv", *PLAIN
+    )
+    assert result.returncode == 0, result.stderr
+    found, wanted = (read_poses(tmp_path / name) for name in ("a.csv", "b.csv"))
+    np.testing.assert_allclose(found.time_s - 1.7e9, wanted.time_s, atol=1e-3)
+    np.testing.assert_allclose(found.rotations, wanted.rotations, atol=0.02)
 
 
 def one_line(result):

@@ -9,6 +9,7 @@ import pytest
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.registry import read_poses
 from edgepose.formats.recordings.registry import read_recording
+from edgepose.placements import PLACEMENTS
 from edgepose.sip.prior import load_prior
 from edgepose_export.mocap import read_motion
 from edgepose_export.training.dataset import read_take
@@ -22,6 +23,19 @@ HEADERS = [
     b"{'descr': '<f4'}",
     b"\xff\xfe",
 ]
+
+
+@pytest.mark.parametrize("content", [b"junk", b""])
+@pytest.mark.parametrize("reader", READERS)
+def test_members_that_are_no_arrays(tmp_path, reader, content):
+    """numpy returns their bytes."""
+    path = tmp_path / "walk.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        sensors = [f"{name}_{quantity}" for name in PLACEMENTS for quantity in ("quat", "acc")]
+        for key in ("t", *sensors, "poses", "trans", "mocap_framerate", "mean", "license"):
+            archive.writestr(f"{key}.npy", content)
+    with pytest.raises(EdgeposeError, match=r"walk\.npz: .*is not an array"):
+        reader(path)
 
 
 @pytest.mark.parametrize("header", HEADERS)

@@ -10,7 +10,7 @@ import pytest
 
 from edgepose.calibration import load_calibration
 from edgepose.calibration.rezero import HeadingRezero
-from edgepose.errors import EdgeposeError
+from edgepose.errors import EdgeposeError, ModelError
 from edgepose.formats.poses.registry import read_poses
 from edgepose.imu import ImuFrame
 from edgepose.inference import archive
@@ -82,6 +82,15 @@ def test_what_waited_to_be_taken_counts_as_latency(walk):
     assert summary.backlog_s == 2.5
     assert min(summary.latencies_s) >= 2.5
     assert max(walk().latencies_s) < 2.5
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
+def test_a_network_that_computes_no_numbers(number):
+    """A flipped bit in a weight is enough for it."""
+    rotations = np.zeros((24, 3, 3), np.float32)
+    rotations[7, 1, 2] = number
+    with pytest.raises(ModelError, match="frame 0 is not a number: its archive is damaged"):
+        pose_frame(EngineOutput(imu_frame(), rotations, np.zeros(24), False))
 
 
 @pytest.mark.parametrize(

@@ -27,14 +27,15 @@ from scipy.spatial.transform import Rotation
 from websockets.sync.client import connect
 
 from edgepose.cli import cli
+from edgepose.config import OutputConfig
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.registry import read_poses
 from edgepose.pose import PoseFrame, held_sensors, parse_status
 from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.csv import CsvSink
+from edgepose.sinks.open import open_outputs
 from edgepose.sinks.udp import UdpSink, decode, encode_binary, encode_json
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics
-from edgepose.viewer import viewer as viewer_module
 from edgepose.viewer.body_mesh import TIPS, build, ground
 from edgepose.viewer.viewer import UdpPoseStream, Viewer, plain, sensor_table
 from tests.support import processes
@@ -490,13 +491,31 @@ def test_documented_commands_are_understood():
 
 
 def test_a_port_in_use_moves_the_page_of_a_run():
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
+    with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        assert port < viewer_module.free_port("127.0.0.1", port) < port + 20
-    assert viewer_module.free_port("127.0.0.1", port) == port
-    assert viewer_module.free_port("nosuch.invalid", 8080) == 8080
+        with contextlib.closing(Viewer("127.0.0.1", port, default_body(), next_free=True)) as viewer:
+            assert port < viewer.port < port + 1000
+            page = urllib.request.urlopen(f"http://127.0.0.1:{viewer.port}", timeout=60)
+            assert b"<title>" in page.read()
+    with pytest.raises(EdgeposeError, match=r"choose another --host"):
+        Viewer("nosuch.invalid", port, default_body(), next_free=True)
+
+
+def test_two_wearers_have_a_page_each(caplog):
+    """Although both viewers start at the same time."""
+    with contextlib.ExitStack() as stack:
+        for name in ("anna", "ben"):
+            open_outputs(stack, OutputConfig(view=True), wearer=name)
+        until(lambda: len(caplog.messages) == 2, "the addresses of two pages")
+        shown = [
+            re.fullmatch(r"(\w+): open (http://127\.0\.0\.1:\d+) in a browser", text)
+            for text in caplog.messages
+        ]
+        assert all(shown), caplog.messages
+        assert sorted(match[1] for match in shown) == ["anna", "ben"]
+        assert len({match[2] for match in shown}) == 2
+        for match in shown:
+            assert b"<title>" in urllib.request.urlopen(match[2], timeout=60).read()
 
 
 def test_an_address_that_is_none(command):

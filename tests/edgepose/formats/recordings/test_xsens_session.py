@@ -89,7 +89,7 @@ def test_device_ids_by_the_command(command, tmp_path):
     same(read_recording(tmp_path / "out" / "walk.npz"), written)
     result = command("convert", tmp_path / "walk", "--to", "npz", "--out", tmp_path / "out2")
     assert result.returncode == 1
-    assert "no placement in the names of its files" in result.stdout
+    assert "no placement in the names of its files" in result.stderr
 
 
 def test_a_counter_that_begins_anew_and_lost_packets(tmp_path):
