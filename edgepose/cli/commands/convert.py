@@ -79,7 +79,7 @@ def convert(
     IN are files, patterns and folders. A folder stands for all recordings in it, at any depth. A folder with
     one subfolder per x-io sensor is one recording; the names of the subfolders contain the placements, or
     --sensors maps their serial numbers as ids (id = 0x64F61CB3). The good part of a damaged recording is
-    written, and the poses of a CSV or BVH file before the first bad one; the exit code is then 1.
+    written, and the poses of a BVH file before the first bad one; the exit code is then 1.
 
     Files of poses (CSV and BVH as `run` writes them, NPZ with the keys of AMASS) become CSV, NPZ or BVH. From
     a recording with true poses, such as DIP-IMU's, --to bvh takes these. - reads CSV from standard input.

@@ -23,7 +23,7 @@ class PoseFormat(FileFormat):
     """A format of poses; the module of each format ends with its `FORMAT`.
 
     Attributes:
-        read: returns the poses before the first bad one, and one line on the problem, or None. Raises
+        read: returns the good poses, and one line on the problem, or None. Raises
             EdgeposeError if no pose is usable.
         holds_poses: whether a file with one of the suffixes contains poses and not a recording of sensors; by
             default all do.

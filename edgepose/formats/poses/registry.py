@@ -41,7 +41,7 @@ def read_poses(path: str | Path) -> PoseSequence:
 
 
 def salvage_poses(path: Path) -> tuple[PoseSequence, str | None]:
-    """Read the poses before the first bad one, and one line on the problem; see `read_poses`.
+    """Read the good poses, and one line on the problem; see `read_poses`.
 
     Raises:
         FileFormatError: no pose is usable.
@@ -71,7 +71,7 @@ def pose_suffixes() -> tuple[str, ...]:
 
 
 def _read(path: Path) -> tuple[PoseSequence, str | None]:
-    """Read the poses before the first bad one, and the problem with the file."""
+    """Read the good poses, and the problem with the file."""
     poses, problem = find_format(path).read(path)
     if not FRAME_TIMES[0] < poses.frame_time < FRAME_TIMES[1]:
         raise FileFormatError(f"{path}: {poses.frame_time:g} s from pose to pose is not possible")

@@ -220,18 +220,18 @@ def _damaged(lines: list[str], damage: str) -> bytes:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        ("frames go back", "row 4: frame 1 comes after frame 1"),
-        ("huge frame", "row 3: "),
-        ("text", "row 3: could not convert"),
-        ("nan", "row 3: a number is infinite or not a number"),
-        ("cut row", r"row 6: \d+ columns, the header has 99"),
-        ("two files", "row 7: "),
-        ("long line", "too long"),
+        ("frames go back", "first: row 4 has frame 1 after frame 1; sort the rows"),
+        ("huge frame", "row 3 has a number that is infinite"),
+        ("text", "row 3 has a cell that is not a number"),
+        ("nan", "row 3 has a number that is infinite, not a number"),
+        ("cut row", r"row 6 has \d+ columns, the header has 99"),
+        ("two files", "6 bad rows left out, the first: row 7 has a cell that is not a number"),
+        ("long line", "row 3 is longer than 16384 characters"),
         ("only a header", "no poses"),
         ("joints", "not a file of poses"),
-        ("zeros", "row 3: the numbers of pelvis are not a rotation"),
-        ("empty", "not a file of poses"),
-        ("binary", "not a text file"),
+        ("zeros", "row 3 has numbers of pelvis that are not a rotation"),
+        ("empty", "the file is empty"),
+        ("binary", "starts with .*, not with 'frame,time_s"),
     ],
 )
 def test_damaged_files(tmp_path, damage, message):
@@ -253,7 +253,7 @@ def test_matrices_that_are_no_rotations(tmp_path):
     path = tmp_path / "a.csv"
     with CsvSink(path, "matrix") as sink:
         sink.write(make_pose(0)._replace(rotations=-np.tile(np.eye(3, dtype=np.float32), (24, 1, 1))))
-    with pytest.raises(EdgeposeError, match="row 2: the numbers of pelvis are not a rotation"):
+    with pytest.raises(EdgeposeError, match="row 2 has numbers of pelvis that are not a rotation"):
         read_poses(path)
 
 

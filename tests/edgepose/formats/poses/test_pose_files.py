@@ -99,10 +99,10 @@ def test_csv_in_blocks(tmp_path):
     lines = (tmp_path / "a.csv").read_text().splitlines(keepends=True)
     bad = tmp_path / "b.csv"
     bad.write_text("".join([*lines[:-2], lines[-1], lines[-2]]))
-    with pytest.raises(EdgeposeError, match=rf"row {BLOCK + 6}: frame {BLOCK + 3} comes after"):
+    with pytest.raises(EdgeposeError, match=rf"row {BLOCK + 6} has frame {BLOCK + 3} after"):
         read_poses(bad)
     bad.write_text("".join([*lines[: BLOCK + 3], "1,2\n"]))
-    with pytest.raises(EdgeposeError, match=rf"row {BLOCK + 4}: 2 columns"):
+    with pytest.raises(EdgeposeError, match=rf"row {BLOCK + 4} has 2 columns"):
         read_poses(bad)
 
 
@@ -400,7 +400,7 @@ def test_times_that_do_not_rise(tmp_path):
     with CsvSink(tmp_path / "a.csv") as sink:
         for i, time_s in enumerate([5.0, 5.1, 5.1]):
             sink.write(standing(i)._replace(time_s=time_s))
-    with pytest.raises(EdgeposeError, match=r"a\.csv, row 4: time 5\.1\d* s is not after that of the row"):
+    with pytest.raises(EdgeposeError, match=r"a\.csv: .* row 4 has time 5\.1\d* s as the row before; write"):
         read_poses(tmp_path / "a.csv")
     assert len(salvage_poses(tmp_path / "a.csv")[0].frames) == 2
     np.savez(tmp_path / "a.npz", poses=np.zeros((3, 72)), time_s=[1.0, 3.0, 2.0], frame=[0, 1, 2])
