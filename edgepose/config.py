@@ -13,10 +13,18 @@ from pathlib import Path
 from typing import Any
 
 from edgepose.errors import ConfigError, EdgeposeError
+from edgepose.formats.bvh_names import BVH_NAMES
 from edgepose.formats.poses.csv_columns import ROTATION_FORMATS
+from edgepose.formats.poses.npz_amass import JOINT_COUNTS
 from edgepose.imu import FILTERS
-from edgepose.utils.output_targets import check_output, is_stream, part_path
-from edgepose.utils.sockets import Destination, parse_address, parse_destination
+from edgepose.utils.output_targets import check_output, is_stream, part_path, split_option
+from edgepose.utils.sockets import (
+    Address,
+    Destination,
+    parse_address,
+    parse_datagram_address,
+    parse_destination,
+)
 from edgepose.utils.text_files import read_toml
 
 ANY_OUTPUT = "give at least one output, such as --csv FILE, --udp HOST:PORT or --view"
@@ -39,10 +47,29 @@ FILE_OUTPUTS = ("csv", "npz", "bvh")
 
 NETWORK_OUTPUTS: dict[str, Callable[[str], Any]] = {
     "udp": parse_destination,
-    "osc": parse_host_and_port,
+    "osc": parse_datagram_address,
     "tcp": parse_host_and_port,
 }
 """Outputs to an address, with the parser of the address."""
+
+
+def split_options(npz: str | None, bvh: str | None) -> dict[str, Any]:
+    """Split the texts FILE[,joints=N] and FILE[,names=SKELETON] of outputs.
+
+    Returns:
+        Values of the fields `npz`, `bvh`, `joints` and `names`, as far as they are given.
+
+    Raises:
+        ConfigError: an option is unknown.
+    """
+    values: dict[str, Any] = {}
+    if npz is not None:
+        values["npz"], joints = split_option(npz, "joints", list(map(str, JOINT_COUNTS)))
+        values |= {} if joints is None else {"joints": int(joints)}
+    if bvh is not None:
+        values["bvh"], names = split_option(bvh, "names", list(BVH_NAMES))
+        values |= {} if names is None else {"names": names}
+    return values
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,6 +144,8 @@ class OutputConfig:
         view: show a figure in the browser.
         height: the wearer's stature, metres.
         overwrite: replace existing files.
+        joints: number of joints in the NPZ file, a key of `JOINT_COUNTS`; also ",joints=52" after its name.
+        names: names of the joints in the BVH file, a key of `BVH_NAMES`; also ",names=unity" after its name.
         sinks: targets of outputs from other packages (entry points `edgepose.sinks`), by output name.
     """
 
@@ -126,15 +155,28 @@ class OutputConfig:
     npz: str | None = None
     bvh: str | None = None
     udp: Destination | None = None
-    osc: tuple[str, int] | None = None
+    osc: Address | tuple[str, int] | None = None
     tcp: tuple[str, int] | None = None
     view: bool = False
     height: float = 1.75
     overwrite: bool = False
+    joints: int = 24
+    names: str = "smpl"
     sinks: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Raise ConfigError for an unknown representation of rotations."""
+        """Split options from the names of files, and complete addresses.
+
+        Raises:
+            ConfigError: an unknown option, or an unknown representation of rotations.
+        """
+        values = split_options(self.npz, self.bvh)
+        values |= {"udp": Destination(*self.udp)} if self.udp else {}
+        values |= {"osc": Address(*self.osc)} if self.osc else {}
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+        if self.joints not in JOINT_COUNTS or self.names not in BVH_NAMES:
+            raise ConfigError(f"joints or names: {self.joints!r}, {self.names!r} are not possible")
         if self.rotations not in ROTATION_FORMATS:
             raise ConfigError(
                 f"rotations: {self.rotations!r} is not one of {', '.join(map(repr, ROTATION_FORMATS))}"

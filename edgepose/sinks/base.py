@@ -72,6 +72,8 @@ class SinkContext(NamedTuple):
         std: write standard deviations, if the format has room for them.
         translation: poses have a translation.
         overwrite: replace existing files.
+        joints: number of joints in NPZ, a key of `JOINT_COUNTS` in `edgepose.formats.poses.npz_amass`.
+        names: names of the joints in BVH, a key of `BVH_NAMES` in `edgepose.formats.bvh_names`.
         stopped: whether the run is to end; a reader that has stopped reading is then not waited for.
     """
 
@@ -82,6 +84,8 @@ class SinkContext(NamedTuple):
     std: bool = False
     translation: bool = False
     overwrite: bool = False
+    joints: int = 24
+    names: str = "smpl"
     stopped: Callable[[], bool] = lambda: False
 
 

@@ -24,7 +24,13 @@ class NpzSink(Sink):
     """
 
     def __init__(
-        self, path: str | Path, rate: float = 60.0, translation: bool = False, *, overwrite: bool = True
+        self,
+        path: str | Path,
+        rate: float = 60.0,
+        translation: bool = False,
+        joints: int = 24,
+        *,
+        overwrite: bool = True,
     ) -> None:
         """Open the CSV file.
 
@@ -32,6 +38,7 @@ class NpzSink(Sink):
             path: file to write.
             rate: frames per second.
             translation: whether the poses have a translation.
+            joints: number of joints to write, a key of `JOINT_COUNTS`.
             overwrite: replace an existing NPZ file; the CSV file of another run is never replaced.
 
         Raises:
@@ -47,7 +54,7 @@ class NpzSink(Sink):
                 f"{self._part} already exists, perhaps from a run that was cut off: save its poses with "
                 f"edgepose convert {self._part} --to npz --out saved, then delete it"
             )
-        self._rate, self._closed, self._count = rate, False, 0
+        self._rate, self._joints, self._closed, self._count = rate, joints, False, 0
         self._csv = CsvSink(self._part, translation=translation, overwrite=False, follow=False)
         self._csv.start()
 
@@ -94,7 +101,7 @@ class NpzSink(Sink):
             try:
                 replace_file(
                     self._path,
-                    lambda path: write_npz(path, read_blocks(self._part), count, self._rate),
+                    lambda path: write_npz(path, read_blocks(self._part), count, self._rate, self._joints),
                     "poses",
                     overwrite=self._overwrite,
                 )
@@ -105,7 +112,7 @@ class NpzSink(Sink):
 
 def open_sink(target: str, context: SinkContext) -> Sink:
     """Open an `NpzSink`; a device or pipe gets the file once it is complete."""
-    rate, translation = context.rate, context.translation
+    settings = context.rate, context.translation, context.joints
     if target != "-" and is_stream(target):
-        return SpooledSink(target, lambda part: NpzSink(part, rate, translation), context.stopped)
-    return NpzSink(target, rate, translation, overwrite=context.overwrite)
+        return SpooledSink(target, lambda part: NpzSink(part, *settings), context.stopped)
+    return NpzSink(target, *settings, overwrite=context.overwrite)

@@ -39,6 +39,8 @@ def open_outputs(
         rotations=outputs.rotations,
         std=outputs.std,
         overwrite=outputs.overwrite,
+        joints=outputs.joints,
+        names=outputs.names,
         stopped=stopped,
     )
     targets = {name: getattr(outputs, name) for name in SINKS if name != "view"} | dict(outputs.sinks)

@@ -11,11 +11,11 @@ import os
 import re
 import stat
 import sys
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import ConfigError, EdgeposeError
 
 ENDINGS = frozenset(
     (
@@ -143,6 +143,21 @@ def check_free(paths: Iterable[Path], hint: str) -> None:
     if existing:
         rest = f" and {len(existing) - 1} others" if existing[1:] else ""
         raise EdgeposeError(f"{existing[0]}{rest}: already exists; {hint}")
+
+
+def split_option(target: str, key: str, choices: Sequence[str]) -> tuple[str, str | None]:
+    """Split "FILE[,key=value]" into the file and the value; None if there is no option.
+
+    Raises:
+        ConfigError: an unknown key or value.
+    """
+    path, comma, option = target.rpartition(",")
+    name, equals, value = option.partition("=")
+    if not (comma and equals and name.isidentifier()):  # a comma in the name of a file
+        return target, None
+    if name != key or value not in choices or not path:
+        raise ConfigError(f"unknown option {option!r} of {path}: possible are {key}={'|'.join(choices)}")
+    return path, value
 
 
 def is_stream(name: str | Path) -> bool:

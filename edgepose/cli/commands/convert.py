@@ -13,6 +13,9 @@ from edgepose.cli.options.outputs import overwrite_option
 from edgepose.cli.options.source import protocol_option, sensors_option
 from edgepose.cli.terminal.messages import printable, say, show
 from edgepose.errors import EdgeposeError
+from edgepose.formats.bvh_names import BVH_NAMES
+from edgepose.formats.poses.bvh import UNITS
+from edgepose.formats.poses.npz_amass import JOINT_COUNTS
 from edgepose.utils.output_targets import check_free, check_output
 
 if TYPE_CHECKING:
@@ -50,6 +53,25 @@ if TYPE_CHECKING:
     show_default=True,
     help="The wearer's height, metres, for the bones of BVH files.",
 )
+@click.option(
+    "--unit",
+    type=click.Choice(list(UNITS)),
+    help="Unit of lengths in the BVH files to read.  [default: inferred from the length of the shanks]",
+)
+@click.option(
+    "--joints",
+    type=click.Choice(list(map(str, JOINT_COUNTS))),
+    default="24",
+    show_default=True,
+    help="Number of joints in NPZ files of poses: 24 as in SMPL, 52 as in SMPL-H, 55 as in SMPL-X.",
+)
+@click.option(
+    "--names",
+    type=click.Choice(list(BVH_NAMES)),
+    default="smpl",
+    show_default=True,
+    help="Names of the joints in BVH files.",
+)
 @protocol_option
 @sensors_option
 @click.option(
@@ -67,6 +89,9 @@ def convert(
     out: Path,
     filter: str,
     height: float,
+    unit: str | None,
+    joints: str,
+    names: str,
     protocol: str,
     sensors: Path | None,
     jobs: int,
@@ -108,7 +133,7 @@ def convert(
     todo = [job for job in planned if job not in done]
     _check_targets(todo, to, overwrite)
     try:
-        options = Options(protocol, sensors, filter, height, overwrite)
+        options = Options(protocol, sensors, filter, height, overwrite, unit, int(joints), names)
         for result in _with_progress(convert_all(todo, options, jobs), len(todo)):
             done[result.job] = result
     finally:

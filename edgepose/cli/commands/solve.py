@@ -13,8 +13,9 @@ import click
 
 from edgepose.cli.options.body import BodyFlags, body_options
 from edgepose.cli.options.gathered import gathered
-from edgepose.cli.options.outputs import check_files, overwrite_option
+from edgepose.cli.options.outputs import bvh_option, check_files, npz_option, overwrite_option
 from edgepose.cli.terminal.messages import end_status, has_terminal, say, status
+from edgepose.config import split_options
 from edgepose.errors import EdgeposeError
 from edgepose.utils.output_targets import check_output, is_stream, part_path
 
@@ -71,6 +72,13 @@ class SolveOutputs:
     bvh: str | None
     plot: str | None
     overwrite: bool
+    joints: int = 24
+    names: str = "smpl"
+
+    def __post_init__(self) -> None:
+        """Split options from the names of files; raise ConfigError for an unknown one."""
+        for name, value in split_options(self.npz, self.bvh).items():
+            object.__setattr__(self, name, value)
 
     def check(self, inputs: Mapping[str, Path | None]) -> None:
         """Make sure that there is an output for the poses, and that no file is lost.
@@ -105,6 +113,8 @@ class SolveOutputs:
             rotations=self.rotations,
             translation=True,
             overwrite=self.overwrite,
+            joints=self.joints,
+            names=self.names,
             stopped=stopped,
         )
         targets = {"npz": self.npz, "bvh": self.bvh, "csv": self.csv}
@@ -176,8 +186,8 @@ def _output_options(command: Callable[..., Any]) -> Callable[..., Any]:
             show_default=True,
             help="Representation of rotations in the CSV.",
         ),
-        click.option("--npz", metavar="FILE", help="Write poses as NPZ with the keys of AMASS."),
-        click.option("--bvh", metavar="FILE", help="Write poses as BVH."),
+        npz_option("Write poses as NPZ with the keys of AMASS."),
+        bvh_option("Write poses as BVH."),
         click.option("--plot", metavar="FILE", help="Write a picture of costs and residuals over time."),
         overwrite_option,
     ]

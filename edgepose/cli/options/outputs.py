@@ -11,9 +11,10 @@ import click
 from edgepose.cli.options.gathered import gathered
 from edgepose.config import OutputConfig, parse_host_and_port
 from edgepose.errors import EdgeposeError
+from edgepose.formats.bvh_names import BVH_NAMES
 from edgepose.formats.poses.csv_columns import ROTATION_FORMATS
 from edgepose.utils.output_targets import identity, is_null
-from edgepose.utils.sockets import Destination, parse_destination
+from edgepose.utils.sockets import Address, Destination, parse_datagram_address, parse_destination
 
 
 def check_files(outputs: Mapping[str, str | Path | None], inputs: Mapping[str, Path | None]) -> None:
@@ -49,6 +50,13 @@ def _destination(ctx: click.Context, param: click.Parameter, value: str | None) 
         raise click.BadParameter(str(error)) from None
 
 
+def _datagram_address(ctx: click.Context, param: click.Parameter, value: str | None) -> Address | None:
+    try:
+        return None if value is None else parse_datagram_address(value)
+    except EdgeposeError as error:
+        raise click.BadParameter(str(error)) from None
+
+
 def address(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, int] | None:
     """Parse the value HOST:PORT of a flag (a click callback)."""
     try:
@@ -71,6 +79,24 @@ overwrite_option = click.option("--overwrite", is_flag=True, help="Replace exist
 """The flag --overwrite."""
 
 
+def npz_option(help: str) -> Callable[[Any], Any]:
+    """Return the flag --npz with a help text."""
+    return click.option(
+        "--npz",
+        metavar="FILE[,joints=24|52|55]",
+        help=f"{help} 24 joints are SMPL's, 52 SMPL-H's, 55 SMPL-X's.",
+    )
+
+
+def bvh_option(help: str) -> Callable[[Any], Any]:
+    """Return the flag --bvh with a help text."""
+    return click.option(
+        "--bvh",
+        metavar="FILE[,names=SKELETON]",
+        help=f"{help} Names of the joints: {', '.join(BVH_NAMES)}.",
+    )
+
+
 def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the output flags; the command gets them as `outputs: OutputConfig`."""
     flags = [
@@ -87,20 +113,18 @@ def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
             is_flag=True,
             help="Add the network's standard deviation of each joint to the CSV, radians.",
         ),
-        click.option(
-            "--npz", metavar="FILE", help="Write poses as NPZ with the keys of AMASS when the run ends."
-        ),
-        click.option("--bvh", metavar="FILE", help="Write poses as BVH, for Blender and similar programs."),
+        npz_option("Write poses as NPZ with the keys of AMASS when the run ends."),
+        bvh_option("Write poses as BVH, for Blender and similar programs."),
         click.option(
             "--udp",
             callback=_destination,
-            metavar="HOST:PORT[,format=json|binary]",
+            metavar="HOST:PORT[,format=json|binary][,broadcast]",
             help="Send each pose as a datagram.",
         ),
         click.option(
             "--osc",
-            callback=address,
-            metavar="HOST:PORT",
+            callback=_datagram_address,
+            metavar="HOST:PORT[,broadcast]",
             help="Send each pose over OSC (the VMC protocol) to programs that show VRM avatars; most of them "
             "listen on port 39539.",
         ),

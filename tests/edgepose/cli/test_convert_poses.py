@@ -121,9 +121,13 @@ def test_bvh_of_others_in_any_unit(tmp_path, metre):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("JOINT spine2", "JOINT chest", "its joints are not SMPL's: no spine2$"),
-        ("JOINT left_", "JOINT l_", r"its joints are not SMPL's: no left_hip, left_knee, left_ankle \.\.\.$"),
-        ("JOINT neck", "JOINT x", "no neck$"),
+        ("JOINT spine2", "JOINT chest", "its joints are not SMPL's: no spine2; other names"),
+        (
+            "JOINT left_",
+            "JOINT l_",
+            r"its joints are not SMPL's: no left_hip, left_knee, left_ankle \.\.\.; other",
+        ),
+        ("JOINT neck", "JOINT x", "no neck; other"),
         ("Frames: 3", "Frames: 4", "4 frames are announced, 3 are there"),
         ("left_", "right_", "joint name 'right_hip' is missing or used twice"),
     ],
@@ -151,9 +155,8 @@ def test_bvh_with_another_zero_pose_or_tree(tmp_path):
     path.write_text(swapped)
     with pytest.raises(EdgeposeError, match="its joint left_elbow does not have SMPL's parent"):
         read_poses(path)
-    z_up = re.sub(r"OFFSET (\S+) (\S+) (\S+)", r"OFFSET \1 \3 \2", text)
-    path.write_text(z_up)
-    with pytest.raises(EdgeposeError, match="its left_knee is not where a T-pose has it"):
+    path.write_text(re.sub(r"OFFSET (\S+) (\S+) (\S+)", r"OFFSET \1 \3 \2", text))
+    with pytest.raises(EdgeposeError, match="its toes point backwards; left and right are exchanged, or an"):
         read_poses(path)
 
 

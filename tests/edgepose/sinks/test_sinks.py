@@ -386,9 +386,11 @@ def test_udp_unknown_host():
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("127.0.0.1:9000", ("127.0.0.1", 9000, "json")),
-        ("pc.local:1,format=binary", ("pc.local", 1, "binary")),
-        ("[::1]:65535,format=json", ("::1", 65535, "json")),
+        ("127.0.0.1:9000", ("127.0.0.1", 9000, "json", "")),
+        ("pc.local:1,format=binary", ("pc.local", 1, "binary", "")),
+        ("[::1]:65535,format=json", ("::1", 65535, "json", "")),
+        ("10.0.0.255:9000,format=binary,broadcast", ("10.0.0.255", 9000, "binary", "broadcast")),
+        ("224.0.0.251:9000,multicast", ("224.0.0.251", 9000, "json", "multicast")),
     ],
 )
 def test_parse_destination(text, expected):
