@@ -311,7 +311,7 @@ def _ignore_interrupts() -> None:
 
 def _write_poses(path: Path, poses: PoseSequence, options: Options) -> None:
     if path.suffix == ".npz":
-        write_poses_npz(path, [poses], len(poses.frames), poses.rate, options.joints)
+        write_poses_npz(path, [poses], len(poses.frames), poses.rate, options.joints, poses.about)
         return
     sink: Sink
     if path.suffix == ".bvh":

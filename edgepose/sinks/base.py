@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from importlib.metadata import entry_points
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any, NamedTuple, TypeVar
 
 from edgepose.errors import ConfigError
@@ -74,6 +74,7 @@ class SinkContext(NamedTuple):
         overwrite: replace existing files.
         joints: number of joints in NPZ, a key of `JOINT_COUNTS` in `edgepose.formats.poses.npz_amass`.
         names: names of the joints in BVH, a key of `BVH_NAMES` in `edgepose.formats.bvh_names`.
+        about: origin of the poses, see `PoseSequence`.
         stopped: whether the run is to end; a reader that has stopped reading is then not waited for.
     """
 
@@ -86,6 +87,7 @@ class SinkContext(NamedTuple):
     overwrite: bool = False
     joints: int = 24
     names: str = "smpl"
+    about: Mapping[str, str] = MappingProxyType({})
     stopped: Callable[[], bool] = lambda: False
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.csv import read_blocks
@@ -29,6 +31,7 @@ class NpzSink(Sink):
         rate: float = 60.0,
         translation: bool = False,
         joints: int = 24,
+        about: Mapping[str, str] = MappingProxyType({}),
         *,
         overwrite: bool = True,
     ) -> None:
@@ -39,6 +42,7 @@ class NpzSink(Sink):
             rate: frames per second.
             translation: whether the poses have a translation.
             joints: number of joints to write, a key of `JOINT_COUNTS`.
+            about: origin of the poses, see `PoseSequence`.
             overwrite: replace an existing NPZ file; the CSV file of another run is never replaced.
 
         Raises:
@@ -54,7 +58,8 @@ class NpzSink(Sink):
                 f"{self._part} already exists, perhaps from a run that was cut off: save its poses with "
                 f"edgepose convert {self._part} --to npz --out saved, then delete it"
             )
-        self._rate, self._joints, self._closed, self._count = rate, joints, False, 0
+        self._settings = rate, joints, about
+        self._closed, self._count = False, 0
         self._csv = CsvSink(self._part, translation=translation, overwrite=False, follow=False)
         self._csv.start()
 
@@ -101,7 +106,7 @@ class NpzSink(Sink):
             try:
                 replace_file(
                     self._path,
-                    lambda path: write_npz(path, read_blocks(self._part), count, self._rate, self._joints),
+                    lambda path: write_npz(path, read_blocks(self._part), count, *self._settings),
                     "poses",
                     overwrite=self._overwrite,
                 )
@@ -112,7 +117,7 @@ class NpzSink(Sink):
 
 def open_sink(target: str, context: SinkContext) -> Sink:
     """Open an `NpzSink`; a device or pipe gets the file once it is complete."""
-    settings = context.rate, context.translation, context.joints
+    settings = context.rate, context.translation, context.joints, context.about
     if target != "-" and is_stream(target):
         return SpooledSink(target, lambda part: NpzSink(part, *settings), context.stopped)
     return NpzSink(target, *settings, overwrite=context.overwrite)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from types import MappingProxyType
 
 from edgepose.config import OutputConfig
 from edgepose.sinks.base import SINKS, Sink, SinkContext, sink_factory
@@ -15,6 +16,7 @@ def open_outputs(
     outputs: OutputConfig,
     rate: float = 60.0,
     stopped: Callable[[], bool] = lambda: False,
+    about: Mapping[str, str] = MappingProxyType({}),
 ) -> list[Sink]:
     """Open the sinks of one wearer. No file appears or is replaced before all of them are open.
 
@@ -23,6 +25,7 @@ def open_outputs(
         outputs: the outputs to open.
         rate: poses per second.
         stopped: whether the run is to end, see `SinkContext`.
+        about: origin of the poses, see `PoseSequence`.
 
     Raises:
         EdgeposeError: a file or address cannot be written to.
@@ -41,6 +44,7 @@ def open_outputs(
         overwrite=outputs.overwrite,
         joints=outputs.joints,
         names=outputs.names,
+        about=about,
         stopped=stopped,
     )
     targets = {name: getattr(outputs, name) for name in SINKS if name != "view"} | dict(outputs.sinks)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import zipfile
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -26,6 +29,11 @@ BETAS = 16
 
 JOINT_COUNTS = {24: "SMPL", 52: "SMPL-H", 55: "SMPL-X"}
 """Numbers of joints that can be written, and the body models that have them; fingers and face are at rest."""
+
+ABOUT = ("model", "calibration", "source", "date", "edgepose")
+"""What a file says about its origin."""
+
+_LONGEST_ABOUT = 10_000  # characters
 
 _RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
 """Names of the frame rate; the first is SMPL-H's, the second SMPL-X's."""
@@ -67,7 +75,8 @@ def read_npz(path: Path) -> tuple[PoseSequence, None]:
         rotations[:, 0] = Z_UP_TO_T @ rotations[:, 0]
         translation = None if translation is None else translation @ Z_UP_TO_T.T
     frames, time_s = _clock(path, arrays, count)
-    return PoseSequence(frames, time_s, rotations, translation, *_states(path, arrays, count)), None
+    states = _states(path, arrays, count)
+    return PoseSequence(frames, time_s, rotations, translation, *states, _about(arrays)), None
 
 
 def _join_parts(arrays: dict[str, NDArray[Any]]) -> None:
@@ -81,7 +90,7 @@ def _join_parts(arrays: dict[str, NDArray[Any]]) -> None:
 
 def _load(path: Path) -> tuple[dict[str, NDArray[Any]], bool]:
     """Load the relevant arrays of a file, and whether it is a recording with true poses in T."""
-    wanted = ("poses", *_PARTS, "trans", *_RATES, "time_s", "frame", "held", "filling")
+    wanted = ("poses", *_PARTS, "trans", *_RATES, "time_s", "frame", "held", "filling", "about")
     try:
         names = member_names(path)
         with open_npz(path) as archive:
@@ -141,6 +150,15 @@ def _states(
     return [sets[mask] for mask in masks], filling.tolist()
 
 
+def _about(arrays: Mapping[str, NDArray[Any]]) -> dict[str, str]:
+    """Return what the file says about its origin; nothing if that is not text as edgepose writes it."""
+    with suppress(KeyError, ValueError, RecursionError):
+        found = json.loads(str(arrays["about"])[:_LONGEST_ABOUT])
+        if isinstance(found, dict):
+            return {key: str(found[key]) for key in ABOUT if key in found}
+    return {}
+
+
 def holds_poses(path: Path) -> bool:
     """Return whether an archive has poses and is not a recording of sensors with true poses."""
     try:
@@ -159,7 +177,14 @@ def _is_recording(names: set[str]) -> bool:
 # --- writing ------------------------------------------------------------------------------------------------
 
 
-def write_npz(path: Path, blocks: Iterable[PoseSequence], count: int, rate: float, joints: int = 24) -> None:
+def write_npz(
+    path: Path,
+    blocks: Iterable[PoseSequence],
+    count: int,
+    rate: float,
+    joints: int = 24,
+    about: Mapping[str, str] = MappingProxyType({}),
+) -> None:
     """Write poses, keeping only a part of them in memory.
 
     Args:
@@ -168,6 +193,8 @@ def write_npz(path: Path, blocks: Iterable[PoseSequence], count: int, rate: floa
         count: total number of poses.
         rate: frames per second.
         joints: a key of `JOINT_COUNTS`.
+        about: see `PoseSequence`.
+        about: see `PoseSequence`.
 
     Raises:
         OSError: the file cannot be written.
@@ -195,6 +222,7 @@ def write_npz(path: Path, blocks: Iterable[PoseSequence], count: int, rate: floa
             "time_s": np.concatenate(times),
             "held": np.concatenate(held),
             "filling": np.concatenate(filling),
+            "about": np.array(json.dumps(dict(about))),
         }
         for key, values in arrays.items():
             with archive.open(f"{key}.npy", "w", force_zip64=True) as member:
