@@ -21,6 +21,7 @@ from edgepose.rotations import matrix_to_euler_zxy
 from edgepose.sinks import pose_file
 from edgepose.sinks.csv import CsvSink, pose_columns
 from edgepose.sinks.udp import UdpSink, decode_binary, encode_binary, encode_json
+from edgepose.sinks.vmc import VmcSink
 from edgepose.skeleton import JOINTS
 from edgepose.utils.sockets import parse_destination, resolve
 
@@ -374,6 +375,32 @@ def test_names_stand_for_their_address_of_ipv4(kind):
     assert resolve(None, 9, kind) == (socket.AF_INET, ("127.0.0.1", 9))
     assert resolve("localhost", 9, kind) == (socket.AF_INET, ("127.0.0.1", 9))
     assert resolve("::1", 9, kind)[0] == socket.AF_INET6
+
+
+def test_broadcast_reaches_those_who_listen():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("", 0))
+        receiver.settimeout(5)
+        port = receiver.getsockname()[1]
+        destination = parse_destination(f"127.255.255.255:{port},format=binary,broadcast")
+        with UdpSink(*destination) as sink:
+            sink.write(make_pose(1))
+        assert decode_binary(receiver.recv(2048)).index == 1
+
+
+@pytest.mark.parametrize(
+    ("host", "cast"),
+    [
+        ("127.255.255.255", "broadcast"),
+        ("255.255.255.255", "broadcast"),
+        ("224.0.0.251", "multicast"),
+        ("ff02::1", "multicast"),
+    ],
+)
+@pytest.mark.parametrize("sink", [UdpSink, VmcSink])
+def test_many_machines_must_be_asked_for(sink, host, cast):
+    with pytest.raises(EdgeposeError, match=f"{host} is a {cast} address, .*: write .*:9000,{cast} to send"):
+        sink(host, 9000)
 
 
 def test_udp_unknown_host():
