@@ -174,8 +174,9 @@ class DatagramSink(Sink):
 
 def _many_machines(host: str, port: int, cast: str) -> str:
     """Return the message about an address that stands for many machines."""
+    target = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
     return (
-        f"{host} is a {cast} address, at which many machines receive: write {host}:{port},{cast} to send "
+        f"{host} is a {cast} address, at which many machines receive: write {target},{cast} to send "
         "there, or the address of one machine"
     )
 
