@@ -379,3 +379,16 @@ def test_a_bad_row_costs_only_itself(tmp_path, form):
     assert read.frames.tolist() == good
     assert "2 bad rows left out, the first: row 13 has a number that is infinite, not a number" in damage
     np.testing.assert_allclose(read.rotations, [poses(30)[i].rotations for i in good], atol=1e-5)
+
+
+def test_flags_for_other_programs(command, tmp_path):
+    write(tmp_path / "a.csv")
+    words = ("--to", "bvh", "--names", "unity", "--out", tmp_path / "unity")
+    assert command("convert", tmp_path / "a.csv", *words).returncode == 0
+    assert "LeftUpperArm" in read_bvh(tmp_path / "unity" / "a.bvh").names
+    words = ("--unit", "cm", "--to", "npz", "--joints", "52", "--out", tmp_path / "amass")
+    assert command("convert", tmp_path / "unity" / "a.bvh", *words).returncode == 0
+    assert np.load(tmp_path / "amass" / "a.npz")["poses"].shape == (20, 156)
+    check(write(tmp_path / "b.csv"), 20)
+    read = read_poses(tmp_path / "amass" / "a.npz")
+    np.testing.assert_allclose(read.rotations[:, :22], [pose.rotations[:22] for pose in poses(20)], atol=1e-5)
