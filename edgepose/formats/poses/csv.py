@@ -62,13 +62,18 @@ def read_blocks(path: str | Path) -> Iterator[PoseSequence]:
     """
     path = Path(path)
     name = name_of(path)
-    ledger = Ledger(name)
+    ledger, parser = Ledger(name), None
     try:
         with open_table(
             path, {"frame", "time_s"}.issubset, "frame,time_s,status,pelvis_...", MAX_LINE
         ) as table:
-            parser = _Parser(_columns(table, name), ledger)
+            parser = _Parser(_columns(table), ledger)
             yield from filter(None, map(parser.block, _blocks(table.rows)))
+    except FileFormatError as error:
+        if parser is None:
+            reason = str(error).removeprefix(f"{name}: ")
+            raise FileFormatError(f"{name} is not a file of poses: {reason}") from None
+        raise FileFormatError("; ".join(filter(None, [ledger.damage(), str(error)]))) from None
     except OSError as error:
         raise FileFormatError(f"cannot read poses from {path}: {error.strerror or error}") from error
     except csv.Error as error:
@@ -116,8 +121,12 @@ class _Columns(NamedTuple):
     translation: list[int]
 
 
-def _columns(table: Table, name: str) -> _Columns:
-    """Find the columns by their names."""
+def _columns(table: Table) -> _Columns:
+    """Find the columns by their names.
+
+    Raises:
+        FileFormatError: some are missing.
+    """
     at = {column: index for index, column in reversed(list(enumerate(table.names)))}
     for form in sorted(
         ROTATION_FORMATS, key=lambda form: -len(ROTATION_FORMATS[form])
@@ -134,8 +143,7 @@ def _columns(table: Table, name: str) -> _Columns:
                 translation if len(translation) == len(TRANSLATION) else [],
             )
     raise FileFormatError(
-        f"{name} is not a file of poses: the names of its columns must be frame, time_s, status, pelvis_..., "
-        "for all 24 joints"
+        "the names of its columns must be frame, time_s, status, pelvis_..., for all 24 joints"
     )
 
 
