@@ -185,7 +185,8 @@ class OutputConfig:
             check_output(target, "poses", (SINKS[name].suffix,), self.overwrite)
 
     def _files(self) -> list[tuple[str, str]]:
-        return [(name, target) for name, target in self.targets if name in SINKS and SINKS[name].suffix]
+        files = [(name, target) for name, target in self.targets if name in SINKS and SINKS[name].suffix]
+        return [(name, SINKS[name].file(target)) for name, target in files]
 
 
 def _target(name: str, value: Any) -> Any:

@@ -67,6 +67,9 @@ class Options(NamedTuple):
         filter: orientation filter, see `orient_recording`; "none" keeps the file's orientations.
         height_m: the wearer's stature, for the bones of BVH files, metres.
         overwrite: replace existing files.
+        unit: of lengths in BVH files to read, a key of `UNITS` in `formats.poses.bvh`; None infers it.
+        joints: number of joints in NPZ files of poses, a key of `JOINT_COUNTS`.
+        names: names of the joints in BVH files to write, a key of `BVH_NAMES`.
     """
 
     protocol: str = "auto"
@@ -74,6 +77,9 @@ class Options(NamedTuple):
     filter: str = "none"
     height_m: float = 1.75
     overwrite: bool = True
+    unit: str | None = None
+    joints: int = 24
+    names: str = "smpl"
 
 
 _DEFAULTS = Options()
@@ -209,7 +215,7 @@ def convert(job: Job, options: Options = _DEFAULTS) -> Result:
             if options.filter != "none":
                 raise EdgeposeError(f"{job.source}: --filter is for recordings, not for poses; leave it out")
             _make_folder(job.target.parent)
-            return Result(job, *convert_poses(job.source, job.target, options.height_m, options.overwrite))
+            return Result(job, *convert_poses(job.source, job.target, options))
         recording = read_file(job.source, options.protocol, options.sensors)
         data = recording.sensors.values()
         if not data:
@@ -293,13 +299,13 @@ def _ignore_interrupts() -> None:
 # --- poses --------------------------------------------------------------------------------------------------
 
 
-def _write_poses(path: Path, poses: PoseSequence, height_m: float) -> None:
+def _write_poses(path: Path, poses: PoseSequence, options: Options) -> None:
     if path.suffix == ".npz":
-        write_poses_npz(path, [poses], len(poses.frames), poses.rate)
+        write_poses_npz(path, [poses], len(poses.frames), poses.rate, options.joints, poses.about)
         return
     sink: Sink
     if path.suffix == ".bvh":
-        sink = BvhSink(path, poses.rate, default_body(height_m))
+        sink = BvhSink(path, poses.rate, default_body(options.height_m), options.names)
     else:
         sink = CsvSink(path, translation=poses.translation is not None)
     with sink:
@@ -307,16 +313,13 @@ def _write_poses(path: Path, poses: PoseSequence, height_m: float) -> None:
             sink.write(pose)
 
 
-def convert_poses(
-    source: Path, target: Path, height_m: float, overwrite: bool = True
-) -> tuple[int, float, str | None]:
+def convert_poses(source: Path, target: Path, options: Options = _DEFAULTS) -> tuple[int, float, str | None]:
     """Convert the good part of a file of poses; the target appears once it is complete.
 
     Args:
         source: file that `edgepose.formats.poses.registry.read_poses` reads.
         target: .csv, .npz or .bvh file.
-        height_m: the wearer's stature, for the bones of a BVH file, metres.
-        overwrite: replace an existing file.
+        options: options of the conversion.
 
     Returns:
         Number of poses, seconds from the first to the last, and one line about the bad part, if any.
@@ -324,14 +327,16 @@ def convert_poses(
     Raises:
         EdgeposeError: no part of the source is good, or the target cannot be written.
     """
-    poses, damage = salvage_poses(source)
+    poses, damage = salvage_poses(source, options.unit)
     read = poses
     if target.suffix != ".csv":  # the others hold no frame numbers, or programs ignore them
         poses, missing = fill_missing_frames(poses, str(source))
         if missing:
             gaps = f"{source}: {missing} frames are missing between its poses; they are interpolated"
             damage = gaps if damage is None else f"{damage}; {gaps}"
-    replace_file(target, lambda path: _write_poses(path, poses, height_m), "poses", overwrite=overwrite)
+    replace_file(
+        target, lambda path: _write_poses(path, poses, options), "poses", overwrite=options.overwrite
+    )
     return len(read.frames), float(read.time_s[-1] - read.time_s[0]), damage
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 from functools import lru_cache
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -92,6 +93,7 @@ class PoseSequence(NamedTuple):
         translation: (T, 3) position of the pelvis in T, metres, if the file has it.
         held: T sets, see `PoseFrame`.
         warming_up: T flags, see `PoseFrame`.
+        about: what the file says about its origin: `model`, `calibration`, `source`, `date`, `edgepose`.
     """
 
     frames: NDArray[np.int64]
@@ -100,6 +102,7 @@ class PoseSequence(NamedTuple):
     translation: Array | None
     held: list[frozenset[str]]
     warming_up: list[bool]
+    about: Mapping[str, str] = MappingProxyType({})
 
     @property
     def status(self) -> list[str]:

@@ -65,10 +65,27 @@ def local_from_global(rotations: ArrayLike) -> Array:
     return local
 
 
+def grounded_pelvis_position(local: ArrayLike, offsets: ArrayLike) -> Array:
+    """Return the pelvis position of a body whose lowest joint is on the ground, above the origin of T.
+
+    This is where all outputs show a body if nothing estimates its position.
+
+    Args:
+        local: (..., 24, 3, 3) rotation of each joint relative to its parent; joint 0 relative to T.
+        offsets: (24, 3) joint position minus its parent's in the zero pose, metres.
+
+    Returns:
+        (..., 3) position, metres.
+    """
+    heights = forward_kinematics(local, offsets)[1][..., 1]
+    position = np.zeros((*heights.shape[:-1], 3))
+    position[..., 1] = heights[..., 0] - heights.min(axis=-1)
+    return position
+
+
 def standing_pelvis_position(offsets: ArrayLike) -> Array:
     """Return the pelvis position (3,) above ground of a body standing straight, metres; offsets (24, 3)."""
-    _, joints = forward_kinematics(np.tile(np.eye(3), (len(JOINTS), 1, 1)), offsets)
-    return np.array([0.0, joints[0, 1] - joints[:, 1].min(), 0.0])
+    return grounded_pelvis_position(np.tile(np.eye(3), (len(JOINTS), 1, 1)), offsets)
 
 
 # --- the default body ------------------------------------------------------------------------------------

@@ -136,6 +136,7 @@ def skeleton_strip(
     offsets: ArrayLike,
     reference: ArrayLike | None = None,
     title: str | None = None,
+    notes: Sequence[str] = (),
 ) -> None:
     """Draw stick figures at K instants side by side, with reference figures in a second row.
 
@@ -146,6 +147,7 @@ def skeleton_strip(
         offsets: (24, 3) joint position minus its parent's in the zero pose, metres.
         reference: (K, 24, 3, 3) local rotations of the reference at the same instants.
         title: line above the figures.
+        notes: K texts below the times; none by default.
 
     Raises:
         EdgeposeError: matplotlib is not installed, or the file cannot be written.
@@ -157,18 +159,21 @@ def skeleton_strip(
         rows.append((flatten(reference, offsets), REFERENCE))
     if any(len(figures) != len(times) for figures, _ in rows) or not len(times):
         raise ValueError("poses, times and reference must be for the same instants, at least one")
-    save_picture(_draw_rows(rows, times, title), path, overwrite=True, dpi=DPI)
+    labels = [f"{time:.2f} s" for time in times]
+    if notes:
+        labels = ["\n".join(pair) for pair in zip(labels, notes, strict=True)]
+    save_picture(_draw_rows(rows, labels, title), path, overwrite=True, dpi=DPI)
 
 
 def _draw_rows(
-    rows: Sequence[tuple[list[FlatBody], dict[str, str]]], times: Array, title: str | None
+    rows: Sequence[tuple[list[FlatBody], dict[str, str]]], labels: Sequence[str], title: str | None
 ) -> Figure:
-    """Draw rows of figures, each with its colours, above their times, with a legend and a title."""
+    """Draw rows of figures, each with its colours, above their labels, with a legend and a title."""
     from matplotlib.figure import Figure
 
     centres, width = _columns([figures for figures, _ in rows])
     height = max(_top(f) for figures, _ in rows for f in figures) + 0.12
-    label = 0.24  # metres below the last ground line
+    label = 0.24 + 0.2 * max(text.count("\n") for text in labels)  # metres below the last ground line
     title_in, legend_in = 0.3 if title else 0.0, 0.36  # inches above the figures
     head_in = title_in + legend_in
     total = len(rows) * height + label
@@ -187,9 +192,9 @@ def _draw_rows(
         axes.plot([0.1, width - 0.1], [ground, ground], color="#DDDDDD", linewidth=1.0, zorder=0)
         for figure_2d, centre in zip(figures, centres, strict=True):
             draw_body(axes, figure_2d, np.array([centre, ground]), colours, 72.0 * scale)
-    for centre, time in zip(centres, times, strict=True):
+    for centre, text in zip(centres, labels, strict=True):
         y = -(len(rows) - 1) * height - 0.05
-        axes.text(centre, y, f"{time:.2f} s", ha="center", va="top", fontsize=8, color=INK)
+        axes.text(centre, y, text, ha="center", va="top", fontsize=8, color=INK)
 
     inch = 1.0 / (body_in + head_in)  # of the figure's height
     if title:

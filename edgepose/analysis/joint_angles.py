@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from edgepose.placements import PLACEMENTS
 from edgepose.rotations import transpose
 from edgepose.skeleton import JOINTS, forward_kinematics
 
@@ -29,6 +30,8 @@ ANGLES = {
     "trunk lean": "chest from upright",
 }
 """Angles and their descriptions; those of limbs exist for either side."""
+
+_SENSORS = {"hip": "lower_leg", "knee": "lower_leg", "shoulder": "forearm", "elbow": "forearm"}
 
 LIMBS = tuple(name for name in ANGLES if not name.startswith("trunk"))
 
@@ -64,6 +67,23 @@ def joint_angles(local: Array) -> dict[str, Array]:
     result["trunk rotation"] = np.arctan2(front[:, 0], front[:, 2])
     result["trunk lean"] = np.arccos(np.clip(chest[:, 1, 1], -1.0, 1.0))
     return {name: np.degrees(values) for name, values in result.items()}
+
+
+def held_angles(held: NDArray[np.bool_]) -> dict[str, NDArray[np.bool_]]:
+    """Return in which poses (T,) each angle of `joint_angles` was not measured, from `held` (T, 6).
+
+    An angle needs the pelvis and the sensor at the end of its limb; those of the trunk need the head.
+    """
+    columns = dict(zip(PLACEMENTS, held.T, strict=True))
+    result = {}
+    for name in ANGLES:
+        if name in LIMBS:
+            for side in ("left", "right"):
+                sensor = f"{side}_{_SENSORS[name.split()[0]]}"
+                result[f"{side} {name}"] = columns[sensor] | columns["pelvis"]
+        else:
+            result[name] = columns["head"] | columns["pelvis"]
+    return result
 
 
 # --- steps --------------------------------------------------------------------------------------------------

@@ -16,14 +16,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import edgepose
 from edgepose.analysis.figures import INK, PREDICTION, require_matplotlib, skeleton_strip
-from edgepose.analysis.joint_angles import ANGLES, LIMBS, WalkingBout, joint_angles, walking_bouts
+from edgepose.analysis.joint_angles import (
+    ANGLES,
+    LIMBS,
+    WalkingBout,
+    held_angles,
+    joint_angles,
+    walking_bouts,
+)
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseSequence, held_sensors, longest_holds
 from edgepose.skeleton import Body
 from edgepose.utils.durable_files import write_whole
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 FIGURES = 8
 """Number of instants that are drawn."""
@@ -35,13 +44,16 @@ STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 60rem; margin: 2rem auto; }
 h1 { font-size: 1.5rem; } h2 { font-size: 1.1rem; margin-top: 2rem; }
 table { border-collapse: collapse; } th, td { padding: .15rem .8rem .15rem 0; text-align: right; }
-th:first-child, td:first-child, td:nth-child(6), th:nth-child(6) { text-align: left; }
+th:first-child, td:first-child, td:nth-child(7), th:nth-child(7) { text-align: left; }
+.about td { text-align: left; }
 th { border-bottom: 1px solid #999; }
 img { max-width: 100%; } .note { color: #666; }
 """
 
 
-def write_report(path: Path, poses: PoseSequence, body: Body, name: str, overwrite: bool = True) -> None:
+def write_report(
+    path: Path, poses: PoseSequence, body: Body, name: str, overwrite: bool = True, date: str = ""
+) -> None:
     """Write the page.
 
     Args:
@@ -50,25 +62,29 @@ def write_report(path: Path, poses: PoseSequence, body: Body, name: str, overwri
         body: for the figures, and for the steps, which are found from the feet.
         name: of the poses, for the heading.
         overwrite: whether an existing file may be replaced.
+        date: of the file, for poses that do not say when they were made.
 
     Raises:
         EdgeposeError: matplotlib is not installed, or the file cannot be written.
     """
     require_matplotlib("a report")
     angles = joint_angles(poses.rotations)
+    held = held_angles(held_sensors(poses.held))
     bouts = walking_bouts(poses.rotations, body.offsets, poses.rate)
     times = poses.time_s - poses.time_s[0]
     parts = [
         f"<h1>{html.escape(name)}</h1>",
         f"<p>{len(times)} poses, {times[-1]:.1f} s, {poses.rate:g} a second</p>",
+        _origin(poses, name, date),
         _image(_strip(poses, times, body), "Figures at instants of the recording"),
         "<h2>Steps</h2>",
         *_steps(bouts, times, poses.rate),
         "<h2>Angles over time</h2>",
-        _image(_plots(times, angles, bouts), "Joint angles over time"),
-        "<p class='note'>Light: left, dark: right. Grey: walking.</p>",
+        _image(_plots(times, angles, held, bouts), "Joint angles over time"),
+        "<p class='note'>Light: left, dark: right. Grey: walking. Dotted, on hatching: not measured, because "
+        "a sensor of the angle sent nothing and its last values were repeated.</p>",
         "<h2>Range of motion</h2>",
-        _ranges(angles),
+        _ranges(angles, held),
         "<h2>Sensors</h2>",
         *_sensors(poses),
     ]
@@ -77,6 +93,27 @@ def write_report(path: Path, poses: PoseSequence, body: Body, name: str, overwri
         f"<style>{STYLE}</style></head><body>{chr(10).join(parts)}</body></html>\n"
     )
     write_whole(path, page, "the report", overwrite=overwrite)
+
+
+def _origin(poses: PoseSequence, name: str, date: str) -> str:
+    """Tabulate where the poses come from, as far as the file says."""
+    about = poses.about
+    rows = [
+        ("poses", name),
+        ("recording or port", about.get("source", "")),
+        ("made", about.get("date", f"{date} (date of the file)" if date else "")),
+        ("model", about.get("model", "")),
+        ("calibration", about.get("calibration", "")),
+        ("made with", f"edgepose {about['edgepose']}" if "edgepose" in about else ""),
+        ("report made with", f"edgepose {edgepose.__version__}"),
+    ]
+    table = _table(("", ""), [(key, html.escape(value)) for key, value in rows if value])
+    if not about:
+        table += (
+            "<p class='note'>Model, calibration and recording are not in this file. The NPZ files of "
+            "edgepose run hold them.</p>"
+        )
+    return table.replace("<table>", "<table class='about'>", 1)
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -93,7 +130,9 @@ def _strip(poses: PoseSequence, times: Array, body: Body) -> bytes:
     chosen = np.unique(np.linspace(0, len(times) - 1, FIGURES).round().astype(int))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "strip.png"
-        skeleton_strip(path, poses.rotations[chosen], times[chosen], body.offsets)
+        notes = ["held" if poses.held[i] else "" for i in chosen]
+        shown = notes if any(notes) else []
+        skeleton_strip(path, poses.rotations[chosen], times[chosen], body.offsets, notes=shown)
         return path.read_bytes()
 
 
@@ -109,8 +148,10 @@ def extremes(values: Array) -> NDArray[np.int64]:
     return np.unique(np.minimum(rows, len(values) - 1))
 
 
-def _plots(times: Array, angles: dict[str, Array], bouts: Sequence[WalkingBout]) -> bytes:
-    """Plot each angle in a panel, left and right together."""
+def _plots(
+    times: Array, angles: dict[str, Array], held: dict[str, Flags], bouts: Sequence[WalkingBout]
+) -> bytes:
+    """Plot each angle in a panel, left and right together; values that were not measured look different."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, 1.35 * len(ANGLES)), dpi=110, facecolor="white", layout="constrained")
@@ -120,9 +161,9 @@ def _plots(times: Array, angles: dict[str, Array], bouts: Sequence[WalkingBout])
             panel.axvspan(times[bout.frames[0]], times[bout.frames[-1]], color="#EEEEEE", linewidth=0)
         sides = ("left", "right") if name in LIMBS else ("trunk",)
         for side in sides:
-            values = angles[f"{side} {name}" if name in LIMBS else name]
-            shown = extremes(values)
-            panel.plot(times[shown], values[shown], color=PREDICTION[side], linewidth=1.0)
+            key = f"{side} {name}" if name in LIMBS else name
+            shown = extremes(angles[key])
+            _plot_line(panel, times[shown], angles[key][shown], held[key][shown], PREDICTION[side])
         panel.set_title(f"{name}, deg", loc="left", fontsize=9, color=INK)
         panel.tick_params(labelsize=8)
         panel.grid(color="#E5E5E5", linewidth=0.6)
@@ -134,16 +175,37 @@ def _plots(times: Array, angles: dict[str, Array], bouts: Sequence[WalkingBout])
     return picture.getvalue()
 
 
-def _ranges(angles: dict[str, Array]) -> str:
-    """Tabulate smallest and largest value, range and mean of each angle, without outliers."""
+def _plot_line(panel: Any, times: Array, values: Array, held: Flags, colour: str) -> None:
+    """Plot values (n,), those that are held (n,) dotted on hatching."""
+    panel.plot(times, np.where(held, np.nan, values), color=colour, linewidth=1.0)
+    if held.any():
+        # With its neighbours, so that the line has no gaps.
+        near = held | np.roll(held, 1) & (np.arange(len(held)) > 0) | np.roll(held, -1) & (times < times[-1])
+        panel.plot(
+            times, np.where(near, values, np.nan), color=colour, linewidth=0.8, linestyle=":", alpha=0.6
+        )
+        panel.fill_between(
+            times, 0.0, 1.0, where=near, transform=panel.get_xaxis_transform(), facecolor="none",
+            hatch="////", edgecolor="#DDDDDD", linewidth=0.0, zorder=0,
+        )  # fmt: skip
+
+
+def _ranges(angles: dict[str, Array], held: dict[str, Flags]) -> str:
+    """Tabulate smallest and largest value, range and mean of each measured angle, without outliers."""
     rows = []
     for name, about in ANGLES.items():
         for key in (f"left {name}", f"right {name}") if name in LIMBS else (name,):
-            low, high = np.percentile(angles[key], [0.5, 99.5])
-            mean = angles[key].mean()
-            rows.append((key, *(f"{round(value):d}" for value in (low, high, high - low, mean)), about))
-    table = _table(("angle, deg", "least", "most", "range", "mean", "what it is"), rows)
-    note = "The lowest and the highest 0.5 % of the poses are left out. All are 0 when standing straight."
+            measured = angles[key][~held[key]]
+            numbers = ["-"] * 4
+            if len(measured):
+                low, high = np.percentile(measured, [0.5, 99.5])
+                numbers = [f"{round(value):d}" for value in (low, high, high - low, measured.mean())]
+            rows.append((key, *numbers, f"{100 * held[key].mean():.0f} %", about))
+    table = _table(("angle, deg", "least", "most", "range", "mean", "not measured", "what it is"), rows)
+    note = (
+        "Poses in which the angle was not measured are left out, and so are the lowest and the highest 0.5 % "
+        "of the others. All angles are 0 when standing straight."
+    )
     return f"{table}<p class='note'>{note}</p>"
 
 

@@ -20,12 +20,13 @@ from edgepose.utils.safe_npz import check_size
 Array = NDArray[np.float64]
 
 _CHANNELS = {
-    f"{axis}{kind}": (kind, "xyz".index(axis.lower())) for axis in "XYZ" for kind in ("position", "rotation")
+    f"{axis}{kind}": (kind, index) for index, axis in enumerate("xyz") for kind in ("position", "rotation")
 }
 
 FRAME_TIMES = (1e-5, 1e2)
 """Shortest and longest plausible time of a frame, seconds."""
 
+_SLOWEST_S = 5.0  # programs that write the rate instead write 10 or more
 _LONGEST_LINE = 1 << 20  # characters; a frame of 1000 joints has fewer than 50,000
 _MOST_JOINTS = 10_000
 _JOINT_BYTES = 8 * (9 + 3)  # memory for a joint of a frame
@@ -121,7 +122,7 @@ class _Hierarchy:
 
     def parse(self, number: int, words: list[str]) -> bool:
         """Take the words of a line, counted from 1; return whether it is MOTION, the end of the hierarchy."""
-        key, rest = words[0], words[1:]
+        key, rest = words[0].upper(), words[1:]
         if key == "{":
             if self._pending is None:
                 fail(self._path, number, "a brace opens without a joint")
@@ -133,7 +134,7 @@ class _Hierarchy:
             self._close(number)
         elif key in ("ROOT", "JOINT"):
             self._begin_joint(number, key, " ".join(rest))
-        elif key == "End":
+        elif key == "END":
             if not self._open or self._open[-1] == _END_SITE:
                 fail(self._path, number, "an end site outside a joint")
             self._pending = _END_SITE
@@ -148,7 +149,7 @@ class _Hierarchy:
                 fail(self._path, number, "MOTION before the hierarchy is closed")
             return True
         else:
-            fail(self._path, number, f"{key!r} is not expected here")
+            fail(self._path, number, f"{words[0]!r} is not expected here")
         return False
 
     def _close(self, number: int) -> None:
@@ -174,7 +175,7 @@ class _Hierarchy:
         self.channels.append(_MISSING)
 
     def _parse_channels(self, number: int, words: list[str]) -> list[_Channel]:
-        kinds = [_CHANNELS.get(word) for word in words[1:]]
+        kinds = [_CHANNELS.get(word.lower()) for word in words[1:]]
         known = [kind for kind in kinds if kind is not None]
         if (
             not words
@@ -197,7 +198,7 @@ def _read_hierarchy(path: Path, lines: Iterator[tuple[int, str]]) -> _Hierarchy:
     number, words = next(filled, (0, [""]))
     if not number:
         raise FileFormatError(f"{path}: empty file")
-    if words[0] != "HIERARCHY":
+    if words[0].upper() != "HIERARCHY":
         fail(path, number, "not a BVH file: HIERARCHY was expected")
     for number, words in filled:
         if hierarchy.parse(number, words):
@@ -205,21 +206,33 @@ def _read_hierarchy(path: Path, lines: Iterator[tuple[int, str]]) -> _Hierarchy:
     raise FileFormatError(f"{path}: ends within the hierarchy, before MOTION")
 
 
+def _frame_time(path: Path, line: int, words: list[str]) -> float:
+    """Parse the seconds from frame to frame, in a line counted from 1."""
+    seconds = numbers(path, line, words, 1)[0]
+    if seconds > _SLOWEST_S:
+        hint = f"; if this is a rate, write {1.0 / seconds:.6f}"
+        fail(path, line, f"a frame time of {seconds:g} s is not plausible{hint}")
+    if seconds < FRAME_TIMES[0]:
+        fail(path, line, f"a frame time of {seconds:g} s is not possible")
+    return seconds
+
+
 def _motion(path: Path, lines: Iterator[tuple[int, str]], width: int) -> tuple[float, Array, str | None]:
     """Read frame time (s), channel values (T, width) before the first bad row, and the problem with it."""
     filled = ((number, line, words) for number, line in lines if (words := line.split()))
-    at_count, _, count = next(filled, (0, "", []))
-    at_time, _, time = next(filled, (0, "", []))
-    if not time:
+    at_count, count_line, _ = next(filled, (0, "", []))
+    at_time, time_line, _ = next(filled, (0, "", []))
+    if not time_line:
         raise FileFormatError(f"{path}: ends before the first frame")
-    if len(count) != 2 or count[0] != "Frames:" or not count[1].isdecimal() or len(count[1]) > 15:
+    key, _, count = count_line.partition(":")
+    count = count.strip()
+    if key.strip().lower() != "frames" or not count.isdecimal() or len(count) > 15:
         fail(path, at_count, "'Frames: <count>' was expected")
-    if time[:2] != ["Frame", "Time:"]:
+    key, _, time = time_line.partition(":")
+    if key.lower().split() != ["frame", "time"]:
         fail(path, at_time, "'Frame Time: <seconds>' was expected")
-    frame_time = numbers(path, at_time, time[2:], 1)[0]
-    if not FRAME_TIMES[0] < frame_time < FRAME_TIMES[1]:
-        fail(path, at_time, f"a frame time of {frame_time:g} s is not possible")
-    announced = int(count[1])
+    frame_time = _frame_time(path, at_time, time.split())
+    announced = int(count)
     values, frames, whole, problem = array("d"), 0, True, None
     try:
         for number, line, words in filled:

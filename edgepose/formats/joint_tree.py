@@ -61,7 +61,7 @@ def numbers(path: Path, line: int, words: list[str], count: int) -> list[float]:
         FileFormatError: a word is not a number, is not finite or beyond `LARGEST`, or the count differs.
     """
     try:
-        values = [float(word) for word in words]
+        values = [float(word.replace(",", ".")) for word in words]  # some programs write decimal commas
     except ValueError:
         fail(path, line, "a number was expected")
     if len(values) != count:

@@ -10,8 +10,9 @@ from __future__ import annotations
 import codecs
 import csv
 import re
+import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from math import isfinite, nan
 from pathlib import Path
 from typing import NamedTuple, TextIO
@@ -71,52 +72,73 @@ def encoding_of(path: Path) -> str:
 
 
 @contextmanager
-def open_table(path: Path, fits: Callable[[Sequence[str]], bool], wanted: str) -> Iterator[Table]:
+def open_table(
+    path: Path, fits: Callable[[Sequence[str]], bool], wanted: str, longest: int = MAX_LINE
+) -> Iterator[Table]:
     """Open a table of which the columns are known by name.
 
     Args:
-        path: the file.
+        path: the file; "-" is standard input.
         fits: whether cells are the names of the columns.
         wanted: the first of these columns, for the message.
+        longest: limit of a line, characters.
 
     Raises:
-        FileFormatError: no line has these columns, or a line is longer than MAX_LINE.
+        FileFormatError: no line has these columns, or a line is longer than the limit.
         OSError: the file cannot be read.
+        UnicodeDecodeError: standard input is not text.
     """
-    with path.open(encoding=encoding_of(path), errors="replace", newline="") as file:
-        lines = _Lines(path, file)
+    name = name_of(path)
+    with _open(path) as file:
+        lines = _Lines(name, file, longest)
         head: list[str] = []
         for line in lines:
+            if lines.number == 1:
+                line = line.removeprefix("\ufeff")  # of standard input
             split = {mark: _trimmed(next(csv.reader([line], delimiter=mark))) for mark in SEPARATORS}
             separator = max(SEPARATORS, key=lambda mark: len(split[mark]))
             if split[separator] and fits(split[separator]):
                 names = split[separator]
-                yield Table(head, names, _rows(path, lines, separator, names))
+                yield Table(head, names, _rows(name, lines, separator, names))
                 return
             head.append(line.strip())
             if len(head) == HEAD_LINES:
                 break
-        first = next((line for line in head if line), "")
-        raise FileFormatError(f"{path}: starts with {first[:40]!r}, not with {wanted!r}")
+        first = next((line for line in head if line), None)
+        if first is None:
+            raise FileFormatError(f"{name}: the file is empty")
+        raise FileFormatError(f"{name}: starts with {first[:40]!r}, not with {wanted!r}")
+
+
+def name_of(path: Path) -> str:
+    """Return the name of a table for messages."""
+    return "standard input" if str(path) == "-" else str(path)
+
+
+def _open(path: Path) -> AbstractContextManager[TextIO]:
+    if str(path) == "-":
+        return nullcontext(sys.stdin)
+    # With "replace", a byte that is not text costs only its row.
+    return path.open(encoding=encoding_of(path), errors="replace", newline="")
 
 
 class _Lines(CountedLines):
     """Lines of a table; the csv module joins those of a quoted line break."""
 
-    def __init__(self, path: Path, file: TextIO) -> None:
-        super().__init__(file)
-        self._path = path
+    def __init__(self, name: str, file: TextIO, longest: int) -> None:
+        super().__init__(file, longest)
+        self._name, self._longest = name, longest
 
     def __next__(self) -> str:
         line = super().__next__()
         if self.too_long:
             raise FileFormatError(
-                f"{self._path}: row {self.number} is longer than {MAX_LINE} characters; is it a table?"
+                f"{self._name}: row {self.number} is longer than {self._longest} characters; is it a table?"
             )
         return line
 
 
-def _rows(path: Path, lines: _Lines, separator: str, names: list[str]) -> Iterator[Row]:
+def _rows(name: str, lines: _Lines, separator: str, names: list[str]) -> Iterator[Row]:
     columns = len(names)
     for cells in csv.reader(lines, delimiter=separator, skipinitialspace=True):
         cells = tidied(cells, separator, columns)
@@ -124,7 +146,7 @@ def _rows(path: Path, lines: _Lines, separator: str, names: list[str]) -> Iterat
             continue
         if separator == "," and len(cells) > columns and len(cells) >= 2 * columns - 2:
             raise FileFormatError(
-                f"{path}: row {lines.number} has {len(cells)} cells for {columns} columns: its numbers have "
+                f"{name}: row {lines.number} has {len(cells)} cells for {columns} columns: its numbers have "
                 "decimal commas, and commas separate the columns, too; export it with decimal points"
             )
         yield Row(lines.number, cells, lines.ended)

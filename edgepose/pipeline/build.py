@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
+from datetime import datetime
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+import edgepose
 from edgepose.calibration import load_calibration
 from edgepose.calibration.misfit import MisfitDetector
 from edgepose.calibration.rezero import HeadingRezero
@@ -69,19 +71,29 @@ class OpenWearer:
             self._orient = OrientationStage(config.filter, magnetometer=calibration.north)
         self._sinks: list[Sink] = []
 
-    def open_outputs(self, stack: ExitStack, rate: float, stopped: Callable[[], bool]) -> None:
+    def open_outputs(self, stack: ExitStack, rate: float, model: str, stopped: Callable[[], bool]) -> None:
         """Open the outputs.
 
         Args:
             stack: closes them.
             rate: poses per second.
+            model: name of the model, for files that hold it.
             stopped: whether the run is to end, see `SinkContext`.
 
         Raises:
             EdgeposeError: an output cannot be written to.
         """
         with prefix_errors(self._config.name):
-            self._sinks = open_outputs(stack, self._config.outputs, rate, stopped, wearer=self._config.name)
+            about = {
+                "model": model,
+                "calibration": str(self._config.calibration),
+                "source": self._config.source.name,
+                "date": datetime.now().astimezone().isoformat(" ", "minutes"),
+                "edgepose": edgepose.__version__,
+            }
+            self._sinks = open_outputs(
+                stack, self._config.outputs, rate, stopped, wearer=self._config.name, about=about
+            )
 
     def pipeline(
         self, rate: float, future: int, several: bool, on_pose: Callable[[RunSummary], None]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from types import TracebackType
+from collections.abc import Callable, Mapping
+from types import MappingProxyType, TracebackType
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 from edgepose.pose import PoseFrame
@@ -75,6 +75,7 @@ class SinkContext(NamedTuple):
         std: write standard deviations, if the format has room for them.
         translation: poses have a translation.
         overwrite: replace existing files.
+        about: origin of the poses, see `PoseSequence`.
         stopped: whether the run is to end; a reader that has stopped reading is then not waited for.
         wearer: the wearer's name, for messages; empty for a single wearer.
     """
@@ -86,6 +87,7 @@ class SinkContext(NamedTuple):
     std: bool = False
     translation: bool = False
     overwrite: bool = False
+    about: Mapping[str, str] = MappingProxyType({})
     stopped: Callable[[], bool] = lambda: False
     wearer: str = ""
 

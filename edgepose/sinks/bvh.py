@@ -10,14 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
+from edgepose.formats.bvh_names import BVH_NAMES
 from edgepose.pose import PoseFrame
 from edgepose.rotations import matrix_to_euler_zxy
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.sinks.pose_file import PoseFileSink
 from edgepose.sinks.spooled import SpooledSink
-from edgepose.skeleton import JOINTS, PARENTS, Body, default_body, standing_pelvis_position
+from edgepose.skeleton import JOINTS, PARENTS, Body, default_body, grounded_pelvis_position
 from edgepose.utils.growing_files import GrowingFile
-from edgepose.utils.output_targets import is_stream
+from edgepose.utils.output_targets import FileTarget, is_stream
 
 Array = NDArray[np.float64]
 
@@ -32,8 +33,8 @@ _DIGITS = 10
 """Width of the number of frames, which is updated in place."""
 
 
-def hierarchy(offsets: Array) -> str:
-    """Return the skeleton part of a file; offsets (24, 3) in cm, row 0 the pelvis' position."""
+def hierarchy(offsets: Array, names: Sequence[str] = JOINTS) -> str:
+    """Return the skeleton part of a file; offsets (24, 3) in cm, row 0 the pelvis' position; 24 names."""
     children: dict[int, list[int]] = {joint: [] for joint in range(len(JOINTS))}
     for joint, parent in enumerate(PARENTS[1:], start=1):
         children[parent].append(joint)
@@ -42,7 +43,7 @@ def hierarchy(offsets: Array) -> str:
         indent = "  " * depth
         channels = "3 " if joint else "6 Xposition Yposition Zposition "
         result = [
-            f"{indent}{'JOINT' if joint else 'ROOT'} {JOINTS[joint]}",
+            f"{indent}{'JOINT' if joint else 'ROOT'} {names[joint]}",
             f"{indent}{{",
             f"{indent}  OFFSET {_text(offsets[joint])}",
             f"{indent}  CHANNELS {channels}Zrotation Xrotation Yrotation",
@@ -82,7 +83,13 @@ class BvhSink(PoseFileSink):
     """
 
     def __init__(
-        self, path: str | Path, rate: float = 60.0, body: Body | None = None, *, overwrite: bool = True
+        self,
+        path: str | Path,
+        rate: float = 60.0,
+        body: Body | None = None,
+        names: str = "smpl",
+        *,
+        overwrite: bool = True,
     ) -> None:
         """Open the file and write the skeleton.
 
@@ -90,13 +97,14 @@ class BvhSink(PoseFileSink):
             path: file to write; it appears with the first poses.
             rate: frames per second.
             body: body whose bone lengths are written; None for the default body.
+            names: names of the joints, a key of `BVH_NAMES`.
             overwrite: replace an existing file.
 
         Raises:
             EdgeposeError: the file cannot be written.
         """
         offsets = (body or default_body()).offsets.copy()
-        self._standing = standing_pelvis_position(offsets)
+        self._offsets = offsets
         self._channels = np.array(depth_first())
         self._before = np.zeros((len(JOINTS), 3))
         self._poses: list[PoseFrame] = []
@@ -108,7 +116,7 @@ class BvhSink(PoseFileSink):
             )
         output = GrowingFile(path, "poses", overwrite=overwrite)
         self._file = output.file
-        head = f"{hierarchy(offsets * 100)}MOTION\n{_COUNT}"
+        head = f"{hierarchy(offsets * 100, BVH_NAMES[names])}MOTION\n{_COUNT}"
         self._count_at = len(head)
         super().__init__(output, f"{head}{0:<{_DIGITS}}\nFrame Time: {1 / rate:.8f}\n".encode())
 
@@ -135,19 +143,24 @@ class BvhSink(PoseFileSink):
 
     def _rows(self, poses: Sequence[PoseFrame]) -> bytes:
         """Return the lines of channel values for poses."""
-        angles = matrix_to_euler_zxy(np.stack([pose.rotations for pose in poses]))
+        rotations = np.stack([pose.rotations for pose in poses])
+        angles = matrix_to_euler_zxy(rotations)
         # Without jumps of 360 degrees, because programs interpolate between frames.
         angles = np.unwrap(np.concatenate([self._before[None], angles]), axis=0)[1:]
         self._before = angles[-1]
-        positions = [self._standing if pose.translation is None else pose.translation for pose in poses]
+        positions = grounded_pelvis_position(rotations, self._offsets)
+        for i, pose in enumerate(poses):
+            if pose.translation is not None:
+                positions[i] = pose.translation
         values = np.degrees(angles[:, self._channels]).reshape(len(poses), -1)
-        table = np.concatenate([100.0 * np.array(positions, float), values], axis=1)
+        table = np.concatenate([100.0 * positions, values], axis=1)
         line = " ".join(["%.4f"] * table.shape[1]) + "\n"
         return "".join(line % tuple(row) for row in table.tolist()).encode()
 
 
-def open_sink(target: str, context: SinkContext) -> Sink:
+def open_sink(target: FileTarget, context: SinkContext) -> Sink:
     """Open a `BvhSink`; a device or pipe gets the file once it is complete."""
-    if target != "-" and is_stream(target):
-        return SpooledSink(target, lambda part: BvhSink(part, context.rate, context.body), context.stopped)
-    return BvhSink(target, context.rate, context.body, overwrite=context.overwrite)
+    settings = context.rate, context.body, target.option
+    if target.path != "-" and is_stream(target.path):
+        return SpooledSink(target.path, lambda part: BvhSink(part, *settings), context.stopped)
+    return BvhSink(target.path, *settings, overwrite=context.overwrite)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.csv import read_blocks
@@ -13,7 +15,7 @@ from edgepose.sinks.base import Sink, SinkContext
 from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.spooled import SpooledSink
 from edgepose.utils.durable_files import replace_file
-from edgepose.utils.output_targets import find_target, is_stream, part_path
+from edgepose.utils.output_targets import FileTarget, find_target, is_stream, part_path
 
 
 class NpzSink(Sink):
@@ -24,7 +26,14 @@ class NpzSink(Sink):
     """
 
     def __init__(
-        self, path: str | Path, rate: float = 60.0, translation: bool = False, *, overwrite: bool = True
+        self,
+        path: str | Path,
+        rate: float = 60.0,
+        translation: bool = False,
+        joints: int = 24,
+        about: Mapping[str, str] = MappingProxyType({}),
+        *,
+        overwrite: bool = True,
     ) -> None:
         """Open the CSV file.
 
@@ -32,6 +41,8 @@ class NpzSink(Sink):
             path: file to write.
             rate: frames per second.
             translation: whether the poses have a translation.
+            joints: number of joints to write, a key of `JOINT_COUNTS`.
+            about: origin of the poses, see `PoseSequence`.
             overwrite: replace an existing NPZ file; the CSV file of another run is never replaced.
 
         Raises:
@@ -47,7 +58,8 @@ class NpzSink(Sink):
                 f"{self._part} already exists, perhaps from a run that was cut off: save its poses with "
                 f"edgepose convert {self._part} --to npz --out saved, then delete it"
             )
-        self._rate, self._closed, self._count = rate, False, 0
+        self._settings = rate, joints, about
+        self._closed, self._count = False, 0
         self._csv = CsvSink(self._part, translation=translation, overwrite=False, follow=False)
         self._csv.start()
 
@@ -94,7 +106,7 @@ class NpzSink(Sink):
             try:
                 replace_file(
                     self._path,
-                    lambda path: write_npz(path, read_blocks(self._part), count, self._rate),
+                    lambda path: write_npz(path, read_blocks(self._part), count, *self._settings),
                     "poses",
                     overwrite=self._overwrite,
                 )
@@ -103,9 +115,9 @@ class NpzSink(Sink):
         self._part.unlink()
 
 
-def open_sink(target: str, context: SinkContext) -> Sink:
+def open_sink(target: FileTarget, context: SinkContext) -> Sink:
     """Open an `NpzSink`; a device or pipe gets the file once it is complete."""
-    rate, translation = context.rate, context.translation
-    if target != "-" and is_stream(target):
-        return SpooledSink(target, lambda part: NpzSink(part, rate, translation), context.stopped)
-    return NpzSink(target, rate, translation, overwrite=context.overwrite)
+    settings = context.rate, context.translation, int(target.option), context.about
+    if target.path != "-" and is_stream(target.path):
+        return SpooledSink(target.path, lambda part: NpzSink(part, *settings), context.stopped)
+    return NpzSink(target.path, *settings, overwrite=context.overwrite)

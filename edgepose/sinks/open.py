@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from types import MappingProxyType
 from typing import Any
 
 from edgepose.config import OutputConfig
@@ -22,6 +23,7 @@ def open_outputs(
     body: Body | None = None,
     translation: bool = False,
     wearer: str = "",
+    about: Mapping[str, str] = MappingProxyType({}),
 ) -> list[Sink]:
     """Open the sinks of one wearer. No file appears or is replaced before all of them are open.
 
@@ -33,6 +35,7 @@ def open_outputs(
         body: the wearer's body; None for the default body of the configured height.
         translation: every pose has a translation.
         wearer: the wearer's name, for messages.
+        about: origin of the poses, see `PoseSequence`.
 
     Returns:
         The sinks in the order in which each pose should be written to them.
@@ -49,6 +52,7 @@ def open_outputs(
         std=outputs.std,
         translation=translation,
         overwrite=outputs.overwrite,
+        about=about,
         stopped=stopped,
         wearer=wearer,
     )
@@ -69,4 +73,4 @@ def _rank(output: tuple[str, Any]) -> int:
         return 1
     if not SINKS[name].suffix:
         return 0
-    return 2 if has_reader(target) else 1
+    return 2 if has_reader(SINKS[name].file(target)) else 1

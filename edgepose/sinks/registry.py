@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 from edgepose.errors import ConfigError
-from edgepose.utils.output_targets import part_path
-from edgepose.utils.sockets import parse_destination, parse_host_and_port
+from edgepose.formats.bvh_names import BVH_NAMES
+from edgepose.utils.output_targets import FileTarget, parse_file, part_path
+from edgepose.utils.sockets import parse_datagram_address, parse_destination, parse_host_and_port
 
 if TYPE_CHECKING:
     from edgepose.sinks.base import SinkFactory
@@ -51,32 +53,41 @@ class Output:
             raise ConfigError(f"{value!r} is neither True nor False")
         return self.parse(str(value)) if isinstance(value, str | Path) else value
 
+    def file(self, target: Any) -> str:
+        """Return the file to which a target of an output with a suffix leads."""
+        return target.path if isinstance(target, FileTarget) else str(target)
+
 
 SINKS = {
     "csv": Output("edgepose.sinks.csv:open_sink", "Write poses as CSV; - is standard output.", suffix=".csv"),
     "npz": Output(
         "edgepose.sinks.npz:open_sink",
-        "Write poses as NPZ with the keys of AMASS at the end.",
+        "Write poses as NPZ with the keys of AMASS at the end. 24 joints are SMPL's, 52 SMPL-H's, "
+        "55 SMPL-X's.",
+        "FILE[,joints=24|52|55]",
+        partial(parse_file, key="joints", choices=("24", "52", "55")),
         suffix=".npz",
         part=part_path,
     ),
     "bvh": Output(
         "edgepose.sinks.bvh:open_sink",
-        "Write poses as BVH, for Blender and similar programs.",
+        f"Write poses as BVH, for Blender and similar programs. Names of the joints: {', '.join(BVH_NAMES)}.",
+        "FILE[,names=SKELETON]",
+        partial(parse_file, key="names", choices=tuple(BVH_NAMES)),
         suffix=".bvh",
     ),
     "udp": Output(
         "edgepose.sinks.udp:open_sink",
         "Send each pose as a datagram.",
-        "HOST:PORT[,format=json|binary]",
+        "HOST:PORT[,format=json|binary][,broadcast]",
         parse_destination,
     ),
     "osc": Output(
         "edgepose.sinks.vmc:open_sink",
         "Send each pose over OSC (the VMC protocol) to programs that show VRM avatars; most of them listen "
         "on port 39539.",
-        "HOST:PORT",
-        parse_host_and_port,
+        "HOST:PORT[,broadcast]",
+        parse_datagram_address,
     ),
     "tcp": Output(
         "edgepose.sinks.tcp:open_sink",

@@ -8,6 +8,7 @@ import struct
 from abc import abstractmethod
 from collections.abc import Sequence
 from functools import lru_cache
+from ipaddress import ip_address
 
 import numpy as np
 
@@ -105,15 +106,17 @@ class DatagramSink(Sink):
     live = True
     NAME = "udp"
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(self, host: str, port: int, cast: str = "") -> None:
         """Resolve the host name, once.
 
         Args:
             host: name or address.
             port: UDP port.
+            cast: "broadcast" or "multicast" if the address may stand for many machines.
 
         Raises:
-            EdgeposeError: the host is unknown, or there is no network to reach it.
+            EdgeposeError: the host is unknown, there is no network to reach it, or it stands for many
+                machines although `cast` does not say so.
         """
         self.unsent = 0
         self._address = f"{host}:{port}"
@@ -121,10 +124,17 @@ class DatagramSink(Sink):
             family, address = resolve(host, port, socket.SOCK_DGRAM)
         except (OSError, UnicodeError) as error:
             raise EdgeposeError(f"cannot find host {host!r} to send poses to: {error}") from error
+        if ip_address(address[0].partition("%")[0]).is_multicast and cast != "multicast":
+            raise EdgeposeError(_many_machines(host, port, "multicast"))
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)  # a full network queue loses a datagram instead of delaying a frame
         try:
+            if cast == "broadcast":
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
             self._socket.connect(address)
+        except PermissionError as error:  # Linux refuses broadcasts in this way
+            self._socket.close()
+            raise EdgeposeError(_many_machines(host, port, "broadcast")) from error
         except OSError as error:
             self._socket.close()
             raise EdgeposeError(
@@ -163,13 +173,22 @@ class DatagramSink(Sink):
             self._socket.send(datagram)
 
 
+def _many_machines(host: str, port: int, cast: str) -> str:
+    """Return the message about an address that stands for many machines."""
+    target = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+    return (
+        f"{host} is a {cast} address, at which many machines receive: write {target},{cast} to send "
+        "there, or the address of one machine"
+    )
+
+
 class UdpSink(DatagramSink):
     """Sends each pose as one datagram, JSON or binary."""
 
-    def __init__(self, host: str, port: int, format: str = "json") -> None:
+    def __init__(self, host: str, port: int, format: str = "json", cast: str = "") -> None:
         """Resolve the host name; `format` is "json" or "binary". See `DatagramSink`."""
         self._encode = {"json": encode_json, "binary": encode_binary}[format]
-        super().__init__(host, port)
+        super().__init__(host, port, cast)
 
     def encode(self, pose: PoseFrame) -> Sequence[bytes]:
         """Return the datagram of a pose."""

@@ -14,7 +14,8 @@ from edgepose.pose import PoseFrame
 from edgepose.rotations import matrix_to_quat
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.sinks.udp import DatagramSink
-from edgepose.skeleton import JOINTS, Body, default_body, standing_pelvis_position
+from edgepose.skeleton import JOINTS, Body, default_body, grounded_pelvis_position
+from edgepose.utils.sockets import Address
 
 BONES = {
     "Hips": "pelvis",
@@ -80,21 +81,22 @@ class VmcSink(DatagramSink):
 
     NAME = "osc"
 
-    def __init__(self, host: str, port: int, body: Body | None = None) -> None:
+    def __init__(self, host: str, port: int, body: Body | None = None, cast: str = "") -> None:
         """Resolve the host name.
 
         Args:
             host: name or address.
             port: UDP port.
             body: body whose bone lengths are sent; None for the default body.
+            cast: see `DatagramSink`.
         """
         offsets = (body or default_body()).offsets.copy()
-        self._standing = standing_pelvis_position(offsets)
+        self._offsets = offsets.copy()
         offsets[_ON_UPPER_CHEST] += offsets[_UPPER_CHEST]
         self._positions = offsets[_INDEX] * TO_UNITY
         self._start_s: float | None = None
         self._quats = np.zeros((len(BONES), 4))  # of the pose before
-        super().__init__(host, port)
+        super().__init__(host, port, cast)
 
     def encode(self, pose: PoseFrame) -> Sequence[bytes]:
         """Return the two bundles of a pose."""
@@ -108,7 +110,10 @@ class VmcSink(DatagramSink):
         self._quats = np.where(opposite, -quats, quats)
         w, x, y, z = self._quats.T
         positions = self._positions.copy()
-        positions[0] = (self._standing if pose.translation is None else pose.translation) * TO_UNITY
+        position = pose.translation
+        if position is None:
+            position = grounded_pelvis_position(pose.rotations, self._offsets)
+        positions[0] = position * TO_UNITY
         numbers = np.column_stack([positions, x, -y, -z, w]).astype(">f4")
         bones = [head + row.tobytes() for head, row in zip(_BONE_HEADS, numbers, strict=True)]
         # Relative, because single precision cannot hold fractions of a second of Unix time.
@@ -116,6 +121,6 @@ class VmcSink(DatagramSink):
         return _bundle([_OK, time_s, _ROOT, *bones[:_HALF]]), _bundle([time_s, *bones[_HALF:]])
 
 
-def open_sink(target: tuple[str, int], context: SinkContext) -> Sink:
-    """Open a `VmcSink` to a host and port."""
-    return VmcSink(*target, context.body)
+def open_sink(target: Address, context: SinkContext) -> Sink:
+    """Open a `VmcSink` to an address."""
+    return VmcSink(target.host, target.port, context.body, target.cast)

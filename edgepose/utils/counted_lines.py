@@ -9,16 +9,16 @@ MAX_LINE = 4096
 
 
 class CountedLines:
-    """Lines of a text file, counted; a longer one than MAX_LINE comes in pieces.
+    """Lines of a text file, counted; a longer one than the limit comes in pieces.
 
     Attributes:
         number: of the current line, from 1.
         line: the current line, or piece.
     """
 
-    def __init__(self, file: TextIO) -> None:
-        """Start before the first line of an open file."""
-        self._file = file
+    def __init__(self, file: TextIO, limit: int = MAX_LINE) -> None:
+        """Start before the first line of an open file; `limit` is that of a line, characters."""
+        self._file, self._limit = file, limit
         self.number = 0
         self.line = "\n"
 
@@ -28,7 +28,7 @@ class CountedLines:
 
     def __next__(self) -> str:
         """Return the next line, or piece of one."""
-        line = self._file.readline(MAX_LINE)
+        line = self._file.readline(self._limit)
         if not line:
             raise StopIteration
         self.number += self.ended
@@ -43,4 +43,4 @@ class CountedLines:
     @property
     def too_long(self) -> bool:
         """Whether the current line is a piece, or as long as one."""
-        return len(self.line) == MAX_LINE
+        return len(self.line) == self._limit

@@ -11,11 +11,11 @@ import os
 import re
 import stat
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import ConfigError, EdgeposeError
 
 _LINKS = 40
 
@@ -108,6 +108,28 @@ def check_free(paths: Iterable[Path], hint: str) -> None:
     if existing:
         rest = f" and {len(existing) - 1} others" if existing[1:] else ""
         raise EdgeposeError(f"{existing[0]}{rest}: already exists; {hint}")
+
+
+class FileTarget(NamedTuple):
+    """File to write, and the value of an option that follows its name after a comma."""
+
+    path: str
+    option: str
+
+
+def parse_file(text: str, key: str, choices: Sequence[str]) -> FileTarget:
+    """Parse "FILE[,key=value]"; the first choice is the default.
+
+    Raises:
+        ConfigError: an unknown key or value.
+    """
+    path, comma, option = text.rpartition(",")
+    name, equals, value = option.partition("=")
+    if not (comma and equals and name.isidentifier()):  # a comma in the name of a file
+        return FileTarget(text, choices[0])
+    if name != key or value not in choices or not path:
+        raise ConfigError(f"unknown option {option!r} of {path}: possible are {key}={'|'.join(choices)}")
+    return FileTarget(path, value)
 
 
 def is_stream(name: str | Path) -> bool:

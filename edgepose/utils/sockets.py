@@ -22,12 +22,25 @@ def resolve(host: str, port: int, kind: socket.SocketKind) -> tuple[socket.Addre
     return family, address
 
 
+CASTS = ("broadcast", "multicast")
+"""Words that permit an address of many machines."""
+
+
+class Address(NamedTuple):
+    """Host name or address, UDP port, and "broadcast" or "multicast" if it stands for many machines."""
+
+    host: str
+    port: int
+    cast: str = ""
+
+
 class Destination(NamedTuple):
-    """Destination of datagrams: host name or address, port, format "json" or "binary"."""
+    """Destination of datagrams: as `Address`, with the format "json" or "binary"."""
 
     host: str
     port: int
     format: str
+    cast: str = ""
 
 
 def parse_address(text: str) -> tuple[str, int]:
@@ -61,22 +74,40 @@ def parse_host_and_port(text: str) -> tuple[str, int]:
     return parse_address(text)
 
 
-def parse_destination(text: str) -> Destination:
-    """Parse "HOST:PORT[,format=json|binary]"; JSON is the default, see `parse_address`.
+def parse_datagram_address(text: str) -> Address:
+    """Parse "HOST:PORT[,broadcast|multicast]", see `parse_address`.
 
     Raises:
         ConfigError: the text has another form.
     """
     address, *options = text.split(",")
     host, port = parse_address(address)
-    form = "json"
+    for option in options:
+        if option not in CASTS:
+            raise ConfigError(f"unknown option {option!r} in {text!r}: possible are {', '.join(CASTS)}")
+    return Address(host, port, options[-1] if options else "")
+
+
+def parse_destination(text: str) -> Destination:
+    """Parse "HOST:PORT[,format=json|binary][,broadcast|multicast]"; JSON is the default, see `parse_address`.
+
+    Raises:
+        ConfigError: the text has another form.
+    """
+    address, *options = text.split(",")
+    host, port = parse_address(address)
+    form, cast = "json", ""
     for option in options:
         key, _, value = option.partition("=")
-        if key != "format":
+        if option in CASTS:
+            cast = option
+        elif key != "format":
             raise ConfigError(
-                f"unknown option {option!r} in {text!r}: the only one is format=json or format=binary"
+                f"unknown option {option!r} in {text!r}: possible are format=json, format=binary, "
+                f"{', '.join(CASTS)}"
             )
-        if value not in ("json", "binary"):
+        elif value not in ("json", "binary"):
             raise ConfigError(f"unknown format {value!r} in {text!r}: choose json or binary")
-        form = value
-    return Destination(host, port, form)
+        else:
+            form = value
+    return Destination(host, port, form, cast)

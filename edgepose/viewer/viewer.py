@@ -24,6 +24,7 @@ from edgepose.pose import PoseFrame, PoseSequence, held_sensors, longest_holds
 from edgepose.sinks.udp import decode
 from edgepose.skeleton import Body, forward_kinematics
 from edgepose.viewer.body_mesh import build, ground
+from edgepose.viewer.camera import FollowingCameras, place_first_camera
 
 Array = NDArray[np.float64]
 
@@ -74,8 +75,8 @@ class SkeletonView:
             )
             self._handles.append((solids, handle))
 
-    def show(self, rotations: Array, position: Array | None) -> None:
-        """Pose the body.
+    def show(self, rotations: Array, position: Array | None) -> Array:
+        """Pose the body, and return the position (3,) of its pelvis, metres.
 
         Args:
             rotations: (24, 3, 3) local rotations.
@@ -86,6 +87,7 @@ class SkeletonView:
             joints = joints - [0.0, ground(rotations, self._offsets), 0.0]
         for solids, handle in self._handles:
             handle.batched_wxyzs, handle.batched_positions = solids.posed(global_rotations, joints)
+        return np.asarray(joints[0])
 
 
 def _rgb(colour: str) -> tuple[int, ...]:
@@ -142,8 +144,7 @@ class Viewer:
         self._server.scene.add_grid(
             "/ground", plane="xz", infinite_grid=True, cell_size=0.5, fade_distance=12.0
         )
-        self._server.initial_camera.position = (0.8, 1.3, 2.1)
-        self._server.initial_camera.look_at = (0.0, 0.9, 0.0)
+        place_first_camera(self._server)
         self.figure = SkeletonView(self._server, "pose", body, POSE, None)
         self._updated_s = 0.0  # when the text was updated
 
@@ -165,6 +166,7 @@ class Viewer:
         """
         times, status = poses.time_s - poses.time_s[0], poses.status
         line = _TimeLine(self._server.gui, float(times[-1]))
+        cameras = FollowingCameras(self._server)
         text = self._server.gui.add_markdown("")
         track = _Track(self.figure, poses, self._body)
         second = None
@@ -179,7 +181,7 @@ class Viewer:
             i = int(np.searchsorted(times, line.advance(now) + 1e-9, side="right")) - 1
             if i != shown:
                 with self._server.atomic():
-                    track.show(i)
+                    cameras.follow(track.show(i))
                     if second is not None:
                         second.show(_nearest_reference(second.poses, poses, i))
                 shown = i
@@ -202,6 +204,7 @@ class Viewer:
             receiver: bound socket; datagrams are JSON or binary as `edgepose run --udp` sends them.
             stopped: called for every picture.
         """
+        cameras = FollowingCameras(self._server)
         text = self._server.gui.add_markdown("waiting for poses")
         stream = UdpPoseStream()
         receiver.setblocking(False)
@@ -212,7 +215,7 @@ class Viewer:
             newest = stream.take(receiver, now)
             if newest is not None:
                 with self._server.atomic():
-                    self.figure.show(newest.rotations.astype(float), newest.translation)
+                    cameras.follow(self.figure.show(newest.rotations.astype(float), newest.translation))
             if now - self._updated_s >= TABLE_S:
                 self._updated_s = now
                 text.content = stream.text(now)
@@ -259,9 +262,9 @@ class _Track:
         self._figure = figure
         self._positions = _grounded_positions(poses, body)
 
-    def show(self, i: int) -> None:
+    def show(self, i: int) -> Array:
         position = None if self._positions is None else self._positions[i]
-        self._figure.show(self.poses.rotations[i], position)
+        return self._figure.show(self.poses.rotations[i], position)
 
 
 class UdpPoseStream:

@@ -12,6 +12,9 @@ from edgepose.cli.options.outputs import overwrite_option
 from edgepose.cli.options.source import protocol_option, sensors_option
 from edgepose.cli.terminal.messages import has_terminal, printable, progress_bar, say, show
 from edgepose.errors import EdgeposeError
+from edgepose.formats.bvh_names import BVH_NAMES
+from edgepose.formats.poses.bvh import UNITS
+from edgepose.formats.poses.npz_amass import JOINT_COUNTS
 from edgepose.formats.poses.registry import READERS as POSES
 from edgepose.formats.recordings.registry import READERS as RECORDINGS
 from edgepose.output_files import check_output
@@ -52,6 +55,25 @@ if TYPE_CHECKING:
     show_default=True,
     help="The wearer's height, metres, for the bones of BVH files.",
 )
+@click.option(
+    "--unit",
+    type=click.Choice(list(UNITS)),
+    help="Unit of lengths in the BVH files to read.  [default: inferred from the length of the shanks]",
+)
+@click.option(
+    "--joints",
+    type=click.Choice(list(map(str, JOINT_COUNTS))),
+    default="24",
+    show_default=True,
+    help="Number of joints in NPZ files of poses: 24 as in SMPL, 52 as in SMPL-H, 55 as in SMPL-X.",
+)
+@click.option(
+    "--names",
+    type=click.Choice(list(BVH_NAMES)),
+    default="smpl",
+    show_default=True,
+    help="Names of the joints in BVH files.",
+)
 @protocol_option
 @sensors_option
 @click.option(
@@ -69,6 +91,9 @@ def convert(
     out: Path,
     filter: str,
     height: float,
+    unit: str | None,
+    joints: str,
+    names: str,
     protocol: str,
     sensors: Path | None,
     jobs: int,
@@ -80,7 +105,7 @@ def convert(
     IN are files, patterns and folders. A folder stands for all recordings in it, at any depth. A folder with
     one subfolder per x-io sensor is one recording; the names of the subfolders contain the placements, or
     --sensors maps their serial numbers as ids (id = 0x64F61CB3). The good part of a damaged recording is
-    written, and the poses of a CSV or BVH file before the first bad one; the exit code is then 1.
+    written, and the poses of a BVH file before the first bad one; the exit code is then 1.
 
     Poses become CSV, NPZ or BVH. From a recording with true poses, such as DIP-IMU's, --to bvh takes these.
     - reads CSV from standard input.
@@ -109,7 +134,7 @@ def convert(
     todo = [job for job in planned if job not in done]
     _check_targets(todo, to, overwrite)
     try:
-        options = Options(protocol, sensors, filter, height, overwrite)
+        options = Options(protocol, sensors, filter, height, overwrite, unit, int(joints), names)
         for result in _with_progress(convert_all(todo, options, jobs), len(todo)):
             done[result.job] = result
     finally:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from datetime import datetime
 from pathlib import Path
 
 import click
@@ -49,5 +50,8 @@ def report(poses: Path, out: Path | None, height: float, overwrite: bool) -> Non
         raise click.UsageError(f"--out would overwrite {poses}; name another file")
     check_output(path, "the report", (".html", ".htm"), overwrite)
     body = default_body(height)
-    write_report(path, read_poses(poses), body, poses.name, overwrite)
+    sequence = read_poses(poses)
+    made = datetime.fromtimestamp(poses.stat().st_mtime).astimezone() if poses.is_file() else None
+    date = "" if made is None else made.isoformat(" ", "minutes")
+    write_report(path, sequence, body, poses.name, overwrite, date)
     show(f"Wrote {path}.")

@@ -23,14 +23,16 @@ class PoseFormat(FileFormat):
     """A format of poses; the module of each format ends with its `FORMAT`.
 
     Attributes:
-        read: returns the poses before the first bad one, and one line on the problem, or None. Raises
+        read: returns the good poses, and one line on the problem, or None. Raises
             EdgeposeError if no pose is usable.
         holds_poses: whether a file with one of the suffixes contains poses and not a recording of sensors; by
             default all do.
+        read_in: like `read`, with the unit of the file's lengths, if the format has no fixed one.
     """
 
     read: Callable[[Path], tuple[PoseSequence, str | None]]
     holds_poses: Callable[[Path], bool] = lambda path: True
+    read_in: Callable[[Path, str | None], tuple[PoseSequence, str | None]] | None = None
 
 
 def all_new(count: int) -> tuple[list[frozenset[str]], list[bool]]:

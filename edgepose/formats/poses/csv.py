@@ -1,23 +1,24 @@
-"""Poses from CSV files, in any of the representations of `edgepose run`."""
+"""Poses from CSV files, in any of the representations of `edgepose run`, however a program rewrote them."""
 
 from __future__ import annotations
 
 import csv
 import sys
 from array import array
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator, Sequence
 from io import BufferedReader
 from itertools import islice
 from pathlib import Path
-from typing import TextIO, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError, FileFormatError
+from edgepose.formats.ledger import Ledger
 from edgepose.formats.poses.base import LARGEST_TIME, PoseFormat, is_absurd
-from edgepose.formats.poses.csv_columns import ROTATION_FORMATS, pose_columns
+from edgepose.formats.poses.csv_columns import ROTATION_FORMATS, TRANSLATION, rotation_columns
+from edgepose.formats.tables import Row, Table, encoding_of, name_of, open_table
 from edgepose.pose import PoseSequence, parse_status
 from edgepose.rotations import euler_to_matrix, nearest_rotation, quat_to_matrix, rotvec_to_matrix
 from edgepose.skeleton import JOINTS
@@ -25,16 +26,20 @@ from edgepose.skeleton import JOINTS
 Array = NDArray[np.float64]
 
 MAX_LINE = 16_384
-"""Longest line, characters; valid rows have fewer than 4000, and an endless line must not fill memory."""
+"""Longest line, characters; valid rows have fewer than 8000, and an endless line must not fill memory."""
 
 BLOCK = 4096
 """Poses read from a CSV file at a time."""
 
-_HEADER = b"frame,time_s,status,"
+MOST_RADIANS = 2.0 * np.pi + 1e-3
+"""Largest angle; larger ones are in degrees."""
+
+_START = "frame,time_s,"
+_START_BYTES = 128
 
 
 def read_csv(path: Path) -> tuple[PoseSequence, str | None]:
-    """Read the poses before the first bad one, and the problem with that one; "-" is standard input."""
+    """Read the good poses, and one line on the bad rows; "-" is standard input."""
     blocks: list[PoseSequence] = []
     problem = None
     try:
@@ -49,165 +54,210 @@ def read_csv(path: Path) -> tuple[PoseSequence, str | None]:
 def read_blocks(path: str | Path) -> Iterator[PoseSequence]:
     """Yield the poses of a CSV file in one or more blocks of up to `BLOCK`; "-" is standard input.
 
-    The header shows which representation the file has.
+    The names of the columns show which representation the file has. Other columns are ignored.
 
     Raises:
-        FileFormatError: no such file, or not a file of poses; names the row, where the header is row 1. All
-            poses before that row have been yielded.
+        FileFormatError: no such file, not a file of poses, or some rows are bad, of which the first is named
+            by its line. All good poses have been yielded before.
     """
-    if str(path) == "-":
-        yield from _read_rows(sys.stdin, "standard input")
-        return
+    path = Path(path)
+    name = name_of(path)
+    ledger, parser = Ledger(name), None
     try:
-        # With "replace", a byte that is not text invalidates only its row.
-        with Path(path).open(encoding="utf-8-sig", errors="replace", newline="") as file:
-            yield from _read_rows(file, str(path))
+        with open_table(
+            path, {"frame", "time_s"}.issubset, "frame,time_s,status,pelvis_...", MAX_LINE
+        ) as table:
+            parser = _Parser(_columns(table), ledger)
+            yield from filter(None, map(parser.block, _blocks(table.rows)))
+    except FileFormatError as error:
+        if parser is None:
+            reason = str(error).removeprefix(f"{name}: ")
+            raise FileFormatError(f"{name} is not a file of poses: {reason}") from None
+        raise FileFormatError("; ".join(filter(None, [ledger.damage(), str(error)]))) from None
     except OSError as error:
         raise FileFormatError(f"cannot read poses from {path}: {error.strerror or error}") from error
-
-
-class _BadRowError(FileFormatError):
-    """A row that is not a pose; `row` is its number, where the header is row 1."""
-
-    def __init__(self, name: str, row: int, problem: str) -> None:
-        super().__init__(f"{name}, row {row}: {problem}")
-        self.row = row
-
-
-def _read_rows(file: TextIO, name: str) -> Iterator[PoseSequence]:
-    rows = csv.reader(_lines(file))
-    first = 2
-    last: tuple[int, float] | None = None
-    try:
-        form, std, moves = _recognise(next(rows, []), name)
-        columns = len(pose_columns(form, std, moves))
-        while block := list(islice(rows, BLOCK)):
-            read = partial(
-                _block, first=first, last=last, columns=columns, form=form, has_translation=moves, name=name
-            )
-            poses, error = _good_rows(block, first, read)
-            if poses is not None:
-                first, last = first + len(poses.frames), (int(poses.frames[-1]), float(poses.time_s[-1]))
-                yield poses
-            if error is not None:
-                raise error
     except csv.Error as error:
-        raise FileFormatError(f"{name}, row {rows.line_num + 1}: {error}") from error
+        raise FileFormatError(f"{name}: not a table: {error}") from error
     except UnicodeDecodeError as error:
         raise FileFormatError(f"{name} is not a text file: byte {error.start} is not UTF-8") from error
-    if last is None:
+    if damage := ledger.damage():
+        raise FileFormatError(damage)
+    if parser.empty:
         raise FileFormatError(f"{name} has no poses, only a header")
 
 
-def _good_rows(
-    rows: list[list[str]], first: int, read: Callable[[list[list[str]]], PoseSequence]
-) -> tuple[PoseSequence | None, EdgeposeError | None]:
-    """Return the poses before the first bad row, and its problem; the first row has number `first`."""
-    problem = None
-    while rows:
+def _blocks(rows: Iterator[Row]) -> Iterator[list[Row]]:
+    """Yield rows in lists of up to `BLOCK`; an error comes after the rows before it."""
+    more = True
+    while more:
+        block: list[Row] = []
         try:
-            return read(rows), problem
-        except _BadRowError as error:
-            problem, rows = error, rows[: error.row - first]
-    return None, problem
+            block.extend(islice(rows, BLOCK))  # keeps the rows before an error
+            more = len(block) == BLOCK
+        finally:
+            if block:
+                yield block
 
 
-_TOO_LONG = "the line is too long for a file of poses"
+class _Columns(NamedTuple):
+    """Indices of the columns.
 
-
-def _lines(file: TextIO) -> Iterator[str]:
-    while line := file.readline(MAX_LINE):
-        if len(line) == MAX_LINE:
-            yield _TOO_LONG  # a bad row; the rows before it stay valid
-            return
-        yield line
-
-
-def _recognise(header: list[str], name: str) -> tuple[str, bool, bool]:
-    """Return representation, whether there are standard deviations, and whether there is a translation."""
-    for form in ROTATION_FORMATS:
-        for std in (False, True):
-            for moves in (False, True):
-                if header == pose_columns(form, std, moves):
-                    return form, std, moves
-    if any("\ufffd" in column for column in header):
-        raise FileFormatError(f"{name} is not a text file")
-    raise FileFormatError(
-        f"{name} is not a file of poses: its first line must be 'frame,time_s,status,pelvis_...' and name "
-        "the 24 joints in SMPL order"
-    )
-
-
-def _block(
-    rows: list[list[str]],
-    first: int,
-    last: tuple[int, float] | None,
-    columns: int,
-    form: str,
-    has_translation: bool,
-    name: str,
-) -> PoseSequence:
-    """Parse rows, starting with number `first`, that follow the frame number and time `last`."""
-    frame_before, time_before = last or (None, -np.inf)
-    frames, times, numbers = array("q"), array("d"), array("d")
-    held, warming_up = list[frozenset[str]](), list[bool]()
-    for number, row in enumerate(rows, start=first):
-        if row == [_TOO_LONG]:
-            raise _BadRowError(name, number, _TOO_LONG)
-        if len(row) != columns:
-            raise _BadRowError(name, number, f"{len(row)} columns, the header has {columns}")
-        try:
-            frame = int(row[0])
-            times.append(float(row[1]))
-            numbers.extend(map(float, row[3:]))
-            frames.append(frame)
-        except (ValueError, OverflowError) as error:
-            raise _BadRowError(name, number, str(error)) from error
-        if frame_before is not None and frame <= frame_before:
-            raise _BadRowError(name, number, f"frame {frame} comes after frame {frame_before}")
-        if times[-1] <= time_before:
-            raise _BadRowError(name, number, f"time {row[1]} s is not after that of the row before")
-        if not row[2].isprintable() or "," in row[2] or '"' in row[2]:
-            raise _BadRowError(name, number, "the status has a comma, a quote or a line break in it")
-        names, warm = parse_status(row[2])
-        held.append(names)
-        warming_up.append(warm)
-        frame_before, time_before = frame, times[-1]
-    values = np.frombuffer(numbers).reshape(len(frames), -1)
-    seconds = np.frombuffer(times)
-    numbered = np.frombuffer(frames, np.int64)
-    bad = is_absurd(seconds, LARGEST_TIME) | is_absurd(numbered, LARGEST_TIME) | is_absurd(values).any(axis=1)
-    if bad.any():
-        problem = "a number is infinite or not a number, or far too large"
-        raise _BadRowError(name, int(bad.argmax()) + first, problem)
-    width = len(ROTATION_FORMATS[form])
-    rotations, off = _rotations(
-        form, values[:, : len(JOINTS) * width].reshape(len(frames), len(JOINTS), width)
-    )
-    if (off > 1e-3).any():
-        at, joint = np.argwhere(off > 1e-3)[0].tolist()
-        raise _BadRowError(name, at + first, f"the numbers of {JOINTS[joint]} are not a rotation")
-    translation = values[:, -3:] if has_translation else None
-    return PoseSequence(numbered, seconds, rotations, translation, held, warming_up)
-
-
-def _rotations(form: str, values: Array) -> tuple[Array, Array]:
-    """Convert numbers (T, 24, n) of one representation to matrices (T, 24, 3, 3).
-
-    The second result (T, 24) is the deviation of the numbers from those of a rotation.
+    Attributes:
+        form: representation of the rotations, a key of `ROTATION_FORMATS`.
+        width: number of columns.
+        frame: frame number.
+        time: time.
+        status: status, if there is one.
+        rotations: numbers of the 24 joints.
+        translation: position of the pelvis, or none.
     """
-    none = np.zeros(values.shape[:2])
+
+    form: str
+    width: int
+    frame: int
+    time: int
+    status: int | None
+    rotations: list[int]
+    translation: list[int]
+
+
+def _columns(table: Table) -> _Columns:
+    """Find the columns by their names.
+
+    Raises:
+        FileFormatError: some are missing.
+    """
+    at = {column: index for index, column in reversed(list(enumerate(table.names)))}
+    for form in sorted(
+        ROTATION_FORMATS, key=lambda form: -len(ROTATION_FORMATS[form])
+    ):  # w x y z before x y z
+        if at.keys() >= set(columns := rotation_columns(form)):
+            translation = [at[column] for column in TRANSLATION if column in at]
+            return _Columns(
+                form,
+                len(table.names),
+                at["frame"],
+                at["time_s"],
+                at.get("status"),
+                [at[column] for column in columns],
+                translation if len(translation) == len(TRANSLATION) else [],
+            )
+    raise FileFormatError(
+        "the names of its columns must be frame, time_s, status, pelvis_..., for all 24 joints"
+    )
+
+
+class _Parser:
+    """Parser of the rows of one file.
+
+    Attributes:
+        empty: whether no row was good.
+    """
+
+    def __init__(self, columns: _Columns, ledger: Ledger) -> None:
+        """Start before the first row; bad rows go to the ledger."""
+        self.empty = True
+        self._columns, self._ledger = columns, ledger
+        self._frame: int | None = None  # of the row before
+        self._time_s = -np.inf
+
+    def block(self, rows: Sequence[Row]) -> PoseSequence | None:
+        """Parse the next rows; None if no row is good."""
+        numbers, frames, times, values = array("q"), array("q"), array("d"), array("d")
+        held, warming_up = list[frozenset[str]](), list[bool]()
+        for row in rows:
+            try:
+                frame, time_s, status, cells = self._parse(row.cells)
+            except ValueError as error:
+                self._ledger.leave_out(row.number, str(error))
+                continue
+            numbers.append(row.number)
+            frames.append(frame)
+            times.append(time_s)
+            values.extend(cells)
+            held.append(status[0])
+            warming_up.append(status[1])
+        table = np.frombuffer(values).reshape(
+            len(frames), len(self._columns.rotations + self._columns.translation)
+        )
+        good, rotations = self._rotations(np.frombuffer(numbers, np.int64), table)
+        if not good.any():
+            return None
+        self.empty = False
+        return PoseSequence(
+            np.frombuffer(frames, np.int64)[good],
+            np.frombuffer(times)[good],
+            rotations,
+            table[good, -3:] if self._columns.translation else None,
+            [names for names, keep in zip(held, good, strict=True) if keep],
+            [warm for warm, keep in zip(warming_up, good, strict=True) if keep],
+        )
+
+    def _parse(self, cells: list[str]) -> tuple[int, float, tuple[frozenset[str], bool], list[float]]:
+        """Parse a row to frame, time, status, and numbers of rotations and translation.
+
+        Raises:
+            ValueError: the problem with the row.
+        """
+        columns = self._columns
+        if len(cells) != columns.width:
+            raise ValueError(f"has {len(cells)} columns, the header has {columns.width}")
+        time = cells[columns.time]
+        try:
+            frame, time_s = int(cells[columns.frame]), float(time)
+            values = [float(cells[i]) for i in columns.rotations + columns.translation]
+        except ValueError:
+            raise ValueError("has a cell that is not a number") from None
+        if not (abs(frame) <= LARGEST_TIME and abs(time_s) <= LARGEST_TIME):
+            raise ValueError(_ABSURD)
+        if self._frame is not None and frame <= self._frame:
+            raise ValueError(f"has frame {frame} after frame {self._frame}; sort the rows by frame")
+        if time_s == self._time_s:
+            raise ValueError(f"has time {time} s as the row before; write times with more digits")
+        if time_s < self._time_s:
+            raise ValueError(f"has time {time} s, which is before that of the row before")
+        status = "" if columns.status is None else cells[columns.status]
+        if not status.isprintable() or "," in status or '"' in status:
+            raise ValueError("has a comma, a quote or a line break in its status")
+        self._frame, self._time_s = frame, time_s
+        return frame, time_s, parse_status(status), values
+
+    def _rotations(self, rows: NDArray[np.int64], values: Array) -> tuple[NDArray[np.bool_], Array]:
+        """Return which rows (T,) are good, and the rotations (n, 24, 3, 3) of these; values (T, columns)."""
+        good: NDArray[np.bool_] = ~np.any(is_absurd(values), axis=1)
+        self._ledger.leave_out_unless(good, rows, _ABSURD)
+        form = self._columns.form
+        count = len(self._columns.rotations)
+        numbers = values[good, :count].reshape(-1, len(JOINTS), len(ROTATION_FORMATS[form]))
+        rotations, problems = _to_matrices(form, numbers)
+        for row, joints in zip(rows[good].tolist(), problems.tolist(), strict=True):
+            if any(joints):
+                self._ledger.leave_out(row, _NO_ROTATION[form].format(JOINTS[joints.index(True)]))
+        whole = ~problems.any(axis=1)
+        good[good] = whole
+        return good, rotations[whole]
+
+
+_ABSURD = "has a number that is infinite, not a number, or far too large"
+_NO_ROTATION = dict.fromkeys(ROTATION_FORMATS, "has numbers of {} that are not a rotation") | dict.fromkeys(
+    ("axis-angle", "euler"),
+    "has an angle of {} beyond a whole turn; angles must be in radians, not in degrees",
+)
+
+
+def _to_matrices(form: str, values: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Convert numbers (T, 24, n) to matrices (T, 24, 3, 3), and tell which (T, 24) are not rotations."""
     if form == "axis-angle":
-        return rotvec_to_matrix(values), none
+        return rotvec_to_matrix(values), np.linalg.norm(values, axis=-1) > MOST_RADIANS
     if form == "euler":
-        return euler_to_matrix(values, "zxy"), none
+        return euler_to_matrix(values, "zxy"), np.abs(values).max(axis=-1) > MOST_RADIANS
     if form == "quat":
         norms = np.linalg.norm(values, axis=-1, keepdims=True)
-        return quat_to_matrix(values / np.where(norms > 0.0, norms, 1.0)), np.abs(norms[..., 0] - 1.0)
+        return quat_to_matrix(values / np.where(norms > 0.0, norms, 1.0)), np.abs(norms[..., 0] - 1.0) > 1e-3
     matrices = values.reshape(*values.shape[:-1], 3, 3)
     # Six digits leave a matrix slightly off a rotation; anything further off is not a rotation.
     nearest = nearest_rotation(matrices)
-    return nearest, np.abs(matrices - nearest).max(axis=(-2, -1))
+    return nearest, np.abs(matrices - nearest).max(axis=(-2, -1)) > 1e-3
 
 
 def _concatenate(blocks: list[PoseSequence]) -> PoseSequence:
@@ -226,17 +276,23 @@ def holds_poses(path: Path) -> bool:
     """Return whether a file starts like a CSV file of poses; "-" is standard input, which stays unread."""
     try:
         if str(path) == "-":
-            return _starts_as_poses(cast(BufferedReader, sys.stdin.buffer).peek(32))
-        with path.open("rb") as file:
-            return _starts_as_poses(file.read(32))
+            start = cast(BufferedReader, sys.stdin.buffer).peek(_START_BYTES)[:_START_BYTES]
+            return _starts_as_poses(start.decode(errors="replace"))
+        with path.open(encoding=encoding_of(path), errors="replace") as file:
+            return _starts_as_poses(file.read(_START_BYTES))
     except OSError:
         return False
 
 
-def _starts_as_poses(start: bytes) -> bool:
+def _starts_as_poses(start: str) -> bool:
     # A pipe may have delivered only a few bytes so far; recordings start with different ones.
-    start = start.removeprefix(b"\xef\xbb\xbf").replace(b'"', b"")[: len(_HEADER)]
-    return start != b"" and _HEADER.startswith(start)
+    start = start.removeprefix("\ufeff").replace('"', "").replace(" ", "")
+    if start[:4].lower() == "sep=":
+        start = start.partition("\n")[2]
+    for mark in "\t;|":
+        start = start.replace(mark, ",")
+    start = start.removeprefix(",")[: len(_START)]  # some programs number the rows
+    return start != "" and _START.startswith(start)
 
 
 FORMAT = PoseFormat((".csv",), read_csv, holds_poses)

@@ -18,13 +18,20 @@ ROTATION_FORMATS = {
 """Column endings of each representation; euler: R = Rz Rx Ry, rotations about the moving axes."""
 
 
+TRANSLATION = ("trans_x", "trans_y", "trans_z")
+"""Columns of the position of the pelvis, metres."""
+
+
+def rotation_columns(rotations: str) -> list[str]:
+    """Return the names of the columns of all joints, in order; `rotations` is a key of `ROTATION_FORMATS`."""
+    return [f"{joint}_{end}" for joint in JOINTS for end in ROTATION_FORMATS[rotations]]
+
+
 def pose_columns(rotations: str, std: bool, translation: bool = False) -> list[str]:
     """Return the names of all columns, in order; `rotations` is a key of `ROTATION_FORMATS`."""
-    names = ["frame", "time_s", "status"] + [
-        f"{joint}_{end}" for joint in JOINTS for end in ROTATION_FORMATS[rotations]
-    ]
+    names = ["frame", "time_s", "status", *rotation_columns(rotations)]
     names += [f"{joint}_std" for joint in JOINTS] if std else []
-    return names + [f"trans_{axis}" for axis in "xyz"] if translation else names
+    return [*names, *TRANSLATION] if translation else names
 
 
 def numbers(rotations: str, matrices: NDArray[Any]) -> NDArray[Any]:

@@ -56,5 +56,6 @@ def fill_missing_frames(poses: PoseSequence, name: str) -> tuple[PoseSequence, i
         None if translation is None else linear(translation, share[:, None]),
         [everything if gap else poses.held[i] for i, gap in zip(before, between, strict=True)],
         [poses.warming_up[i] for i in before],
+        poses.about,
     )
     return filled, missing

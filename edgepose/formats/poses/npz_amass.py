@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import zipfile
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -24,6 +27,23 @@ Array = NDArray[np.float64]
 BETAS = 16
 """Shape coefficients of SMPL; all are zero, the average body."""
 
+JOINT_COUNTS = {24: "SMPL", 52: "SMPL-H", 55: "SMPL-X"}
+"""Numbers of joints that can be written, and the body models that have them; fingers and face are at rest."""
+
+ABOUT = ("model", "calibration", "source", "date", "edgepose")
+"""What a file says about its origin."""
+
+_LONGEST_ABOUT = 10_000  # characters
+
+_RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
+"""Names of the frame rate; the first is SMPL-H's, the second SMPL-X's."""
+
+_PARTS = ("root_orient", "pose_body")
+"""Arrays that hold the first 22 joints in files without `poses`."""
+
+_BODY = 22
+"""Joints that all three models share, in the same order."""
+
 _POSE_BYTES = 8 * 9 * len(JOINTS)  # memory for a pose
 
 
@@ -37,13 +57,14 @@ def read_npz(path: Path) -> tuple[PoseSequence, None]:
     the body are taken; hands stay at rest.
     """
     arrays, in_t = _load(path)
+    _join_parts(arrays)
     if "poses" not in arrays or arrays["poses"].ndim != 2 or not len(arrays["poses"]):
         raise FileFormatError(f"{path}: no poses in it; it needs an array 'poses' (frames, 72)")
     count, width = arrays["poses"].shape
     if width < 66 or width % 3:
         raise FileFormatError(f"{path}: 'poses' must be (frames, 72), it is {arrays['poses'].shape}")
     check_size(path, count * _POSE_BYTES)
-    joints = len(JOINTS) if width == 72 else 22
+    joints = len(JOINTS) if width == 72 else _BODY
     vectors = _numbers(path, arrays, "poses", (count, width))[:, : 3 * joints].reshape(count, joints, 3)
     rotations = np.broadcast_to(np.eye(3), (count, len(JOINTS), 3, 3)).copy()
     rotations[:, :joints] = rotvec_to_matrix(vectors)
@@ -54,12 +75,22 @@ def read_npz(path: Path) -> tuple[PoseSequence, None]:
         rotations[:, 0] = Z_UP_TO_T @ rotations[:, 0]
         translation = None if translation is None else translation @ Z_UP_TO_T.T
     frames, time_s = _clock(path, arrays, count)
-    return PoseSequence(frames, time_s, rotations, translation, *_states(path, arrays, count)), None
+    states = _states(path, arrays, count)
+    return PoseSequence(frames, time_s, rotations, translation, *states, _about(arrays)), None
+
+
+def _join_parts(arrays: dict[str, NDArray[Any]]) -> None:
+    """Add the array `poses` if the root and the body are arrays of their own, as in some SMPL-X files."""
+    parts = [arrays.pop(key, None) for key in _PARTS]
+    if "poses" not in arrays and all(part is not None and part.ndim == 2 for part in parts):
+        root, body = (np.asarray(part) for part in parts)
+        if len(root) == len(body) and root.shape[1] == 3:
+            arrays["poses"] = np.concatenate([root, body[:, :63]], axis=1)
 
 
 def _load(path: Path) -> tuple[dict[str, NDArray[Any]], bool]:
     """Load the relevant arrays of a file, and whether it is a recording with true poses in T."""
-    wanted = ("poses", "trans", "mocap_framerate", "mocap_frame_rate", "time_s", "frame", "held", "filling")
+    wanted = ("poses", *_PARTS, "trans", *_RATES, "time_s", "frame", "held", "filling", "about")
     try:
         names = member_names(path)
         with open_npz(path) as archive:
@@ -96,8 +127,8 @@ def _clock(path: Path, arrays: Mapping[str, NDArray[Any]], count: int) -> tuple[
         if (np.diff(times) <= 0).any():
             raise FileFormatError(f"{path}: the times in 'time_s' do not increase")
         return frames, times
-    key = "mocap_framerate" if "mocap_framerate" in arrays else "mocap_frame_rate"
-    if key not in arrays or arrays[key].size != 1:
+    key = next((key for key in _RATES if key in arrays and arrays[key].size == 1), None)
+    if key is None:
         raise FileFormatError(f"{path}: needs one number 'mocap_framerate', frames per second")
     rate = float(_numbers(path, {key: arrays[key].reshape(())}, key, ()))
     if not 1e-2 < rate < 1e5:
@@ -119,13 +150,23 @@ def _states(
     return [sets[mask] for mask in masks], filling.tolist()
 
 
+def _about(arrays: Mapping[str, NDArray[Any]]) -> dict[str, str]:
+    """Return what the file says about its origin; nothing if that is not text as edgepose writes it."""
+    with suppress(KeyError, ValueError, RecursionError):
+        found = json.loads(str(arrays["about"])[:_LONGEST_ABOUT])
+        if isinstance(found, dict):
+            return {key: str(found[key]) for key in ABOUT if key in found}
+    return {}
+
+
 def holds_poses(path: Path) -> bool:
     """Return whether an archive has poses and is not a recording of sensors with true poses."""
     try:
         names = member_names(path)
     except (OSError, *BROKEN):
         return False
-    return "poses.npy" in names and not _is_recording(names)
+    some = "poses.npy" in names or {f"{part}.npy" for part in _PARTS} <= names
+    return some and not _is_recording(names)
 
 
 def _is_recording(names: set[str]) -> bool:
@@ -136,7 +177,14 @@ def _is_recording(names: set[str]) -> bool:
 # --- writing ------------------------------------------------------------------------------------------------
 
 
-def write_npz(path: Path, blocks: Iterable[PoseSequence], count: int, rate: float) -> None:
+def write_npz(
+    path: Path,
+    blocks: Iterable[PoseSequence],
+    count: int,
+    rate: float,
+    joints: int = 24,
+    about: Mapping[str, str] = MappingProxyType({}),
+) -> None:
     """Write poses, keeping only a part of them in memory.
 
     Args:
@@ -144,6 +192,9 @@ def write_npz(path: Path, blocks: Iterable[PoseSequence], count: int, rate: floa
         blocks: the poses, in order.
         count: total number of poses.
         rate: frames per second.
+        joints: a key of `JOINT_COUNTS`.
+        about: see `PoseSequence`.
+        about: see `PoseSequence`.
 
     Raises:
         OSError: the file cannot be written.
@@ -151,10 +202,10 @@ def write_npz(path: Path, blocks: Iterable[PoseSequence], count: int, rate: floa
     frames, times, held, filling, positions = [], [], [], [], []
     with zipfile.ZipFile(path, "w") as archive:
         with archive.open("poses.npy", "w", force_zip64=True) as member:
-            header = {"descr": "<f4", "fortran_order": False, "shape": (count, 72)}
+            header = {"descr": "<f4", "fortran_order": False, "shape": (count, 3 * joints)}
             np.lib.format.write_array_header_1_0(member, header)
             for block in blocks:
-                member.write(_vectors(block).tobytes())
+                member.write(_vectors(block, joints).tobytes())
                 frames.append(block.frames)
                 times.append(block.time_s)
                 held.append(held_sensors(block.held))
@@ -165,21 +216,29 @@ def write_npz(path: Path, blocks: Iterable[PoseSequence], count: int, rate: floa
             "betas": np.zeros(BETAS),
             "gender": np.array("neutral"),
             "mocap_framerate": np.array(float(rate)),
+            "mocap_frame_rate": np.array(float(rate)),
+            "surface_model_type": np.array(JOINT_COUNTS[joints].replace("-", "").lower()),
             "frame": np.concatenate(frames),
             "time_s": np.concatenate(times),
             "held": np.concatenate(held),
             "filling": np.concatenate(filling),
+            "about": np.array(json.dumps(dict(about))),
         }
         for key, values in arrays.items():
             with archive.open(f"{key}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, values, allow_pickle=False)
 
 
-def _vectors(block: PoseSequence) -> NDArray[np.float32]:
-    """Return axis-angle vectors (T, 72), the pelvis relative to AMASS's world with Z up."""
+def _vectors(block: PoseSequence, joints: int) -> NDArray[np.float32]:
+    """Return axis-angle vectors (T, 3 * joints), the pelvis relative to AMASS's world with Z up."""
     rotations = block.rotations.copy()
     rotations[:, 0] = Z_UP_TO_T.T @ rotations[:, 0]
-    return matrix_to_rotvec(rotations).reshape(len(rotations), 72).astype("<f4")
+    vectors = matrix_to_rotvec(rotations)
+    if joints == len(JOINTS):
+        return vectors.reshape(len(rotations), -1).astype("<f4")
+    result = np.zeros((len(rotations), joints, 3), "<f4")
+    result[:, :_BODY] = vectors[:, :_BODY]
+    return result.reshape(len(rotations), -1)
 
 
 def _positions(block: PoseSequence) -> NDArray[np.float32]:

@@ -40,13 +40,17 @@ def read_poses(path: str | Path) -> PoseSequence:
     return poses
 
 
-def salvage_poses(path: Path) -> tuple[PoseSequence, str | None]:
-    """Read the poses before the first bad one, and one line on the problem; see `read_poses`.
+def salvage_poses(path: Path, unit: str | None = None) -> tuple[PoseSequence, str | None]:
+    """Read the good poses, and one line on the problem; see `read_poses`.
+
+    Args:
+        path: file to read; "-" is CSV on standard input.
+        unit: of lengths in BVH, a key of `UNITS` in `edgepose.formats.poses.bvh`; None infers it.
 
     Raises:
         FileFormatError: no pose is usable.
     """
-    poses, problem = _read(path)
+    poses, problem = _read(path, unit)
     return poses, problem and f"{problem}; {len(poses.frames)} poses are kept"
 
 
@@ -70,9 +74,10 @@ def pose_suffixes() -> tuple[str, ...]:
     return tuple(suffix for format in all_formats(PoseFormat, READERS.values()) for suffix in format.suffixes)
 
 
-def _read(path: Path) -> tuple[PoseSequence, str | None]:
-    """Read the poses before the first bad one, and the problem with the file."""
-    poses, problem = find_format(path).read(path)
+def _read(path: Path, unit: str | None = None) -> tuple[PoseSequence, str | None]:
+    """Read the good poses, and the problem with the file."""
+    format = find_format(path)
+    poses, problem = format.read(path) if format.read_in is None else format.read_in(path, unit)
     if not FRAME_TIMES[0] < poses.frame_time < FRAME_TIMES[1]:
         raise FileFormatError(f"{path}: {poses.frame_time:g} s from pose to pose is not possible")
     return poses, problem

@@ -15,14 +15,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import edgepose
 from edgepose.analysis.joint_angles import ANGLES, LIMBS, joint_angles, walking_bouts
 from edgepose.analysis.report import POINTS, extremes, write_report
 from edgepose.cli import cli
+from edgepose.convert import Job, convert
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.registry import read_poses
 from edgepose.pose import PoseFrame, longest_holds, parse_status
+from edgepose.rotations import rotvec_to_matrix
 from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.csv import CsvSink
+from edgepose.sinks.npz import NpzSink
 from edgepose.skeleton import JOINTS, default_body, local_from_global
 from edgepose_export.mocap import read_motion
 
@@ -184,6 +188,7 @@ def test_page_of_a_walk(command, tmp_path):
     page = Page((tmp_path / "walk & <b>.html").read_text(encoding="utf-8"))
     assert result.stdout == f"Wrote {tmp_path / 'walk & <b>.html'}.\n"
     assert name in page.words
+    assert "Model, calibration and recording are not in this file." in page.words
     assert page.links == []
     assert [image.shape[1] for image in page.images] == [1600, 990]
     rows = {row[0]: row[1:] for row in page.rows}
@@ -201,6 +206,65 @@ def test_page_of_a_walk(command, tmp_path):
     assert rows["head"][2] == f"{6 / rate:.2f} s"
     assert rows["pelvis"][0] == "0"
     assert "In 4 poses the window was filling." in page.words
+
+
+def test_values_that_were_not_measured(tmp_path):
+    """Ranges leave them out; the picture shows them on hatching."""
+    count = 300
+    vectors = np.zeros((count, 24, 3))
+    vectors[:, JOINTS.index("left_knee"), 0] = np.radians(np.linspace(0, 30, count))
+    vectors[:, JOINTS.index("left_elbow"), 1] = -np.radians(np.linspace(0, 40, count))
+    vectors[200:260, JOINTS.index("left_knee"), 0] = np.radians(120)
+
+    def page(name, held):
+        with CsvSink(tmp_path / f"{name}.csv") as sink:
+            for i, rotations in enumerate(rotvec_to_matrix(vectors)):
+                names = frozenset(held if 200 <= i < 260 else ())
+                sink.write(PoseFrame(i, i / 60.0, rotations, np.zeros(24), None, names))
+        write_report(tmp_path / f"{name}.html", read_poses(tmp_path / f"{name}.csv"), default_body(), name)
+        found = Page((tmp_path / f"{name}.html").read_text(encoding="utf-8"))
+        return {row[0]: row[1:] for row in found.rows}, found
+
+    rows, whole = page("whole", ())
+    assert rows["left knee flexion"][:5] == ["0", "120", "120", rows["left knee flexion"][3], "0 %"]
+    rows, partly = page("partly", ("left_lower_leg",))
+    assert rows["left knee flexion"][1] == "30"
+    assert rows["left hip flexion"][4] == rows["left knee flexion"][4] == "20 %"
+    assert rows["right knee flexion"][4] == rows["left elbow flexion"][4] == rows["trunk lean"][4] == "0 %"
+    assert "not measured, because a sensor of the angle sent nothing" in partly.words
+    # The curves of the knees differ, and so do the labels of figures; those of the elbows do not.
+    panels = np.abs(whole.images[1] - partly.images[1]).max(axis=(1, 2))
+    height = len(panels) // len(ANGLES)
+    assert panels[2 * height : 3 * height].max() > 0.1
+    assert panels[4 * height + 30 : 5 * height].max() < 0.01
+    assert whole.images[0].shape != partly.images[0].shape or (whole.images[0] != partly.images[0]).any()
+
+
+def test_a_sensor_that_never_sent(tmp_path):
+    with CsvSink(tmp_path / "a.csv") as sink:
+        sink.write(
+            PoseFrame(0, 0.0, np.tile(np.eye(3), (24, 1, 1)), np.zeros(24), None, frozenset(["pelvis"]))
+        )
+    write_report(tmp_path / "a.html", read_poses(tmp_path / "a.csv"), default_body(), "a")
+    rows = {row[0]: row[1:] for row in Page((tmp_path / "a.html").read_text(encoding="utf-8")).rows}
+    assert rows["left elbow flexion"][:5] == ["-", "-", "-", "-", "100 %"]
+
+
+def test_page_names_where_poses_come_from(tmp_path):
+    about = {"model": "rnn", "calibration": "ca<li>b.json", "source": "walk.npz", "date": "2026-01-02 10:00"}
+    with NpzSink(tmp_path / "a.npz", about=about | {"edgepose": "0.0.9"}) as sink:
+        for i in range(3):
+            sink.write(PoseFrame(i, i / 60.0, np.tile(np.eye(3), (24, 1, 1)), np.zeros(24)))
+    convert(Job(tmp_path / "a.npz", tmp_path / "b.npz"))  # keeps it
+    write_report(tmp_path / "b.html", read_poses(tmp_path / "b.npz"), default_body(), "b.npz")
+    rows = {row[0]: row[1:] for row in Page((tmp_path / "b.html").read_text(encoding="utf-8")).rows}
+    assert rows["poses"] == ["b.npz"]
+    assert rows["model"] == ["rnn"]
+    assert rows["calibration"] == ["ca<li>b.json"]
+    assert rows["recording or port"] == ["walk.npz"]
+    assert rows["made"] == ["2026-01-02 10:00"]
+    assert rows["made with"] == ["edgepose 0.0.9"]
+    assert rows["report made with"] == [f"edgepose {edgepose.__version__}"]
 
 
 def test_page_of_a_single_pose_to_another_file(command, tmp_path):

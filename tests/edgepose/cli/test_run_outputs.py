@@ -28,7 +28,8 @@ def test_all_outputs_say_the_same(command, wearer, tmp_path):
         result = command(
             *("run", "--file", wearer.short, "--realtime"),
             *("--calibration", wearer.calibration, "--model", "rnn"),
-            *("--csv", tmp_path / "a.csv", "--npz", tmp_path / "a.npz", "--bvh", tmp_path / "a.bvh"),
+            *("--csv", tmp_path / "a.csv", "--npz", f"{tmp_path / 'a.npz'},joints=52"),
+            *("--bvh", tmp_path / "a.bvh"),
             *("--osc", mailbox.address, "--tcp", free_address(), "--height", "1.9"),
         )
     datagrams = mailbox.datagrams
@@ -41,6 +42,9 @@ def test_all_outputs_say_the_same(command, wearer, tmp_path):
     np.testing.assert_array_equal(again.frames, poses.frames)
     np.testing.assert_allclose(again.time_s, poses.time_s, atol=1e-9)
     np.testing.assert_allclose(again.rotations, poses.rotations, atol=2e-6)
+    assert np.load(tmp_path / "a.npz")["poses"].shape == (180, 156)
+    assert again.about.keys() == {"model", "calibration", "source", "date", "edgepose"}
+    assert (again.about["model"], again.about["calibration"]) == ("rnn", str(wearer.calibration))
     assert read_motion(tmp_path / "a.npz").rate == 60.0
     read = read_bvh(tmp_path / "a.bvh")
     assert (len(read.rotations), read.rate) == (180, 60.0)
@@ -94,6 +98,22 @@ def test_an_interrupted_run_leaves_whole_files(wearer, tmp_path, numbers):
         (["--npz", "-"], 1, "cannot write poses to -"),
         (["--npz", "no/a.npz"], 1, "its folder does not exist"),
         (["--osc", "127.0.0.1"], 2, "no port in '127.0.0.1'"),
+        (
+            ["--osc", "127.255.255.255:39539"],
+            1,
+            "is a broadcast address, at which many machines receive: write",
+        ),
+        (
+            ["--udp", "224.0.0.251:9000"],
+            1,
+            "write 224.0.0.251:9000,multicast to send there, or the address of",
+        ),
+        (
+            ["--npz", "a.npz,joints=53"],
+            2,
+            "unknown option 'joints=53' of a.npz: possible are joints=24|52|55",
+        ),
+        (["--bvh", "a.bvh,names=maya"], 2, "possible are names=smpl|mixamo|unity|motionbuilder|rokoko"),
         (["--tcp", "192.0.2.1:8888"], 1, "cannot listen for viewers at 192.0.2.1 port 8888"),
         (["--bvh", "a.bvh", "--height", "175"], 1, "height 175 m is not between"),
         (["--bvh", "RECORDING"], 2, "--bvh would overwrite"),

@@ -87,8 +87,8 @@ def test_addresses_and_lines_are_read_as_flags(rig):
     )  # fmt: skip
     assert flags.name == "Anna B."
     assert (flags.source.port, flags.source.baud, flags.source.protocol) == ("/dev/ttyUSB0", 921600, "native")
-    assert flags.outputs.udp == ("10.0.0.5", 9000, "binary")
-    assert flags.outputs.osc == ("127.0.0.1", 39539)
+    assert flags.outputs.udp == ("10.0.0.5", 9000, "binary", "")
+    assert flags.outputs.osc == ("127.0.0.1", 39539, "")
     assert flags.control == ("127.0.0.1", 9100)
 
 

@@ -21,6 +21,7 @@ from edgepose.rotations import matrix_to_euler_zxy
 from edgepose.sinks import pose_file
 from edgepose.sinks.csv import CsvSink, pose_columns
 from edgepose.sinks.udp import UdpSink, decode_binary, encode_binary, encode_json
+from edgepose.sinks.vmc import VmcSink
 from edgepose.skeleton import JOINTS
 from edgepose.utils.sockets import parse_destination, resolve
 
@@ -220,18 +221,18 @@ def _damaged(lines: list[str], damage: str) -> bytes:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        ("frames go back", "row 4: frame 1 comes after frame 1"),
-        ("huge frame", "row 3: "),
-        ("text", "row 3: could not convert"),
-        ("nan", "row 3: a number is infinite or not a number"),
-        ("cut row", r"row 6: \d+ columns, the header has 99"),
-        ("two files", "row 7: "),
-        ("long line", "too long"),
+        ("frames go back", "first: row 4 has frame 1 after frame 1; sort the rows"),
+        ("huge frame", "row 3 has a number that is infinite"),
+        ("text", "row 3 has a cell that is not a number"),
+        ("nan", "row 3 has a number that is infinite, not a number"),
+        ("cut row", r"row 6 has \d+ columns, the header has 99"),
+        ("two files", "6 bad rows left out, the first: row 7 has a cell that is not a number"),
+        ("long line", "row 3 is longer than 16384 characters"),
         ("only a header", "no poses"),
         ("joints", "not a file of poses"),
-        ("zeros", "row 3: the numbers of pelvis are not a rotation"),
-        ("empty", "not a file of poses"),
-        ("binary", "not a text file"),
+        ("zeros", "row 3 has numbers of pelvis that are not a rotation"),
+        ("empty", "the file is empty"),
+        ("binary", "starts with .*, not with 'frame,time_s"),
     ],
 )
 def test_damaged_files(tmp_path, damage, message):
@@ -253,7 +254,7 @@ def test_matrices_that_are_no_rotations(tmp_path):
     path = tmp_path / "a.csv"
     with CsvSink(path, "matrix") as sink:
         sink.write(make_pose(0)._replace(rotations=-np.tile(np.eye(3, dtype=np.float32), (24, 1, 1))))
-    with pytest.raises(EdgeposeError, match="row 2: the numbers of pelvis are not a rotation"):
+    with pytest.raises(EdgeposeError, match="row 2 has numbers of pelvis that are not a rotation"):
         read_poses(path)
 
 
@@ -376,6 +377,32 @@ def test_names_stand_for_their_address_of_ipv4(kind):
     assert resolve("::1", 9, kind)[0] == socket.AF_INET6
 
 
+def test_broadcast_reaches_those_who_listen():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("", 0))
+        receiver.settimeout(5)
+        port = receiver.getsockname()[1]
+        destination = parse_destination(f"127.255.255.255:{port},format=binary,broadcast")
+        with UdpSink(*destination) as sink:
+            sink.write(make_pose(1))
+        assert decode_binary(receiver.recv(2048)).index == 1
+
+
+@pytest.mark.parametrize(
+    ("host", "cast"),
+    [
+        ("127.255.255.255", "broadcast"),
+        ("255.255.255.255", "broadcast"),
+        ("224.0.0.251", "multicast"),
+        ("ff02::1", "multicast"),
+    ],
+)
+@pytest.mark.parametrize("sink", [UdpSink, VmcSink])
+def test_many_machines_must_be_asked_for(sink, host, cast):
+    with pytest.raises(EdgeposeError, match=f"{host} is a {cast} address, .*: write .*:9000,{cast} to send"):
+        sink(host, 9000)
+
+
 def test_udp_unknown_host():
     with pytest.raises(EdgeposeError, match="cannot find host"):
         UdpSink("no-such-host.invalid", 9000)
@@ -386,9 +413,11 @@ def test_udp_unknown_host():
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("127.0.0.1:9000", ("127.0.0.1", 9000, "json")),
-        ("pc.local:1,format=binary", ("pc.local", 1, "binary")),
-        ("[::1]:65535,format=json", ("::1", 65535, "json")),
+        ("127.0.0.1:9000", ("127.0.0.1", 9000, "json", "")),
+        ("pc.local:1,format=binary", ("pc.local", 1, "binary", "")),
+        ("[::1]:65535,format=json", ("::1", 65535, "json", "")),
+        ("10.0.0.255:9000,format=binary,broadcast", ("10.0.0.255", 9000, "binary", "broadcast")),
+        ("224.0.0.251:9000,multicast", ("224.0.0.251", 9000, "json", "multicast")),
     ],
 )
 def test_parse_destination(text, expected):

@@ -11,8 +11,11 @@ from pythonosc.osc_bundle import OscBundle
 from scipy.spatial.transform import Rotation
 
 from edgepose.errors import EdgeposeError
+from edgepose.formats.bvh import read_bvh
+from edgepose.formats.poses.registry import read_poses
 from edgepose.pose import PoseFrame
 from edgepose.sinks import vmc
+from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.tcp import CLIENTS, TcpSink
 from edgepose.sinks.vmc import VmcSink
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics
@@ -166,6 +169,22 @@ def test_without_a_place_the_hips_are_above_the_ground():
     place, _ = bones(pose())["Hips"]
     assert place[0] == place[2] == 0.0
     assert 0.8 < place[1] < 1.1
+
+
+SITTING = {"left_hip": ("x", -90), "right_hip": ("x", -90), "left_knee": ("x", 90), "right_knee": ("x", 90)}
+
+
+@pytest.mark.parametrize("turns", [{}, SITTING, {"pelvis": ("x", -90)}], ids=["standing", "sitting", "lying"])
+def test_without_a_place_the_lowest_joint_is_on_the_ground(tmp_path, turns):
+    """In VMC as in BVH."""
+    one = pose(**turns)
+    place, _ = bones(one)["Hips"]
+    joints = forward_kinematics(one.rotations, default_body().offsets)[1] + place
+    assert joints[:, 1].min() == pytest.approx(0.0, abs=1e-6)
+    with BvhSink(tmp_path / "a.bvh") as sink:
+        sink.write(one)
+    np.testing.assert_allclose(read_bvh(tmp_path / "a.bvh").positions[0, 0] / 100.0, place, atol=1e-5)
+    assert read_poses(tmp_path / "a.bvh").translation is None
 
 
 def test_vmc_nobody_listens():

@@ -38,7 +38,7 @@ def frame_time(path: Path) -> tuple[int, float]:
 def test_rounded_times(tmp_path, digits):
     poses = read_poses(write(tmp_path / "a.csv", range(COUNT), digits))
     assert poses.rate == pytest.approx(60.0, rel=1e-3)
-    convert_poses(tmp_path / "a.csv", tmp_path / "a.bvh", 1.75)
+    convert_poses(tmp_path / "a.csv", tmp_path / "a.bvh")
     count, seconds = frame_time(tmp_path / "a.bvh")
     assert count == COUNT
     assert seconds == pytest.approx(1.0 / 60.0, rel=1e-3)
@@ -61,10 +61,10 @@ def test_a_pause_does_not_count(tmp_path):
 def test_every_second_row(tmp_path):
     write(tmp_path / "a.csv", range(0, COUNT, 2))
     assert read_poses(tmp_path / "a.csv").rate == 30.0
-    _, _, damage = convert_poses(tmp_path / "a.csv", tmp_path / "a.bvh", 1.75)
+    _, _, damage = convert_poses(tmp_path / "a.csv", tmp_path / "a.bvh")
     assert damage is None
     assert frame_time(tmp_path / "a.bvh") == (COUNT // 2, pytest.approx(1.0 / 30.0))
-    convert_poses(tmp_path / "a.csv", tmp_path / "a.npz", 1.75)
+    convert_poses(tmp_path / "a.csv", tmp_path / "a.npz")
     with np.load(tmp_path / "a.npz") as arrays:
         assert arrays["mocap_framerate"] == 30.0
 
@@ -74,7 +74,7 @@ def test_lost_rows(tmp_path, ending):
     kept = [i for i in range(COUNT) if i % 7 and not 100 < i < 110] + [COUNT]
     kept = [i for i in kept if i < COUNT]
     write(tmp_path / "a.csv", kept)
-    count, seconds, damage = convert_poses(tmp_path / "a.csv", tmp_path / f"a.{ending}", 1.75)
+    count, seconds, damage = convert_poses(tmp_path / "a.csv", tmp_path / f"a.{ending}")
     missing = kept[-1] - kept[0] + 1 - len(kept)
     assert (count, damage) == (
         len(kept),
@@ -95,7 +95,7 @@ def test_lost_rows(tmp_path, ending):
 def test_numbers_far_apart(tmp_path):
     write(tmp_path / "a.csv", [0, 1, 2, 200])
     with pytest.raises(EdgeposeError, match="197 frames are missing between its 4 poses"):
-        convert_poses(tmp_path / "a.csv", tmp_path / "a.bvh", 1.75)
+        convert_poses(tmp_path / "a.csv", tmp_path / "a.bvh")
 
 
 def test_quotes_around_the_names_of_columns(tmp_path):

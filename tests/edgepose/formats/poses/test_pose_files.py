@@ -99,10 +99,10 @@ def test_csv_in_blocks(tmp_path):
     lines = (tmp_path / "a.csv").read_text().splitlines(keepends=True)
     bad = tmp_path / "b.csv"
     bad.write_text("".join([*lines[:-2], lines[-1], lines[-2]]))
-    with pytest.raises(EdgeposeError, match=rf"row {BLOCK + 6}: frame {BLOCK + 3} comes after"):
+    with pytest.raises(EdgeposeError, match=rf"row {BLOCK + 6} has frame {BLOCK + 3} after"):
         read_poses(bad)
     bad.write_text("".join([*lines[: BLOCK + 3], "1,2\n"]))
-    with pytest.raises(EdgeposeError, match=rf"row {BLOCK + 4}: 2 columns"):
+    with pytest.raises(EdgeposeError, match=rf"row {BLOCK + 4} has 2 columns"):
         read_poses(bad)
 
 
@@ -163,6 +163,35 @@ def test_npz_of_others(tmp_path):
     assert (read.rotations[:, 22:] == np.eye(3)).all()  # fingers are no hands
 
 
+@pytest.mark.parametrize("key", ["mocap_framerate", "mocap_frame_rate", "fps"])
+def test_npz_with_root_and_body_apart(tmp_path, key):
+    vectors = np.random.default_rng(0).normal(scale=0.3, size=(20, 66))
+    np.savez(tmp_path / "a.npz", poses=vectors, **{key: 120.0})
+    np.savez(tmp_path / "b.npz", root_orient=vectors[:, :3], pose_body=vectors[:, 3:], **{key: [120.0]})
+    whole, parts = read_poses(tmp_path / "a.npz"), read_poses(tmp_path / "b.npz")
+    assert is_poses(tmp_path / "b.npz")
+    assert (whole.rate, parts.rate) == (120.0, 120.0)
+    np.testing.assert_array_equal(parts.rotations, whole.rotations)
+
+
+@pytest.mark.parametrize(("joints", "model"), [(24, "smpl"), (52, "smplh"), (55, "smplx")])
+def test_npz_with_the_joints_of_other_models(tmp_path, joints, model):
+    """Tools of AMASS take joints by their place: 22 of the body, SMPL-X's jaw and eyes, 30 of the fingers."""
+    poses = [pose._replace(rotations=pose.rotations.copy()) for pose in motion(5, moves=False)]
+    written(NpzSink(tmp_path / "a.npz", joints=joints), poses)
+    with np.load(tmp_path / "a.npz") as archive:
+        vectors = archive["poses"].reshape(5, -1, 3)
+        assert str(archive["surface_model_type"]) == model
+        assert archive["mocap_framerate"] == archive["mocap_frame_rate"] == 60.0
+    assert vectors.shape == (5, joints, 3)
+    if joints > 24:
+        assert (vectors[:, 22:] == 0.0).all()
+    wanted = Rotation.from_matrix(np.stack([pose.rotations[1:22] for pose in poses]).reshape(-1, 3, 3))
+    np.testing.assert_allclose(vectors[:, 1:22].reshape(-1, 3), wanted.as_rotvec(), atol=2e-6)
+    read = read_poses(tmp_path / "a.npz").rotations
+    np.testing.assert_allclose(read[:, :22], [pose.rotations[:22] for pose in poses], atol=2e-6)
+
+
 def test_true_poses_of_a_recording_are_in_the_body_frame(tmp_path):
     vectors = np.random.default_rng(0).normal(scale=0.3, size=(20, 72))
     with np.load(REAL) as archive:
@@ -184,7 +213,10 @@ def test_true_poses_of_a_recording_are_in_the_body_frame(tmp_path):
         ({"poses": np.array([["a"] * 72] * 5)}, ", not numbers"),
         ({"trans": np.full((5, 3), 1e7)}, "a number in 'trans' of frame 0 is not finite, or far too large"),
         ({"trans": np.zeros((4, 3))}, r"'trans' is float64 \(4, 3\), not numbers \(5, 3\)"),
-        ({"time_s": None, "mocap_framerate": None}, "needs one number 'mocap_framerate'"),
+        (
+            {"time_s": None, "mocap_framerate": None, "mocap_frame_rate": None},
+            "needs one number 'mocap_framerate'",
+        ),
         ({"time_s": None, "mocap_framerate": np.array(0.0)}, "a frame rate of 0 Hz is not possible"),
         ({"frame": np.array([0, 1, 1, 2, 3])}, "do not increase"),
         ({"held": np.zeros((5, 5), bool)}, "'held' is bool"),
@@ -400,7 +432,7 @@ def test_times_that_do_not_rise(tmp_path):
     with CsvSink(tmp_path / "a.csv") as sink:
         for i, time_s in enumerate([5.0, 5.1, 5.1]):
             sink.write(standing(i)._replace(time_s=time_s))
-    with pytest.raises(EdgeposeError, match=r"a\.csv, row 4: time 5\.1\d* s is not after that of the row"):
+    with pytest.raises(EdgeposeError, match=r"a\.csv: .* row 4 has time 5\.1\d* s as the row before; write"):
         read_poses(tmp_path / "a.csv")
     assert len(salvage_poses(tmp_path / "a.csv")[0].frames) == 2
     np.savez(tmp_path / "a.npz", poses=np.zeros((3, 72)), time_s=[1.0, 3.0, 2.0], frame=[0, 1, 2])
