@@ -7,6 +7,7 @@ not write NaN or infinity, and not leave samples out without a message.
 
 from __future__ import annotations
 
+import json
 import random
 import re
 import shutil
@@ -33,7 +34,7 @@ SLOW = ("run", "solve", "report")
 """Commands that take so long that they are chosen less often."""
 
 NOT_FINITE = re.compile(r"(?<![\w.:/\\-])-?(?:nan|inf|infinity)(?![\w.:/\\-])", re.IGNORECASE)
-"""NaN or infinity as a value of a text file."""
+"""NaN or infinity as a value of a table."""
 
 
 class Result(NamedTuple):
@@ -54,19 +55,23 @@ Case = tuple[Kind, int]
 """A kind of file, and the number of one of the ways to damage it."""
 
 
-def not_finite(folder: Path) -> str | None:
-    """Return where an output has NaN or infinity; None if none has."""
-    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
-        if path.suffix == ".npz":
-            with np.load(path) as arrays:
-                sparse = set(arrays["sparse"].tolist()) if "sparse" in arrays.files else set()
-                for key in set(arrays.files) - sparse:
-                    if arrays[key].dtype.kind == "f" and not np.isfinite(arrays[key]).all():
-                        return f"{path.name}: {key}"
-        elif path.suffix in (".csv", ".bvh", ".json", ".html"):
-            found = NOT_FINITE.search(path.read_text(errors="replace"))
-            if found:
-                return f"{path.name}: {found[0]} at character {found.start()}"
+def not_finite(path: Path) -> str | None:
+    """Return where an output has NaN or infinity; None if it has none."""
+    if path.suffix == ".npz":
+        with np.load(path) as arrays:
+            sparse = set(arrays["sparse"].tolist()) if "sparse" in arrays.files else set()
+            for key in set(arrays.files) - sparse:
+                if arrays[key].dtype.kind == "f" and not np.isfinite(arrays[key]).all():
+                    return f"{path.name}: {key}"
+    elif path.suffix in (".csv", ".bvh"):
+        found = NOT_FINITE.search(path.read_text(errors="replace"))
+        return found and f"{path.name}: {found[0]} at character {found.start()}"
+    elif path.suffix == ".json" or path.name == "stdout":
+        text = path.read_text(errors="replace")
+        names: list[str] = []
+        if text.startswith("{"):
+            json.loads(text, parse_constant=names.append)
+        return f"{path.name}: {names[0]}" if names else None
     return None
 
 
@@ -97,9 +102,9 @@ def judge(ended: Ended, out: Path, whole: int | None) -> tuple[str, str]:
         return "other exit code", f"{ended.code}: {message}"
     if ended.code and not (message or ended.out):
         return "no message", ""
-    bad = not_finite(out) or ("standard output" if NOT_FINITE.search(ended.out) else None)
-    if bad:
-        return "not finite", bad
+    for path in (out.parent / "stdout", *sorted(out.rglob("*"))):
+        if path.is_file() and (bad := not_finite(path)):
+            return "not finite", bad
     if not ended.code and whole is not None and (counted(out) or 0) < whole:
         return "silent loss", f"{counted(out)} of {whole}"
     return ("refused" if ended.code else "ok"), message

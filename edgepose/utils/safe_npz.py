@@ -5,12 +5,14 @@ from __future__ import annotations
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.lib.npyio import NpzFile
+from numpy.typing import NDArray
 
 from edgepose.errors import FileFormatError
 
@@ -19,6 +21,8 @@ MAX_BYTES = 2 << 30
 
 _FREE_BYTES = 256 << 20  # size below which the ratio is not limited: simulated data at rest compress well
 _MAX_RATIO = 100  # real recordings and poses compress by less than 3:1
+
+_LONGEST_NAME = 60  # characters of a name in a message
 
 BROKEN = (
     zipfile.BadZipFile,
@@ -62,8 +66,30 @@ def member_names(path: Path) -> set[str]:
         return set(archive.namelist())
 
 
+class Arrays(Mapping[str, NDArray[Any]]):
+    """The arrays of a file by name; numpy would return the bytes of a member that is no array."""
+
+    def __init__(self, file: NpzFile) -> None:
+        """Wrap an open file."""
+        self.files = list(file.files)
+        self._file = file
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """Unpack an array; raise one of `BROKEN` if it is damaged, or not an array."""
+        array = self._file[name]
+        if not isinstance(array, np.ndarray):
+            raise ValueError(f"{name[:_LONGEST_NAME]!r} is not an array")
+        return array
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.files)
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+
 @contextmanager
-def open_npz(path: Path) -> Iterator[NpzFile]:
+def open_npz(path: Path) -> Iterator[Arrays]:
     """Open a file for reading arrays, which are unpacked on access.
 
     Raises:
@@ -78,4 +104,4 @@ def open_npz(path: Path) -> Iterator[NpzFile]:
             check_size(path, sum(member.file_size for member in archive.infolist()))
         file.seek(0)
         with np.load(file, allow_pickle=False) as arrays:
-            yield arrays
+            yield Arrays(arrays)

@@ -18,6 +18,9 @@ import click
 _WAIT_MS = 1000
 """Longest wait for a slow reader of standard error, milliseconds."""
 
+_LONGEST_LINE = 4000
+"""Characters of a line of a message; the rest, quoted from a damaged file, is left out."""
+
 _status = False  # whether the cursor stands at the end of a status line
 
 
@@ -29,6 +32,9 @@ def printable(text: str) -> str:
 def say(text: str) -> None:
     """Write a message to standard error, over the status line if there is one."""
     global _status
+    text = "\n".join(
+        line if len(line) <= _LONGEST_LINE else f"{line[:_LONGEST_LINE]} ..." for line in text.split("\n")
+    )
     click.echo(("\r\033[K" if _status else "") + printable(text), err=True)
     _status = False
 
