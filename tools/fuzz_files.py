@@ -22,6 +22,7 @@ from typing import NamedTuple
 import click
 import numpy as np
 from fuzz_mutations import damage_file, damage_folder, is_text
+from fuzz_packets import FRAMINGS
 from fuzz_process import LIMIT_BYTES, LIMIT_S, Ended, Lost, run_command, run_forked, supervised, warm_up
 from fuzz_seeds import CONVERT, Kind, counted, make_kinds
 
@@ -30,7 +31,7 @@ TO_NPZ = CONVERT[0]
 GOOD = ("ok", "refused")
 """Outcomes that are right."""
 
-SLOW = ("run", "solve", "report")
+SLOW = ("bench", "evaluate", "export", "report", "run", "solve", "train")
 """Commands that take so long that they are chosen less often."""
 
 NOT_FINITE = re.compile(r"(?<![\w.:/\\-])-?(?:nan|inf|infinity)(?![\w.:/\\-])", re.IGNORECASE)
@@ -110,6 +111,14 @@ def judge(ended: Ended, out: Path, whole: int | None) -> tuple[str, str]:
     return ("refused" if ended.code else "ok"), message
 
 
+def notices_damage(kind: Kind) -> bool:
+    """Whether a digit in the place of another can cost a sample only if the reader notices it.
+
+    It does not if it may have to skip foreign lines or frames.
+    """
+    return kind.commands[0] == TO_NPZ or (kind.commands[0].startswith(TO_NPZ) and kind.name in FRAMINGS)
+
+
 class Fuzzer:
     """Runs cases in a folder of their own, which is emptied before each."""
 
@@ -126,7 +135,7 @@ class Fuzzer:
         self._seed, self._keep = seed, keep
         self._seeds.mkdir()
         self.kinds = make_kinds(self._seeds, run_forked)
-        readable = [kind for kind in self.kinds.values() if kind.commands[0].startswith(TO_NPZ)]
+        readable = [kind for kind in self.kinds.values() if notices_damage(kind)]
         counts = supervised(self._count_whole, readable)
         self._whole = {kind.name: count for kind, count in counts if isinstance(count, int)}
 

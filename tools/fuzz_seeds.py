@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import can
 import numpy as np
 from fuzz_process import Ended
+from fuzz_training_seeds import training_seeds
 
 from edgepose.formats.poses.registry import READERS as POSE_READERS
 from edgepose.formats.recordings.base import iter_samples
@@ -42,7 +43,7 @@ class Kind(NamedTuple):
         seed: a whole file or folder of the kind.
         commands: words of the commands that read it; {file} is the damaged one, {out} a folder for outputs,
             {seeds} the folder of the whole files.
-        folder: whether the seed is a folder and {file} the entry of this name in it; "" is the folder itself.
+        inside: the name of {file} if the seed is the folder around it.
     """
 
     name: str
@@ -69,9 +70,8 @@ RECORDING = (
 POSES = (
     *CONVERT,
     *("convert {file} --to bvh --out {out}", "report {file} --out {out}/report.html"),
-    "learn-prior {file} --about x --out {out}/prior.npz",
 )
-MOTION = ("synthesize {file} --out {out}", "synthesize {file} --out {out} --hold 1 --mounting 1", *POSES)
+MOTION = ("synthesize {file} --out {out}", "synthesize {file} --out {out} --hold 1 --mounting 1")
 CAPTURE = (
     *(
         "convert {file} --to npz --out {out}",
@@ -121,11 +121,26 @@ def make_prior() -> dict[str, Array]:
 # --- wires --------------------------------------------------------------------------------------------------
 
 
+def line_ids(protocol: Protocol) -> list[int]:
+    """Return the ids that come out if sensors of the protocol's ids are encoded; 0 if they have no ids."""
+    assert protocol.encoder is not None
+    encode, decoder = protocol.encoder(), protocol.decoder()
+    found: set[int] = set()
+    for number in range(3 * len(protocol.ids)):
+        sensor = protocol.ids[number % len(protocol.ids)]
+        packet = encode(
+            Sample(sensor, 10_000 * number, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 9.81), (0.0,) * 3), number
+        )
+        for words in [[packet]] if protocol.transport == "bytes" else [frame[:3] for frame in packet]:
+            found |= {sample.sensor for sample in decoder.feed(*words)}
+    return list(protocol.ids) if found == set(protocol.ids) and found else [0]
+
+
 def wire(protocol: Protocol, recording: Recording) -> Iterator[tuple[float, Any]]:
     """Yield time and packet (bytes, or CAN frames) of a recording's samples."""
     assert protocol.encoder is not None
     encode = protocol.encoder()
-    ids = [0] if protocol.single_device else list(protocol.ids)
+    ids = line_ids(protocol)
     count = dict.fromkeys(range(len(PLACEMENTS)), 0)
     for sample in iter_samples(recording):
         if sample.sensor < len(ids):
@@ -164,9 +179,9 @@ def write_log(path: Path, protocol: Protocol, recording: Recording) -> None:
                 )
 
 
-def id_map(protocol: Protocol) -> str:
-    """Return a sensor map by id: of one sensor and five that are not there, if a line has only one."""
-    ids = list(protocol.ids) or range(len(PLACEMENTS))
+def id_map(ids: list[int]) -> str:
+    """Return a sensor map by id: of one sensor and five that are not there, if there is one id."""
+    ids = ids if len(ids) == len(PLACEMENTS) else list(range(len(PLACEMENTS)))
     return "".join(f"{name} = {{ id = {number} }}\n" for name, number in zip(PLACEMENTS, ids, strict=True))
 
 
@@ -189,7 +204,7 @@ def pose_kinds(folder: Path, recording: Path, run: Run) -> Iterator[Kind]:
     made(run([*words, "--csv", f"{folder}/matrix.csv", "--rotations", "matrix"], folder))
     truth = {
         "gt": np.zeros((FRAMES, 72)),
-        "imu_ori": np.zeros((FRAMES, 17, 3, 3)),
+        "imu_ori": np.tile(np.eye(3), (FRAMES, 17, 1, 1)),
         "imu_acc": np.zeros((FRAMES, 17, 3)),
     }
     (folder / "poses.pkl").write_bytes(pickle.dumps(truth, 2))
@@ -202,13 +217,14 @@ def pose_kinds(folder: Path, recording: Path, run: Run) -> Iterator[Kind]:
 def wire_kinds(folder: Path, recording: Recording) -> Iterator[Kind]:
     """Yield captures and logs of all protocols, and logs of all kinds."""
     for name, protocol in PROTOCOLS.items():
-        (folder / f"{name}.toml").write_text(id_map(protocol))
-        more = f" --protocol {name} --sensors {{seeds}}/{name}.toml"
+        (folder / f"{name}.toml").write_text(id_map(line_ids(protocol)))
+        sensors = f" --sensors {{seeds}}/{name}.toml"
+        more = f"{sensors} --protocol {name}"
         if protocol.transport == "bytes":
             inside = folder / name
             inside.mkdir()
             write_capture(inside / "walk.bin", protocol, recording)
-            yield Kind(name, inside, (*(words + more for words in CAPTURE), CAPTURE[1]), "walk.bin")
+            yield Kind(name, inside, (*(words + more for words in CAPTURE), CAPTURE[1] + sensors), "walk.bin")
         else:
             write_log(folder / f"{name}.log", protocol, recording)
             yield Kind(name, folder / f"{name}.log", tuple(words + more for words in CAPTURE))
@@ -218,15 +234,16 @@ def wire_kinds(folder: Path, recording: Recording) -> Iterator[Kind]:
             write_log(path, PROTOCOLS["native-can"], recording)
             yield Kind(f"log{ending}", path, CAPTURE)
     for path in sorted((DATA / "protocols").glob("*.bin")):
-        yield Kind(path.stem, path, (CAPTURE[1], CAPTURE[1] + " --protocol auto"))
+        more = " --sensors {seeds}/witmotion.toml"
+        yield Kind(path.stem, path, (CAPTURE[1] + more, CAPTURE[0] + more))
 
 
 RIG = """file = "recordings/npz.npz"
 calibration = "calibration.json"
 name = "anna"
-csv = "out/p.csv"
-npz = "out/p.npz"
-rotations = "quaternion"
+csv = "../out/p.csv"
+npz = "../out/p.npz"
+rotations = "quat"
 height = 1.8
 filter = "none"
 overwrite = true
@@ -314,7 +331,7 @@ def other_kinds(folder: Path, recording: Recording) -> Iterator[Kind]:
     capture.mkdir()
     for name in ("07.asf", "07_01.amc"):
         shutil.copy(DATA / "mocap" / name, capture)
-    yield Kind("amc", capture, MOTION[:2], "07_01.amc")
+    yield Kind("amc", capture, MOTION, "07_01.amc")
     yield Kind("bvh", DATA / "mocap" / "07_01.bvh", MOTION)
     model = Path(__file__).parents[1] / "edgepose" / "inference" / "models" / "rnn-cmu.pt"
     yield Kind("model", model, ("models {file}", f"run --file {use} --model {{file}}"))
@@ -332,6 +349,7 @@ def make_kinds(folder: Path, run: Run) -> dict[str, Kind]:
     kinds += wire_kinds(folder, recording)
     kinds += settings_kinds(folder, recording)
     kinds += other_kinds(folder, recording)
+    kinds += [Kind(*seed) for seed in training_seeds(folder, run)]
     return {kind.name: kind for kind in kinds}
 
 

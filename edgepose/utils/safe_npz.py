@@ -82,9 +82,11 @@ class Arrays(Mapping[str, NDArray[Any]]):
         return array
 
     def __iter__(self) -> Iterator[str]:
+        """Iterate over the names."""
         return iter(self.files)
 
     def __len__(self) -> int:
+        """Return the number of arrays."""
         return len(self.files)
 
 
