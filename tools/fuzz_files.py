@@ -24,7 +24,7 @@ import numpy as np
 from fuzz_mutations import damage_file, damage_folder, is_text
 from fuzz_packets import FRAMINGS
 from fuzz_process import LIMIT_BYTES, LIMIT_S, Ended, Lost, run_command, run_forked, supervised, warm_up
-from fuzz_seeds import CONVERT, Kind, counted, make_kinds
+from fuzz_seeds import CONVERT, POSES, RECORDING, Kind, counted, make_kinds
 
 TO_NPZ = CONVERT[0]
 
@@ -116,7 +116,7 @@ def notices_damage(kind: Kind) -> bool:
 
     It does not if it may have to skip foreign lines or frames.
     """
-    return kind.commands[0] == TO_NPZ or (kind.commands[0].startswith(TO_NPZ) and kind.name in FRAMINGS)
+    return kind.commands in (RECORDING, POSES) or kind.name in FRAMINGS
 
 
 class Fuzzer:

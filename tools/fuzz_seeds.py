@@ -21,6 +21,7 @@ from edgepose.imu import Recording, SensorData
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array, quat_multiply, quat_rotate, rotvec_to_quat
 from edgepose.skeleton import PARENTS, default_body, forward_kinematics
+from edgepose.sources.can_log import write_log
 from edgepose.sources.replay import CAN_LOGS
 from firmware_protocols.base import Protocol
 from firmware_protocols.registry import PROTOCOLS
@@ -162,21 +163,18 @@ def write_capture(path: Path, protocol: Protocol, recording: Recording) -> None:
     path.with_name(path.name + ".times").write_text(times)
 
 
-def write_log(path: Path, protocol: Protocol, recording: Recording) -> None:
-    """Write a log of a CAN bus."""
-    with can.Logger(path) as log:
-        for time_s, frames in wire(protocol, recording):
-            for identifier, data, extended, fd in frames:
-                log.on_message_received(
-                    can.Message(
-                        timestamp=1e9 + time_s,
-                        arbitration_id=identifier,
-                        data=data,
-                        is_extended_id=extended,
-                        is_fd=fd,
-                        channel=0,
-                    )
-                )
+def messages(protocol: Protocol, recording: Recording) -> Iterator[can.Message]:
+    """Yield the frames of a CAN bus."""
+    for time_s, frames in wire(protocol, recording):
+        for identifier, data, extended, fd in frames:
+            yield can.Message(
+                timestamp=1e9 + time_s,
+                arbitration_id=identifier,
+                data=data,
+                is_extended_id=extended,
+                is_fd=fd,
+                channel=0,
+            )
 
 
 def id_map(ids: list[int]) -> str:
@@ -226,12 +224,12 @@ def wire_kinds(folder: Path, recording: Recording) -> Iterator[Kind]:
             write_capture(inside / "walk.bin", protocol, recording)
             yield Kind(name, inside, (*(words + more for words in CAPTURE), CAPTURE[1] + sensors), "walk.bin")
         else:
-            write_log(folder / f"{name}.log", protocol, recording)
+            write_log(folder / f"{name}.log", messages(protocol, recording))
             yield Kind(name, folder / f"{name}.log", tuple(words + more for words in CAPTURE))
     for ending in (*CAN_LOGS, ".csv", ".asc.gz", ".log.gz"):
         if ending not in UNREADABLE:
             path = folder / f"log{ending}"
-            write_log(path, PROTOCOLS["native-can"], recording)
+            write_log(path, messages(PROTOCOLS["native-can"], recording))
             yield Kind(f"log{ending}", path, CAPTURE)
     for path in sorted((DATA / "protocols").glob("*.bin")):
         more = " --sensors {seeds}/witmotion.toml"

@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 
 from edgepose.errors import EdgeposeError
+from edgepose.formats.ledger import Ledger
 from edgepose.sources import open_source
+from edgepose.sources.can_log import read_log, write_log
+from edgepose.sources.replay import CAN_LOGS
 from firmware_protocols import native_can
 from firmware_protocols.sample import Sample
 
@@ -180,3 +183,14 @@ def test_zeros_at_the_end_of_a_log(tmp_path):
     times, damage = read(path)
     check_whole(times)
     assert damage == f"{path}: 1 bad lines left out, the first: line 5401 is not a frame"
+
+
+@pytest.mark.parametrize("ending", [ending for ending in CAN_LOGS if ending != ".mf4"])
+def test_logs_are_written_whole(tmp_path, ending):
+    """python-can's writer of .db has a thread, and drops what that has not written when it is closed."""
+    path, sent = tmp_path / f"walk{ending}", messages()
+    write_log(path, sent)
+    written = [message for _, _, found in read_log(path, Ledger(str(path), "line")) for message in found]
+    assert [(m.arbitration_id, bytes(m.data)) for m in written] == [
+        (m.arbitration_id, bytes(m.data)) for m in sent
+    ]
