@@ -97,8 +97,8 @@ def judge(ended: Ended, out: Path, whole: int | None) -> tuple[str, str]:
         return "unexpected error", next(
             line for line in (ended.errors + ended.out).splitlines() if "unexpected error" in line
         )
-    if "Warning: " in ended.errors:
-        return "warning of Python", next(line for line in ended.errors.splitlines() if "Warning: " in line)
+    if warned := re.search(r".*:\d+: \w*Warning: .*", ended.errors):
+        return "warning of Python", warned[0]
     if ended.code not in (0, 1, 2):
         return "other exit code", f"{ended.code}: {message}"
     if ended.code and not (message or ended.out):

@@ -37,3 +37,15 @@ def test_headers_that_numpy_cannot_parse(tmp_path, reader, header):
             archive.writestr(f"{key}.npy", member)
     with pytest.raises(EdgeposeError, match=r"walk\.npz"):
         reader(path)
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_members_that_are_no_arrays(tmp_path, reader):
+    """numpy gives their bytes."""
+    path = tmp_path / "walk.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        for key in ("t", "head_quat", "head_acc", "poses", "trans", "mocap_framerate", "mean", "license"):
+            archive.writestr(f"{key}.npy", b"junk" * 1000)
+    with pytest.raises(EdgeposeError, match=r"walk\.npz") as raised:
+        reader(path)
+    assert len(str(raised.value)) < len(str(path)) + 200
