@@ -7,6 +7,8 @@ not write NaN or infinity, and not leave samples out without a message.
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import json
 import random
 import re
@@ -33,6 +35,9 @@ GOOD = ("ok", "refused")
 
 SLOW = ("bench", "evaluate", "export", "report", "run", "solve", "train")
 """Commands that take so long that they are chosen less often."""
+
+SLOW_TURNS = 4
+"""Kinds for which there are only such commands have one case in this number of turns."""
 
 NOT_FINITE = re.compile(r"(?<![\w.:/\\-])-?(?:nan|inf|infinity)(?![\w.:/\\-])", re.IGNORECASE)
 """NaN or infinity as a value of a table."""
@@ -205,25 +210,32 @@ class Fuzzer:
 
 
 def cases(kinds: dict[str, Kind], only: tuple[str, ...], number: int | None, count: int) -> list[Case]:
-    """Return cases, one of each kind in turn; or the case of one number of each kind."""
+    """Return cases, one of each kind in turn, of slow ones rarely; or the case of one number of each kind."""
     chosen = [kinds[name] for name in only or kinds]
     if number is not None:
         return [(kind, number) for kind in chosen]
-    return [(chosen[i % len(chosen)], i // len(chosen)) for i in range(count)]
+    turns = (
+        (kind, turn)
+        for turn in itertools.count()
+        for kind in chosen
+        if only or turn % SLOW_TURNS == 0 or not all(command.split()[0] in SLOW for command in kind.commands)
+    )
+    return list(itertools.islice(turns, count))
 
 
 def fuzz(fuzzer: Fuzzer, chosen: list[Case]) -> Counter[str]:
-    """Run cases; print those that fail and return the number of each outcome."""
+    """Run cases, up to Ctrl-C; print those that fail and return the number of each outcome."""
     counts: Counter[str] = Counter()
-    for case, result in supervised(fuzzer.run, chosen):
-        if isinstance(result, Lost):
-            fuzzer.keep(case)
-            outcome = "hang" if result.code is None else "killed"
-            result = Result(outcome, "" if result.code is None else f"exit code {result.code}", [])
-        counts[result.outcome] += 1
-        if result.outcome not in GOOD:
-            print(f"{case[0].name}-{case[1]}: {result.outcome}: {result.detail[:300]}")
-            print(f"    {' '.join(result.words)}", flush=True)
+    with contextlib.suppress(KeyboardInterrupt):
+        for case, result in supervised(fuzzer.run, chosen):
+            if isinstance(result, Lost):
+                fuzzer.keep(case)
+                outcome = "hang" if result.code is None else "killed"
+                result = Result(outcome, "" if result.code is None else f"exit code {result.code}", [])
+            counts[result.outcome] += 1
+            if result.outcome not in GOOD:
+                print(f"{case[0].name}-{case[1]}: {result.outcome}: {result.detail[:300]}")
+                print(f"    {' '.join(result.words)}", flush=True)
     return counts
 
 
