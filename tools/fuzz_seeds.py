@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import shutil
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,7 +27,7 @@ from edgepose.sources.replay import CAN_LOGS
 from firmware_protocols.base import Protocol
 from firmware_protocols.registry import PROTOCOLS
 from firmware_protocols.sample import Sample
-from tests.support.recording_files import FRAMES, RATE, WRITERS
+from tests.edgepose.formats.test_formats import FRAMES, RATE, WRITERS
 
 DATA = Path(__file__).parents[1] / "tests" / "data"
 
@@ -186,10 +187,18 @@ def id_map(ids: list[int]) -> str:
 # --- all kinds ----------------------------------------------------------------------------------------------
 
 
+def writer(name: str) -> Callable[[Path, Recording], Path]:
+    """Return the function of the tests that writes a recording in a format."""
+    if name in WRITERS:
+        return WRITERS[name]
+    test: Any = import_module(f"tests.edgepose.formats.recordings.test_{name.replace('-', '_')}")
+    return test.write_recording
+
+
 def recording_kinds(folder: Path, recording: Recording) -> Iterator[Kind]:
     """Yield the kinds of recordings, each written in its format."""
     for name in READERS:
-        yield Kind(name, WRITERS[name](folder / name, recording), RECORDING)
+        yield Kind(name, writer(name)(folder / name, recording), RECORDING)
 
 
 def pose_kinds(folder: Path, recording: Path, run: Run) -> Iterator[Kind]:
