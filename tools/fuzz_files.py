@@ -142,7 +142,10 @@ class Fuzzer:
         self.kinds = make_kinds(self._seeds, run_forked)
         readable = [kind for kind in self.kinds.values() if notices_damage(kind)]
         counts = supervised(self._count_whole, readable)
-        self._whole = {kind.name: count for kind, count in counts if isinstance(count, int)}
+        # The first packet of a capture may look like the end of one that began before it.
+        self._whole = {
+            kind.name: count - (kind.name in FRAMINGS) for kind, count in counts if isinstance(count, int)
+        }
 
     def run(self, case: Case) -> Result:
         """Run a case."""
