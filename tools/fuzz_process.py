@@ -83,28 +83,36 @@ def warm_up() -> None:
 
 def supervised(work: Callable[[Item], Answer], items: Sequence[Item]) -> Iterator[tuple[Item, Answer | Lost]]:
     """Yield each item with what a forked process makes of it; one that is killed costs only its item."""
-    context = multiprocessing.get_context("fork")
     done = 0
     while done < len(items):
-        ours, theirs = context.Pipe(duplex=False)
-        batch = items[done : done + _BATCH]
-        process = context.Process(target=_serve, args=(work, batch, theirs))
-        process.start()
-        theirs.close()
-        for item in batch:
-            if not ours.poll(WAIT_S):
-                process.kill()
-                answer: Answer | Lost = Lost(None)
-            else:
-                try:
-                    answer = ours.recv()
-                except EOFError:
-                    process.join()
-                    answer = Lost(process.exitcode)
+        for item, answer in _until_lost(work, items[done : done + _BATCH]):
             done += 1
             yield item, answer
-            if isinstance(answer, Lost):
-                break
+
+
+def _until_lost(
+    work: Callable[[Item], Answer], items: Sequence[Item]
+) -> Iterator[tuple[Item, Answer | Lost]]:
+    """Yield items with what a forked process makes of them, up to one that kills it."""
+    context = multiprocessing.get_context("fork")
+    ours, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_serve, args=(work, items, theirs))
+    process.start()
+    theirs.close()
+    try:
+        for item in items:
+            if not ours.poll(WAIT_S):
+                yield item, Lost(None)
+                return
+            try:
+                answer = ours.recv()
+            except EOFError:
+                process.join()
+                yield item, Lost(process.exitcode)
+                return
+            yield item, answer
+    finally:
+        process.kill()
         process.join()
         ours.close()
 

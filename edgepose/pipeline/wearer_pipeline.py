@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from edgepose.calibration import apply_calibration
 from edgepose.calibration.misfit import MisfitDetector
 from edgepose.calibration.rezero import HeadingRezero
-from edgepose.errors import EdgeposeError, ModelError, as_edgepose_error
+from edgepose.errors import EdgeposeError, as_edgepose_error
 from edgepose.imu import ImuFrame, ImuSample
-from edgepose.inference.engine import EngineInput, EngineOutput
+from edgepose.inference.engine import EngineInput, EngineOutput, check_finite
 from edgepose.pipeline.dropout import extrapolate_dropouts
 from edgepose.pipeline.dropout_monitor import DropoutMonitor
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
@@ -70,10 +70,7 @@ def pose_frame(output: EngineOutput) -> PoseFrame:
     Raises:
         ModelError: the network has computed NaN or infinity.
     """
-    if not (np.isfinite(output.rotations).all() and np.isfinite(output.std).all()):
-        raise ModelError(
-            "the network computes NaN or infinite numbers, so its archive is damaged; get or export it again"
-        )
+    check_finite(output)
     frame: ImuFrame = output.frame
     held = frozenset(name for name, held in zip(PLACEMENTS, frame.held.tolist(), strict=True) if held)
     return PoseFrame(frame.index, frame.time_s, output.rotations, output.std, None, held, output.warming_up)
