@@ -233,6 +233,8 @@ def _open_capture(path: Path, metadata: Mapping[str, str], overwrite: bool) -> O
 def _open_can_log(path: Path, overwrite: bool) -> Output:
     import can
 
+    from edgepose.sources.can_log import write_log
+
     journal = _journal(path)
     file = DurableAppender(str(journal), "CAN frames", b"", overwrite=overwrite, follow=journal == path)
     writer = can.CanutilsLogWriter(cast(TextIO, _TextFile(file)))
@@ -244,9 +246,8 @@ def _open_can_log(path: Path, overwrite: bool) -> Output:
 
     def convert(part: Path) -> None:
         try:
-            with can.CanutilsLogReader(journal) as reader, can.Logger(part) as log:
-                for message in reader:
-                    log.on_message_received(message)
+            with can.CanutilsLogReader(journal) as reader:
+                write_log(part, reader)
         except OSError:
             raise
         # python-can's writers raise arbitrary exceptions.

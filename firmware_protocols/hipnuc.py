@@ -27,7 +27,6 @@ from firmware_protocols._hipnuc_fields import (
     vector_i,
     write_fields,
 )
-from firmware_protocols._numbers import plausible
 from firmware_protocols._stream import StreamDecoder
 from firmware_protocols.base import Protocol, uncounted
 from firmware_protocols.rotation import from_angles, from_yaw_pitch_roll
@@ -80,15 +79,14 @@ def _integer_angles(data: bytes, start: int) -> Quaternion:
 def _block(data: bytes, start: int, sensor: int | None) -> Sample:
     """Return the sample of a 0x91 item; without `sensor`, byte 1 is its node id and time 0 means no time."""
     node, degrees, ms, ax, ay, az, gx, gy, gz, mx, my, mz, w, x, y, z = _HI91.unpack_from(data, start)
-    if not plausible((ax, ay, az, gx, gy, gz, mx, my, mz)):
-        raise ValueError("NaN, infinity, or too large")
+    mag = scaled((mx, my, mz), 1.0)
     return Sample(
         node if sensor is None else sensor,
         None if sensor is None and not ms else ms * 1000,
         unit(w, x, y, z),
-        (ax * STANDARD_G, ay * STANDARD_G, az * STANDARD_G),
-        (gx * DEG, gy * DEG, gz * DEG),
-        (mx, my, mz) if mx or my or mz else None,
+        scaled((ax, ay, az), STANDARD_G),
+        scaled((gx, gy, gz), DEG),
+        mag if mx or my or mz else None,
         None if sensor is None else float(degrees),  # the layout with a node id has none
     )
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from math import isfinite, radians
+from math import radians
 
+from firmware_protocols._numbers import LARGEST
 from firmware_protocols.sample import STANDARD_G
 
 FIELDS = (
@@ -105,8 +106,8 @@ class Pattern:
             raise ValueError("separator must be a non-empty string")
         if self.frame not in FRAMES:
             raise ValueError(f"frame must be one of {', '.join(FRAMES)}, not {self.frame!r}")
-        if self.wrap_us is not None and not (type(self.wrap_us) is int and self.wrap_us > 0):
-            raise ValueError(f"wrap_us must be an integer above 0, not {self.wrap_us!r}")
+        if self.wrap_us is not None and not (type(self.wrap_us) is int and 0 < self.wrap_us <= 1 << 64):
+            raise ValueError("wrap_us must be an integer from 1 to 2^64")
         for quantity in self.units:
             self.scale(quantity)
         if self.header is not None and (
@@ -128,7 +129,7 @@ class Pattern:
             name = unit.removeprefix("-")
             if name in known and (unit == name or quantity not in ("time", "temperature")):
                 return known[name] if unit == name else -known[name]
-        elif type(unit) in (int, float) and isfinite(unit) and unit:
+        elif type(unit) in (int, float) and 0 < abs(unit) <= LARGEST:
             return float(unit)
         raise ValueError(f"units: {quantity} must be one of {', '.join(known)} or a number, not {unit!r}")
 

@@ -1,21 +1,23 @@
 """Feeds noise and damaged packets to every decoder of the registry, and counts the samples that come out.
 
 No decoder may raise, hang or grow without limit, and each must find every packet that the damage did not
-touch.
+touch. With --packets, the damaged packets have right checksums, and what comes out must be plausible.
 """
 
 from __future__ import annotations
 
 import gc
 import random
+import sys
 import time
 import tracemalloc
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from math import atan2, cos, pi, sin
 from typing import Any, NamedTuple
 
 import click
+from fuzz_packets import fuzz_packets
 
 from firmware_protocols.registry import PROTOCOLS, Decoder, Protocol
 from firmware_protocols.sample import Sample
@@ -288,14 +290,35 @@ def expected(protocol: Protocol, first: list[Any], pieces: list[list[Any]]) -> s
     show_default=True,
     help="Input for each decoder.",
 )
+@click.option(
+    "--packets",
+    type=click.IntRange(1),
+    help="Feed this number of damaged packets with right checksums to each decoder instead.",
+)
 @click.option("--seed", type=int, default=0, show_default=True)
 @click.argument("names", nargs=-1, type=click.Choice(list(PROTOCOLS)))
-def main(size: int, seed: int, names: tuple[str, ...]) -> None:
+def main(size: int, packets: int | None, seed: int, names: tuple[str, ...]) -> None:
     """Run the command line."""
+    chosen = names or tuple(PROTOCOLS)
+    if packets is not None:
+        sys.exit(print_packets(chosen, packets, seed))
     print(f"{'format':<18}{'bytes':>9}{'good':>8}{'missed':>8}{'held more, B':>14}{'slowest, us/B':>15}")
-    for name in names or PROTOCOLS:
+    for name in chosen:
         r = fuzz(PROTOCOLS[name], size, seed)
         print(f"{name:<18}{r.fed:>9}{r.good:>8}{r.missed:>8}{r.grown:>14}{r.slowest_us:>15.1f}", flush=True)
+
+
+def print_packets(names: Sequence[str], count: int, seed: int) -> bool:
+    """Print a table of damaged packets with right checksums; return whether anything is wrong."""
+    print(f"{'format':<18}{'packets':>9}{'samples':>9}{'slowest batch, s':>18}{'wrong':>7}")
+    failed = False
+    for name in names:
+        r = fuzz_packets(PROTOCOLS[name], Sender(PROTOCOLS[name]).round(), count, seed)
+        print(f"{name:<18}{r.packets:>9}{r.samples:>9}{r.slowest_s:>18.3f}{len(r.problems):>7}", flush=True)
+        for problem in r.problems[:5]:
+            print(f"    {problem}", flush=True)
+        failed = failed or bool(r.problems)
+    return failed
 
 
 if __name__ == "__main__":

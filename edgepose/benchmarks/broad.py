@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 ENDINGS = (".mat", ".npz")
 _COLUMNS = {"imu_gyr": 3, "imu_acc": 3, "imu_mag": 3, "opt_quat": 4}
 _START_S = 1.0
+_LARGEST = 1e6  # more than any sensor measures, in any of the units
+_TOLERANCE = 0.1  # of the length of a quaternion
 
 
 class Trial(NamedTuple):
@@ -100,6 +102,13 @@ def read_trial(path: Path) -> Trial:
             )
         # Row after row in memory: some filters read the buffer directly.
         numbers[key] = np.ascontiguousarray(arrays[key], float)
+        size = np.linalg.norm(np.clip(numbers[key], -_LARGEST, _LARGEST), axis=1)
+        if key == "opt_quat":
+            good = np.isnan(numbers[key]).any(axis=1) | (abs(size - 1.0) < _TOLERANCE)
+        else:
+            good = size < _LARGEST
+        if not good.all():
+            raise EdgeposeError(f"{path}: {key!r} has impossible values, the first in row {np.argmin(good)}")
     movement = np.asarray(arrays["movement"]).astype(bool)
     rate = float(np.asarray(arrays["sampling_rate"]).reshape(-1)[0])
     if movement.shape != (count,) or not 1.0 < rate < 1e5:

@@ -23,8 +23,18 @@ SPARSE = ("csc_matrix", "csr_matrix", "csc_array", "csr_array")
 MIN_BONE, MAX_BONE = 0.005, 1.0
 """Shortest and longest believable distance between a joint and its parent, metres."""
 
+_MAX_VALUE = 1e6  # in millimetres, all coordinates and weights are smaller
+
 
 # --- arrays -------------------------------------------------------------------------------------------------
+
+
+def _floats(value: Any, name: str, path: Path) -> Array:
+    """Return a value of the file as an array; raise FileFormatError if its numbers are absurd."""
+    array = numbers(value, name, path).astype(float)
+    if array.size and np.abs(array).max() > _MAX_VALUE:
+        raise FileFormatError(f"{path}: {name} contains {np.abs(array).max():.3g}, which no body has")
+    return array
 
 
 def _is_known(module: str, name: str) -> bool:
@@ -37,13 +47,12 @@ def _regressor(value: Any, n_vertices: int, path: Path) -> Array:
     """Return a dense (24, V) joint regressor from a dense or sparse one."""
     name, shape = "J_regressor", (len(PARENTS), n_vertices)
     if not (isinstance(value, InertObject) and type(value).__name__ in SPARSE):
-        dense = numbers(value, name, path).astype(float)
+        dense = _floats(value, name, path)
         _check_shape(dense.shape, shape, name, path)
         return dense
     state = value.state if isinstance(value.state, dict) else {}
-    data, indices, indptr = (
-        numbers(state.get(key), f"{name}.{key}", path) for key in ("data", "indices", "indptr")
-    )
+    data = _floats(state.get("data"), f"{name}.data", path)
+    indices, indptr = (numbers(state.get(key), f"{name}.{key}", path) for key in ("indices", "indptr"))
     # The name of the shape depends on the version of scipy.
     found = numbers(state.get("_shape", state.get("shape")), f"{name}.shape", path)
     _check_shape(tuple(found.tolist()), shape, name, path)
@@ -76,7 +85,7 @@ def _check_shape(found: tuple[Any, ...], wanted: tuple[int, ...], name: str, pat
 def _joints(model: Mapping[Any, Any], vertices: Array | None, path: Path) -> Array:
     """Return the joint positions (24, 3) of the zero pose, metres."""
     if "J" in model:
-        joints = numbers(model["J"], "J", path).astype(float)
+        joints = _floats(model["J"], "J", path)
     elif "J_regressor" in model and vertices is not None:
         joints = _regressor(model["J_regressor"], len(vertices), path) @ vertices
     else:
@@ -133,27 +142,26 @@ def read_smpl(path: str | Path) -> Body:
 
     vertices = None
     if "v_template" in model:
-        vertices = numbers(model["v_template"], "v_template", path).astype(float)
+        vertices = _floats(model["v_template"], "v_template", path)
         if vertices.ndim != 2 or vertices.shape[1] != 3 or not len(vertices):
             raise FileFormatError(f"{path}: v_template has shape {vertices.shape} instead of (vertices, 3)")
     joints = _joints(model, vertices, path)
     offsets = np.zeros_like(joints)
     offsets[1:] = joints[1:] - joints[list(PARENTS[1:])]
-    far = np.abs(offsets).max(axis=1) > MAX_BONE
-    if far.any():
-        raise FileFormatError(
-            f"{path}: joint {int(np.argmax(far))} is more than {MAX_BONE:g} m from its parent; SMPL "
-            "models are in metres"
-        )
     sensors, height = _sensors(offsets)
     if vertices is not None:
         height = float(np.ptp(vertices[:, 1]))
     if not MIN_HEIGHT <= height <= MAX_HEIGHT:
         raise FileFormatError(f"{path}: the body is {height:.3g} m tall; SMPL models are in metres with Y up")
     lengths = np.linalg.norm(offsets[1:], axis=1)
-    if np.any(lengths < MIN_BONE):
+    if lengths.min() < MIN_BONE:
         joint = 1 + int(np.argmin(lengths))
         raise FileFormatError(f"{path}: joint {joint} coincides with its parent; these are not SMPL's joints")
+    if lengths.max() > MAX_BONE:
+        joint = 1 + int(np.argmax(lengths))
+        raise FileFormatError(
+            f"{path}: joint {joint} is {lengths.max():.3g} m from its parent; these are not SMPL's joints"
+        )
     return Body(offsets, sensors, height)
 
 

@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from edgepose.errors import ModelError
+
 Array = NDArray[np.float32]
 Input = NDArray[np.floating[Any]]
 
@@ -35,6 +37,14 @@ class EngineOutput(NamedTuple):
     rotations: Array
     std: Array
     warming_up: bool
+
+
+def check_finite(output: EngineOutput) -> None:
+    """Raise ModelError if a pose is NaN or infinite, as a network with damaged weights makes them."""
+    if not (np.isfinite(output.rotations).all() and np.isfinite(output.std).all()):
+        raise ModelError(
+            "the network computes NaN or infinite numbers, so its archive is damaged; get or export it again"
+        )
 
 
 class EngineInput(NamedTuple):

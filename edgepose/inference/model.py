@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from edgepose.errors import ModelError
 from edgepose.inference import archive
-from edgepose.inference.engine import Engine, StreamEngine
+from edgepose.inference.engine import Engine, StreamEngine, check_finite
 from edgepose.inference.quantisation import quantise_weights
 
 FRAMES_PER_STEP = 64
@@ -68,7 +68,7 @@ class Model:
             body frame.
 
         Raises:
-            ModelError: the arrays have other shapes, or numbers in them are not finite.
+            ModelError: the arrays have other shapes, or numbers in them or in the poses are not finite.
         """
         bones, force = np.asarray(orientation, np.float32), np.asarray(acceleration, np.float32)
         frames = len(bones)
@@ -82,6 +82,8 @@ class Model:
         engine = self.engine(FRAMES_PER_STEP)
         outputs = [each for i in range(frames) for each in engine.push(i, bones[i], force[i])]
         outputs += engine.finish()
+        for each in outputs:
+            check_finite(each)
         return (
             np.stack([each.rotations for each in outputs]) if outputs else np.empty((0, 24, 3, 3), np.float32)
         )

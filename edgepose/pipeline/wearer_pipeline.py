@@ -14,9 +14,9 @@ from edgepose.calibration import apply_calibration
 from edgepose.calibration.misfit import MisfitDetector
 from edgepose.calibration.rezero import HeadingRezero
 from edgepose.diagnostics.rig_monitor import RigMonitor
-from edgepose.errors import EdgeposeError, ModelError, as_edgepose_error
+from edgepose.errors import EdgeposeError, as_edgepose_error
 from edgepose.imu import ImuFrame, ImuSample
-from edgepose.inference.engine import EngineInput, EngineOutput
+from edgepose.inference.engine import EngineInput, EngineOutput, check_finite
 from edgepose.pipeline.dropout import extrapolate_dropouts
 from edgepose.pipeline.dropout_monitor import DropoutMonitor
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
@@ -70,14 +70,10 @@ def pose_frame(output: EngineOutput) -> PoseFrame:
     """Return the pose of a frame from the network's output.
 
     Raises:
-        ModelError: the network has computed something that is not a number.
+        ModelError: the network has computed NaN or infinity.
     """
+    check_finite(output)
     frame: ImuFrame = output.frame
-    if not np.isfinite(output.rotations).all():
-        raise ModelError(
-            f"the network's pose of frame {frame.index} is not a number: its archive is damaged, or sensors "
-            "send absurd values"
-        )
     held = frozenset(name for name, held in zip(PLACEMENTS, frame.held.tolist(), strict=True) if held)
     return PoseFrame(frame.index, frame.time_s, output.rotations, output.std, None, held, output.warming_up)
 

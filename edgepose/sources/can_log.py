@@ -1,4 +1,4 @@
-"""Logs of CAN buses, through python-can's readers: a damaged line or frame costs only itself."""
+"""Logs of CAN buses, through python-can's readers and writers: a damaged line or frame costs only itself."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import logging
 import re
 import sqlite3
 import struct
-from collections.abc import Iterator
+import time
+from collections.abc import Iterable, Iterator
 from datetime import datetime
 from itertools import islice, pairwise
 from pathlib import Path
@@ -23,6 +24,9 @@ from edgepose.utils.counted_lines import CountedLines
 
 # python-can warns about every vendor library and every clock that is not installed.
 logging.getLogger("can").setLevel(logging.CRITICAL)
+
+_STUCK_S = 30.0
+"""Longest time in which a writer may write nothing, seconds."""
 
 _LATEST_S = 1e11  # 5000 years of Unix time
 _BLF_OBJECT, _BLF_HEAD = b"LOBJ", struct.Struct("<4sHHII")
@@ -288,3 +292,30 @@ def read_log(path: Path, ledger: Ledger) -> Iterator[Frame]:
     except Exception as error:
         text = (str(error).splitlines() or [""])[0] or type(error).__name__
         raise FileFormatError(f"{path}: cannot read it as a log of a CAN bus: {text}") from None
+
+
+def write_log(path: Path, messages: Iterable[can.Message]) -> None:
+    """Write a log of a CAN bus in the format of its ending.
+
+    Raises:
+        ValueError: not all messages could be written.
+        OSError, or any other exception of python-can's writers.
+    """
+    count = 0
+    with can.Logger(path) as log:
+        for message in messages:
+            log.on_message_received(message)
+            count += 1
+        if isinstance(log, can.SqliteWriter):
+            _wait_until_written(log, count)
+
+
+def _wait_until_written(log: can.SqliteWriter, count: int) -> None:
+    """Wait for the writer's thread, which drops all that it has not written when it is stopped."""
+    seen, since_s = -1, 0.0
+    while log.num_frames < count:
+        if log.num_frames > seen:
+            seen, since_s = log.num_frames, time.monotonic()
+        elif time.monotonic() > since_s + _STUCK_S:
+            raise ValueError(f"only {seen} of {count} frames could be written")
+        time.sleep(0.01)

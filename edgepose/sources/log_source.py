@@ -19,7 +19,7 @@ from edgepose.sources import Batch, Batches, Device, SourceCounters, sum_counter
 from edgepose.sources.clock_sync import DeviceClock
 from edgepose.sources.line_decoder import LineDecoder
 from edgepose.sources.pacing import paced_batches
-from edgepose.sources.protocol_detection import Chunk
+from edgepose.sources.protocol_detection import Chunk, decode
 
 ChunkReader = Callable[[Path, Ledger], Iterator[tuple[str, float, Chunk | None]]]
 """Yields the chunks of a file: name of the line, time in seconds, and data; None for data that is bad."""
@@ -37,6 +37,8 @@ class RestartCounts(Protocol):
 
 SET_BACK_S = 0.5
 """A log's times that go back by more are those of a clock that was set back, seconds."""
+
+_HEAD, _STEP = 100, 16  # chunks in which the first packet is, bytes of a step towards it
 
 _FEW = 5  # frames whose times are wrong, rather than the clock
 
@@ -71,6 +73,7 @@ class LogSource:
         self._read_chunks = read_chunks
         self._make_decoder, self._clocks = make_decoder, clocks
         self._decoders: dict[str, LineDecoder] = {}
+        self._heads: dict[str, list[Chunk]] = {}
         self._bad = 0
         self._ledger = Ledger(str(path), "line")
         self._set_back_s = 0.0
@@ -104,6 +107,8 @@ class LogSource:
     def damage(self) -> str | None:
         """What is wrong with the file; partial packets do not count: a log may start and end anywhere."""
         problems = [self._ledger.damage()]
+        if corrupted := sum(map(self._corrupted, self._decoders)):
+            problems.append(f"{self._path}: {corrupted} corrupted packets left out")
         if self._bad:
             problems.append(f"{self._path}: ignored {self._bad} frames with an impossible time or id")
         if self.counters.packets:
@@ -159,6 +164,9 @@ class LogSource:
             decoder = self._decoders.get(name)
             if decoder is None:
                 decoder = self._decoders[name] = self._make_decoder(name)
+                self._heads[name] = []
+            if len(self._heads[name]) < _HEAD:
+                self._heads[name].append(chunk)
             yield from decoder.feed(chunk, time_s)
         for decoder in self._decoders.values():
             yield from decoder.finish()
@@ -168,6 +176,20 @@ class LogSource:
                 f"{self._path}: neither its packets nor the capture hold times; "
                 "make captures with edgepose record, or switch on the device's time"
             )
+
+    def _corrupted(self, name: str) -> int:
+        """Return the number of bad packets of a line after its first good one."""
+        line = self._decoders[name]
+        bad = line.counters.bad
+        if not bad or line.protocol is None:
+            return 0
+        decoder = line.protocol.decoder()
+        for chunk in self._heads[name]:
+            for piece in [chunk[i : i + _STEP] for i in range(0, len(chunk), _STEP)]:
+                decode(decoder, piece)
+                if decoder.counters.packets:
+                    return bad - decoder.counters.bad
+        return 0
 
     @property
     def _untimed(self) -> int:

@@ -22,6 +22,8 @@ MAX_BYTES = 2 << 30
 _FREE_BYTES = 256 << 20  # size below which the ratio is not limited: simulated data at rest compress well
 _MAX_RATIO = 100  # real recordings and poses compress by less than 3:1
 
+_LONGEST_NAME = 60  # characters of a name in a message
+
 BROKEN = (
     zipfile.BadZipFile,
     zlib.error,
@@ -65,18 +67,18 @@ def member_names(path: Path) -> set[str]:
 
 
 class Arrays(Mapping[str, NDArray[Any]]):
-    """The arrays of an open file by name; a member that is none raises ValueError when it is accessed."""
+    """The arrays of a file by name; numpy would return the bytes of a member that is no array."""
 
     def __init__(self, file: NpzFile) -> None:
-        """Wrap a file that numpy has opened."""
+        """Wrap an open file."""
+        self.files = list(file.files)
         self._file = file
-        self.files = file.files
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """Unpack an array."""
+        """Unpack an array; raise one of `BROKEN` if it is damaged, or not an array."""
         array = self._file[name]
-        if not isinstance(array, np.ndarray):  # numpy returns the bytes of other members
-            raise ValueError(f"{name!r} is not an array")
+        if not isinstance(array, np.ndarray):
+            raise ValueError(f"{name[:_LONGEST_NAME]!r} is not an array")
         return array
 
     def __iter__(self) -> Iterator[str]:
@@ -84,7 +86,7 @@ class Arrays(Mapping[str, NDArray[Any]]):
         return iter(self.files)
 
     def __len__(self) -> int:
-        """Return the number of members."""
+        """Return the number of arrays."""
         return len(self.files)
 
 

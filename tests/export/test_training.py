@@ -306,6 +306,9 @@ def changed(files, path, **arrays):
         ({"poses": np.zeros((29, 72))}, "differ in length"),
         ({"poses": np.zeros((30, 156))}, "not a recording with true poses"),
         ({"license": np.array(None)}, "not a recording with true poses"),
+        ({"head_acc": np.full((30, 3), np.nan)}, "an acceleration is not finite, or absurd"),
+        ({"poses": np.full((30, 72), np.inf)}, "a pose is not finite, or absurd"),
+        ({"head_quat": np.zeros((30, 4))}, "a quaternion is not of unit length"),
     ],
 )
 def test_recordings_that_cannot_be_trained_on(files, tmp_path, arrays, message):

@@ -198,6 +198,7 @@ BLOCK = hipnuc.encode(stream(1)[0])[6:]
     [
         BLOCK[:12] + struct.pack("<f", math.nan) + BLOCK[16:],
         BLOCK[:24] + struct.pack("<2f", math.inf, -math.inf) + BLOCK[32:],
+        BLOCK[:12] + struct.pack("<f", 2e6) + BLOCK[16:],  # in g
         BLOCK[:60] + bytes(16),
         BLOCK[:60] + struct.pack("<4f", 1.2, 0, 0, 0),
         BLOCK[:60] + struct.pack("<4f", math.nan, 0, 0, 0),

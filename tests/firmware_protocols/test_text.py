@@ -310,6 +310,7 @@ def test_random_bytes_never_raise(name, chunks):
         ({"columns": {"ax": "a", "ay": "b", "az": "c"}, "units": {"acc": "lb"}}, "units: acc must be one of"),
         ({"columns": {"ax": "a", "ay": "b", "az": "c"}, "units": {"acc": 0}}, "units: acc must be one of"),
         ({"columns": {"ax": "a", "ay": "b", "az": "c"}, "units": {"acc": []}}, "units: acc must be one of"),
+        ({"columns": {"ax": "a", "ay": "b", "az": "c"}, "units": {"acc": 10**400}}, "units: acc must be"),
         (
             {"columns": {"ax": "a", "ay": "b", "az": "c"}, "units": {"time": "-us"}},
             "units: time must be one of",
@@ -322,6 +323,7 @@ def test_random_bytes_never_raise(name, chunks):
         ({"columns": {"ax": "a", "ay": "b", "az": "c"}, "header": "x,y"}, "header has none"),
         ({"columns": {"ax": "a", "ay": "b", "az": "c"}, "separator": ""}, "separator"),
         ({"columns": {"ax": "a", "ay": "b", "az": "c"}, "wrap_us": 0}, "wrap_us"),
+        ({"columns": {"ax": "a", "ay": "b", "az": "c"}, "wrap_us": 10**400}, "wrap_us"),
         ({"columns": {"ax": "a", "ay": "b", "az": "c"}, "rate": 5}, "unknown key 'rate'"),
     ],
 )

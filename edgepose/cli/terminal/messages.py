@@ -24,6 +24,8 @@ _WAIT_MS = 1000
 
 _LEAST_COLUMNS = 20
 """Narrowest terminal that messages are fitted into; some report a width of 0."""
+_LONGEST_LINE = 4000
+"""Characters of a line of a message; the rest, quoted from a damaged file, is left out."""
 
 _status = False  # whether the cursor stands at the end of a status line
 _bar = False  # whether a progress bar is shown, which is drawn again below a message
@@ -39,8 +41,17 @@ def say(text: str) -> None:
     """Write a message to standard error, over the status line or progress bar if there is one."""
     global _status
     with _lock:
-        click.echo(("\r\033[K" if _status or _bar else "") + wrapped(printable(text), sys.stderr), err=True)
+        click.echo(
+            ("\r\033[K" if _status or _bar else "") + wrapped(printable(_shortened(text)), sys.stderr),
+            err=True,
+        )
         _status = False
+
+
+def _shortened(text: str) -> str:
+    return "\n".join(
+        line if len(line) <= _LONGEST_LINE else f"{line[:_LONGEST_LINE]} ..." for line in text.split("\n")
+    )
 
 
 def wrapped(text: str, stream: IO[str]) -> str:

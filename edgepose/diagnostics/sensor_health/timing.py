@@ -48,6 +48,8 @@ class Timing:
         # A long interval only means missing samples if nearly all intervals are multiples of one.
         regular = np.mean(np.abs(steps - np.round(steps)) < 0.2) > 0.9
         usual = intervals[steps < _GAP] if regular else intervals
+        if not usual.mean() > middle / 10.0:  # times go to and fro
+            return
         self.period_s, self._jitter_s = float(usual.mean()), float(usual.std())
         if regular:
             steps = np.diff(times[-fresh - 1 :]) / self.period_s

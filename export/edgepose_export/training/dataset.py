@@ -25,6 +25,9 @@ from edgepose_export.training.splits import HELD_OUT, SPLITS, part_of
 SEATED = ".seated"
 """End of the names of takes with legs made by `edgepose_export.synthesis.sitting`."""
 
+_LARGEST = 1e6
+"""More than any sensor measures, m/s^2; or rad."""
+
 RATE = 60.0
 """Frames per second of all networks."""
 
@@ -61,6 +64,7 @@ def read_take(path: Path) -> Take:
             rate, license_note = float(data["mocap_framerate"]), str(data["license"])
         if not len(poses) == len(quats) == len(force):
             raise ValueError("sensors and poses differ in length")
+        _check_numbers(quats, force, poses)
     except (OSError, *BROKEN) as error:
         raise EdgeposeError(
             f"{path}: not a recording with true poses ({error}); make it with edgepose synthesize"
@@ -88,6 +92,15 @@ def read_take(path: Path) -> Take:
         local.astype(np.float32),
         license_note,
     )
+
+
+def _check_numbers(quats: NDArray[Any], force: NDArray[Any], poses: NDArray[Any]) -> None:
+    """Raise ValueError unless quaternions, forces and rotation vectors are possible."""
+    for name, array in (("a quaternion", quats), ("an acceleration", force), ("a pose", poses)):
+        if array.dtype.kind not in "fiu" or not (np.abs(array) < _LARGEST).all():
+            raise ValueError(f"{name} is not finite, or absurd")
+    if not len(poses) or not (np.abs(np.linalg.norm(quats.astype(float), axis=-1) - 1.0) < 0.01).all():
+        raise ValueError("no frames, or a quaternion is not of unit length")
 
 
 def take_paths(folder: Path, part: str) -> list[Path]:

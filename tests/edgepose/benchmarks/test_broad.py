@@ -110,6 +110,9 @@ def test_files_that_are_none(tmp_path, name):
         ({"movement": np.zeros(7, bool)}, "'movement' or 'sampling_rate'"),
         ({"sampling_rate": np.nan}, "'movement' or 'sampling_rate'"),
         ({"movement": np.zeros(50, bool)}, "has no movement"),
+        ({"imu_acc": np.diag([0.0] * 7 + [np.nan] + [0.0] * 42)[:, 7:10]}, "'imu_acc' has impos.* in row 7"),
+        ({"imu_gyr": np.full((50, 3), 1e300)}, "'imu_gyr' has impossible values, the first in row 0"),
+        ({"opt_quat": np.full((50, 4), 2.0)}, "'opt_quat' has impossible values"),
     ],
 )
 def test_arrays_that_do_not_fit(six, tmp_path, change, problem):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from edgepose.cli.terminal.messages import say
 from edgepose.formats.recordings.csv import csv_header
 from edgepose.formats.recordings.raw_capture import times_header
 from tests.support.terminals import on_a_terminal
@@ -92,3 +93,12 @@ def test_names_that_are_no_text(command, wearer, tmp_path):
 def test_control_characters_in_the_first_lines_of_a_recording():
     assert csv_header({"no\x1b[2Jte": "a\tb\x9bc\nd"}).splitlines()[0] == "# no?[2Jte: a b?c d"
     assert times_header({"\x07": "\x1b"}).splitlines()[0] == "# ?: ?"
+
+
+def test_a_message_that_quotes_a_file_is_cut(capsys):
+    say("edgepose: bad\n" + "x" * 1_000_000)
+    first, second = capsys.readouterr().err.splitlines()
+    assert first == "edgepose: bad"
+    assert second.startswith("xxx")
+    assert second.endswith("x ...")
+    assert len(second) < 5000

@@ -14,6 +14,8 @@ from edgepose import rotations as rot
 from edgepose.calibration import GRAVITY, load_calibration
 from edgepose.diagnostics.rules import Diagnosis, diagnose
 from edgepose.diagnostics.sensor_health import SensorHealth, SensorHealthMonitor
+from edgepose.diagnostics.sensor_health.columns import TIME
+from edgepose.diagnostics.sensor_health.timing import Timing
 from edgepose.formats.recordings.base import iter_samples
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import ImuSample, SensorData
@@ -419,3 +421,13 @@ def test_the_same_however_the_samples_come(moving):
     now_s = rows[-1].time_s
     for a, b in zip(one.report(now_s), other.report(now_s), strict=True):
         assert dataclasses.asdict(a) == pytest.approx(dataclasses.asdict(b), nan_ok=True)
+
+
+def test_times_that_go_to_and_fro():
+    """As in a capture that holds one piece again and again: there is no period."""
+    window = np.zeros((31, 15))
+    window[:, TIME] = [*np.tile([0.0, 0.01, 0.02], 10), 0.0]
+    timing = Timing()
+    timing.update(window, 31)
+    assert math.isnan(timing.period_s)
+    assert timing.result(window, 31, 0.0, 0.02).lost == 0

@@ -108,6 +108,14 @@ def test_status(held, filling, text):
     assert parse_status(text) == (pose.held, pose.warming_up)
 
 
+@pytest.mark.parametrize(("rotation", "std"), [(np.nan, 0.0), (np.inf, 0.0), (0.0, np.nan)])
+def test_numbers_of_a_damaged_network_reach_no_output(rotation, std):
+    """Bits of weights may be flipped in an archive that the user trusts."""
+    output = EngineOutput(imu_frame(), np.full((24, 3, 3), rotation), np.full(24, std), False)
+    with pytest.raises(EdgeposeError, match="its archive is damaged"):
+        pose_frame(output)
+
+
 def test_every_frame_comes_out_once_and_in_order(walk):
     shelf = Shelf()
     seen = []

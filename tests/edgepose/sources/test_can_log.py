@@ -12,7 +12,10 @@ import numpy as np
 import pytest
 
 from edgepose.errors import EdgeposeError
+from edgepose.formats.ledger import Ledger
 from edgepose.sources import open_source
+from edgepose.sources.can_log import read_log, write_log
+from edgepose.sources.replay import CAN_LOGS
 from firmware_protocols import native_can
 from firmware_protocols.sample import Sample
 
@@ -241,3 +244,14 @@ def test_files_of_other_programs(tmp_path, name, says):
     path.write_bytes(gzip.compress(b"time_s,sensor\n"))
     with pytest.raises(EdgeposeError, match=says):
         open_source(file=path)
+
+
+@pytest.mark.parametrize("ending", [ending for ending in CAN_LOGS if ending != ".mf4"])
+def test_logs_are_written_whole(tmp_path, ending):
+    """python-can's writer of .db has a thread, and drops what that has not written when it is closed."""
+    path, sent = tmp_path / f"walk{ending}", messages()
+    write_log(path, sent)
+    written = [message for _, _, found in read_log(path, Ledger(str(path), "line")) for message in found]
+    assert [(m.arbitration_id, bytes(m.data)) for m in written] == [
+        (m.arbitration_id, bytes(m.data)) for m in sent
+    ]

@@ -606,6 +606,24 @@ def test_capture_with_wrap_noise_and_loss(tmp_path):
     assert 58 <= len(clock.flush()) <= 60
 
 
+@pytest.mark.parametrize("protocol", ["native", "auto"])
+@pytest.mark.parametrize(
+    ("change", "damage"),
+    [
+        (lambda data: data, None),
+        # A capture may start and end anywhere.
+        (lambda data: data[10:-10], None),
+        (lambda data: data[:2010] + b"\7" + data[2011:], "1 corrupted packets left out"),
+        (lambda data: data[5:-1000] + b"\1" + data[-1000:], "1 corrupted packets left out"),
+    ],
+)
+def test_corrupted_packets_of_a_capture(tmp_path, protocol, change, damage):
+    (tmp_path / "a.bin").write_bytes(change(b"".join(map(encode, packets(100)))))
+    source, _, got = everything(file=tmp_path / "a.bin", protocol=protocol)
+    assert len(got) >= 597
+    assert source.damage == (damage and f"{tmp_path / 'a.bin'}: {damage}")
+
+
 def test_capture_without_packets(tmp_path):
     (tmp_path / "a.raw").write_bytes(os.urandom(5000))
     with pytest.raises(EdgeposeError, match="5000 bytes"):
