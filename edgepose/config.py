@@ -16,7 +16,7 @@ from typing import Any
 from edgepose.errors import ConfigError, EdgeposeError
 from edgepose.formats.poses.csv_columns import ROTATION_FORMATS
 from edgepose.imu import FILTERS
-from edgepose.output_files import check_output
+from edgepose.sinks.output_files import check_output
 from edgepose.sinks.registry import SINKS
 from edgepose.utils.output_targets import is_stream
 from edgepose.utils.similar_names import choices

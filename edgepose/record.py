@@ -19,8 +19,8 @@ from edgepose.formats.recordings.npz import write_npz
 from edgepose.formats.recordings.raw_capture import times_header, times_path, times_row
 from edgepose.formats.recordings.registry import salvage_recording
 from edgepose.imu import ImuSample
-from edgepose.output_files import check_output
 from edgepose.placements import PLACEMENTS
+from edgepose.sinks.output_files import check_output
 from edgepose.sources import Batch, Source
 from edgepose.sources.replay import CAPTURES
 from edgepose.utils.durable_files import replace_file

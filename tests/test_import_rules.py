@@ -8,9 +8,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 LEVELS = (
-    "errors placements rotations skeleton imu pose faults utils",
+    "errors placements rotations skeleton imu pose utils",
     "formats orientation calibration inference",
-    "sources sinks sip analysis diagnostics viewer convert record config output_files",
+    "sources sinks sip analysis diagnostics viewer convert record config",
     "pipeline",
     "benchmarks",
     "cli",

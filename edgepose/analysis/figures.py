@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edgepose.errors import EdgeposeError
-from edgepose.output_files import check_output
+from edgepose.sinks.output_files import check_output
 from edgepose.skeleton import forward_kinematics
 from edgepose.utils.durable_files import replace_file
 from edgepose.utils.output_targets import is_stream

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from edgepose.calibration import Calibration
-from edgepose.faults import no_common_heading
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import Device
+from edgepose.utils.fault_messages import no_common_heading
 from firmware_protocols.registry import PROTOCOLS
 
 

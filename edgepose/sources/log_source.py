@@ -11,7 +11,6 @@ from types import MappingProxyType, TracebackType
 from typing import Protocol
 
 from edgepose.errors import EdgeposeError
-from edgepose.faults import JUMPS_OF_TWO, clock_restarted, two_devices
 from edgepose.formats.ledger import Ledger
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
@@ -20,6 +19,7 @@ from edgepose.sources.clock_sync import DeviceClock
 from edgepose.sources.line_decoder import LineDecoder
 from edgepose.sources.pacing import paced_batches
 from edgepose.sources.protocol_detection import Chunk, decode
+from edgepose.utils.fault_messages import JUMPS_OF_TWO, clock_restarted, two_devices
 
 ChunkReader = Callable[[Path, Ledger], Iterator[tuple[str, float, Chunk | None]]]
 """Yields the chunks of a file: name of the line, time in seconds, and data; None for data that is bad."""

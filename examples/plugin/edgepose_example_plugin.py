@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 from edgepose import PoseFrame, Sink
-from edgepose.output_files import check_output
 from edgepose.sinks.base import SinkContext
+from edgepose.sinks.output_files import check_output
 from edgepose.utils.durable_files import write_whole
 from firmware_protocols.base import Decoder, Protocol
 from firmware_protocols.sample import Counters, Sample

@@ -31,9 +31,9 @@ from edgepose.cli.terminal import messages as terminal
 from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
 from edgepose.orientation.stage import OrientationStage
-from edgepose.output_files import check_output
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
+from edgepose.sinks.output_files import check_output
 from edgepose.sources.sensor_map import read_map
 
 

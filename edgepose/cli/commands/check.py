@@ -110,11 +110,7 @@ def check(
 
         def watch(now: Callable[[], State]) -> None:
             if page is not None:
-                width = shutil.get_terminal_size().columns
-                title = printable(f"edgepose check  {source.name}; Ctrl-C ends")
-                state = now()
-                table = ["listening ..."] if state.seconds < LISTEN_S else _lines(state, width)
-                page.draw([title[:width], *table, *_wrapped(warnings, width)])
+                page.draw(_page_lines(source.name, now(), warnings))
 
         state, error = _listen(opened, health, source.file is None, seconds, lambda: stop.asked, watch)
         differences = [] if loaded is None else other_devices(loaded, opened.devices)
@@ -136,6 +132,13 @@ def check(
     if error is not None:
         raise error
     ctx.exit(1 if state.problems or opened.damage else 0)
+
+
+def _page_lines(name: str, state: State, warnings: Sequence[str]) -> list[str]:
+    width = shutil.get_terminal_size().columns
+    title = printable(f"edgepose check  {name}; Ctrl-C ends")
+    table = ["listening ..."] if state.seconds < LISTEN_S else _lines(state, width)
+    return [title[:width], *table, *_wrapped(warnings, width)]
 
 
 def _listen(

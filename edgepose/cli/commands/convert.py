@@ -17,7 +17,7 @@ from edgepose.formats.poses.bvh import UNITS
 from edgepose.formats.poses.npz_amass import JOINT_COUNTS
 from edgepose.formats.poses.registry import READERS as POSES
 from edgepose.formats.recordings.registry import READERS as RECORDINGS
-from edgepose.output_files import check_output
+from edgepose.sinks.output_files import check_output
 from edgepose.utils.output_targets import check_free
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import click
 
 from edgepose.cli.options.outputs import overwrite_option
 from edgepose.cli.terminal.messages import show
-from edgepose.output_files import check_output
+from edgepose.sinks.output_files import check_output
 
 
 @click.command()

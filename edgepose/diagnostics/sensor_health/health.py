@@ -12,10 +12,10 @@ from edgepose.diagnostics.sensor_health.columns import row_of
 from edgepose.diagnostics.sensor_health.comparison import HeadingComparison, compare_values
 from edgepose.diagnostics.sensor_health.report import SensorHealth
 from edgepose.diagnostics.sensor_health.sensor import Sensor
-from edgepose.faults import shared_convention
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
 from edgepose.sources.clock_sync import DeviceClock
+from edgepose.utils.fault_messages import shared_convention
 
 _FOLD_S = 2.0  # time between two measurements if no report is requested
 _MOST_PENDING = 5000

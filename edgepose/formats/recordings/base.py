@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import FileFormatError
-from edgepose.faults import clock_restarted
 from edgepose.formats.ledger import Ledger
 from edgepose.formats.registered import FileFormat
 from edgepose.imu import ImuSample, Recording, SensorData
 from edgepose.placements import PLACEMENTS
+from edgepose.utils.fault_messages import clock_restarted
 
 Array = NDArray[np.float64]
 

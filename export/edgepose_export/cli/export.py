@@ -13,7 +13,7 @@ import click
 from edgepose.cli.options.outputs import overwrite_option
 from edgepose.cli.terminal.messages import say
 from edgepose.inference.quantisation import PRECISIONS
-from edgepose.output_files import check_output
+from edgepose.sinks.output_files import check_output
 from edgepose.skeleton import JOINTS
 from edgepose.utils.durable_files import write_whole
 from edgepose_export.cli.evaluate import default_parts

@@ -9,7 +9,7 @@ import click
 from edgepose.cli.options.outputs import overwrite_option
 from edgepose.cli.terminal.messages import say
 from edgepose.errors import EdgeposeError
-from edgepose.output_files import check_output
+from edgepose.sinks.output_files import check_output
 
 RATE = 6.0
 """Poses per second that are used; neighbouring frames are nearly alike."""

@@ -10,10 +10,10 @@ import pytest
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.registry import pose_suffixes
 from edgepose.formats.recordings.registry import recording_suffixes
-from edgepose.output_files import check_output, known_endings
 from edgepose.pose import PoseFrame
 from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.npz import NpzSink
+from edgepose.sinks.output_files import check_output, known_endings
 from edgepose.sinks.registry import SINKS
 from edgepose.sources.replay import CAN_LOGS, CAPTURES
 from edgepose.utils.durable_files import replace_file, write_whole
