@@ -19,7 +19,7 @@ from edgepose.calibration.static_pose import (
 from edgepose.errors import CalibrationError
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array, tilt_deg
-from edgepose.utils import fault_messages
+from edgepose.utils import fault_messages as messages
 
 SPREAD_LIMIT_DEG = 3.0  # RMS about the mean over a hold; standing people sway 0.1 - 0.5
 GAP_LIMIT_S = 0.5  # longest time without a sample within a hold; radios lose some tenths of a second
@@ -95,9 +95,7 @@ def check_hold(hold: Hold, advice: str = "stand still and repeat") -> HoldSummar
         if (apart := detect_alternating_devices(quat)) is not None
     ]
     if shared:
-        raise CalibrationError(
-            "; ".join(f"{name}: {fault_messages.two_devices(apart)}" for name, apart in shared)
-        )
+        raise CalibrationError("; ".join(f"{name}: {messages.two_devices(apart)}" for name, apart in shared))
     mean = np.stack([rot.mean_rotation(quat) for quat in quats])
     spread = np.array([_rms(_angles(quat, centre)) for quat, centre in zip(quats, mean, strict=True)])
     moved = [
@@ -199,16 +197,14 @@ def _gravity(hold: Hold, quats: list[Array]) -> tuple[Array, list[str]]:
         acc, quat = s.acc[measured], quat[measured]
         force[i] = rot.quat_rotate(quat, acc).mean(axis=0)
         size = float(np.linalg.norm(acc.mean(axis=0)))
-        if (problem := fault_messages.no_gravity(size)) is not None:
+        if (problem := messages.no_gravity(size)) is not None:
             removed.append(f"{name}: {problem}")
         elif tilt_deg(force[i]) > GRAVITY_TILT_LIMIT_DEG:
             tilted[name], fitting[name] = tilt_deg(force[i]), fitting_conventions(quat, acc)
-        elif (problem := fault_messages.wrong_unit(size) or fault_messages.wrong_scale(size)) is not None:
+        elif (problem := messages.wrong_unit(size) or messages.wrong_scale(size)) is not None:
             warnings.append(f"{name}: {problem}")
-    conventions = fault_messages.shared_convention(fitting)
-    wrong = [
-        f"{name}: {fault_messages.wrong_frame(tilt, conventions[name])}" for name, tilt in tilted.items()
-    ]
+    conventions = messages.shared_convention(fitting)
+    wrong = [f"{name}: {messages.wrong_frame(tilt, conventions[name])}" for name, tilt in tilted.items()]
     if removed or wrong:
         raise CalibrationError("; ".join([*removed, *wrong]))
     return force, warnings

@@ -10,7 +10,7 @@ from edgepose.calibration.checks import GRAVITY_TILT_LIMIT_DEG
 from edgepose.calibration.fit import POSE_TILT_DEG
 from edgepose.diagnostics.sensor_health import REST_ACC, REST_S, SensorHealth
 from edgepose.sources.clock_sync import FOLLOWED_PPM
-from edgepose.utils import fault_messages
+from edgepose.utils import fault_messages as messages
 
 SILENT_S = 1.0
 LOWEST_RATE_HZ = 50.0
@@ -94,9 +94,9 @@ def _invalid(s: SensorHealth) -> str | None:
 
 
 def _two_devices(s: SensorHealth) -> str | None:
-    if s.two_devices_deg is None and s.clock_restarts < fault_messages.JUMPS_OF_TWO:
+    if s.two_devices_deg is None and s.clock_restarts < messages.JUMPS_OF_TWO:
         return None
-    return fault_messages.two_devices(s.two_devices_deg)
+    return messages.two_devices(s.two_devices_deg)
 
 
 def _same(s: SensorHealth) -> str | None:
@@ -113,20 +113,20 @@ def _frozen(s: SensorHealth) -> str | None:
 
 
 def _no_gravity(s: SensorHealth) -> str | None:
-    return fault_messages.no_gravity(s.norm_m_s2)
+    return messages.no_gravity(s.norm_m_s2)
 
 
 def _unit(s: SensorHealth) -> str | None:
-    return fault_messages.wrong_unit(s.norm_m_s2)
+    return messages.wrong_unit(s.norm_m_s2)
 
 
 def _scale(s: SensorHealth) -> str | None:
-    return fault_messages.wrong_scale(s.norm_m_s2)
+    return messages.wrong_scale(s.norm_m_s2)
 
 
 def _frame(s: SensorHealth) -> str | None:
     if s.tilt_deg > GRAVITY_TILT_LIMIT_DEG:
-        return fault_messages.wrong_frame(s.tilt_deg, s.convention)
+        return messages.wrong_frame(s.tilt_deg, s.convention)
     return None
 
 
@@ -210,7 +210,7 @@ def _drift(s: SensorHealth) -> str | None:
 
 def _restarts(s: SensorHealth) -> str | None:
     if s.clock_restarts:
-        return f"{fault_messages.clock_restarted(s.clock_restarts)}: check its power"
+        return f"{messages.clock_restarted(s.clock_restarts)}: check its power"
     return None
 
 

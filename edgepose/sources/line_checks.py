@@ -7,7 +7,7 @@ import logging
 from edgepose.errors import DeviceError
 from edgepose.placements import PLACEMENTS
 from edgepose.sources.line_reader import LineReader
-from edgepose.utils import fault_messages
+from edgepose.utils import fault_messages as messages
 
 _log = logging.getLogger(__name__)
 
@@ -65,14 +65,14 @@ def warn_about_clock_resets(line: LineReader) -> None:
     devices = {} if line.clocks is None else line.clocks.devices
     for placement, clock in devices.items():
         before = line.clock_resets.get(placement, 0)
-        if clock.resets - before >= fault_messages.JUMPS_OF_TWO and not line.duplicate_ids:
+        if clock.resets - before >= messages.JUMPS_OF_TWO and not line.duplicate_ids:
             line.duplicate_ids = True
-            _log.warning("%s: %s: %s", line.spec.name, PLACEMENTS[placement], fault_messages.two_devices())
+            _log.warning("%s: %s: %s", line.spec.name, PLACEMENTS[placement], messages.two_devices())
         elif clock.resets > before:
             _log.warning(
                 "%s: %s: %s: calibrate again",
                 line.spec.name,
                 PLACEMENTS[placement],
-                fault_messages.clock_restarted(),
+                messages.clock_restarted(),
             )
         line.clock_resets[placement] = clock.resets

@@ -134,7 +134,7 @@ def check(
     ctx.exit(1 if state.problems or opened.damage else 0)
 
 
-def _page_lines(name: str, state: State, warnings: Sequence[str]) -> list[str]:
+def _page_lines(name: str, state: State, warnings: list[str]) -> list[str]:
     width = shutil.get_terminal_size().columns
     title = printable(f"edgepose check  {name}; Ctrl-C ends")
     table = ["listening ..."] if state.seconds < LISTEN_S else _lines(state, width)
