@@ -154,10 +154,11 @@ class OutputConfig:
             object.__setattr__(self, each.name, value)
 
     def __getattr__(self, name: str) -> Any:
-        """Return the target of an output of this package, None if it is not written."""
+        """Return the file or target of an output of this package, None if it is not written."""
         if name not in SINKS:
             raise AttributeError(f"OutputConfig has no attribute {name!r}")
-        return dict(self.targets).get(name)
+        target = dict(self.targets).get(name)
+        return target if target is None or not SINKS[name].suffix else SINKS[name].file(target)
 
     @property
     def any(self) -> bool:

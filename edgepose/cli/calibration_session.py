@@ -78,12 +78,14 @@ class Measured(NamedTuple):
         reset: the heading reset, if there is one.
         from_s: start of the hold in a recording, seconds; None if it was live.
         devices: the devices that sent the samples, by placement.
+        damaged: a part of a recording was left out.
     """
 
     summary: HoldSummary
     reset: HeadingReset | None
     from_s: float | None
     devices: Mapping[int, Device]
+    damaged: bool = False
 
     @property
     def warnings(self) -> list[str]:
@@ -99,7 +101,7 @@ def measure_live(
     Raises:
         EdgeposeError: sensors are missing, the wearer moved, or headings would be arbitrary.
     """
-    reset = _side_by_side(source, plan, orient, say)
+    reset, damaged = _side_by_side(source, plan, orient, say)
     with open_source(**source.arguments()) as opened:
         batches = wait_for_all_sensors((b._replace(samples=orient(b.samples)) for b in opened), say)
         if plan.heading_reset == "live":
@@ -115,7 +117,7 @@ def measure_live(
             reset = record_motion(
                 batches, say, lambda moving: calibration.headings_from_motion(moving, upright)
             )
-    return Measured(summary, reset or _mounted(plan, summary), None, opened.devices)
+    return Measured(summary, reset or _mounted(plan, summary), None, opened.devices, damaged)
 
 
 def measure_recorded(
@@ -126,7 +128,7 @@ def measure_recorded(
     Raises:
         EdgeposeError: they are not in it, the wearer moved, or headings would be arbitrary.
     """
-    reset = _side_by_side(source, plan, orient, say)
+    reset, damaged = _side_by_side(source, plan, orient, say)
     everything, damage, devices = _read(source, orient)
     _check_north(orient, plan, devices)
     still, start_s = _window(source.name, (everything, damage), plan.start, plan.hold_s, say)
@@ -136,7 +138,8 @@ def measure_recorded(
     if plan.heading_reset == "motion":
         moving = _movements(source.name, everything, plan, start_s + plan.hold_s)
         reset = calibration.headings_from_motion(moving, summary.orientation)
-    return Measured(summary, reset or _mounted(plan, summary), start_s, devices)
+    reset = reset or _mounted(plan, summary)
+    return Measured(summary, reset, start_s, devices, damaged or damage is not None)
 
 
 def _movements(name: str, everything: Hold, plan: CalibrationPlan, hold_end_s: float) -> Hold:
@@ -166,15 +169,17 @@ def _movements(name: str, everything: Hold, plan: CalibrationPlan, hold_end_s: f
 
 def _side_by_side(
     source: SourceConfig, plan: CalibrationPlan, orient: OrientationStage, say: Prompter
-) -> HeadingReset | None:
+) -> tuple[HeadingReset | None, bool]:
     """Return the heading reset from a recording of the sensors lying side by side, if the plan names one.
+
+    The second value is whether a part of that recording was left out.
 
     Raises:
         EdgeposeError: the sensors do not lie side by side, or their headings do not hold in other recordings.
     """
     path = plan.side_by_side
     if path is None:
-        return None
+        return None, False
     say(f"Heading reset from {path}.")
     fresh = orient.fresh()
     everything, damage, _ = _read(dataclasses.replace(source, file=path, port=None, can=None), fresh)
@@ -183,9 +188,8 @@ def _side_by_side(
             "without magnetometers the filter starts each recording with arbitrary headings, which another "
             "recording cannot reset: use --heading-reset motion, live or mounting"
         )
-    return calibration.headings_side_by_side(
-        _window(str(path), (everything, damage), None, plan.hold_s, say)[0]
-    )
+    lying, _ = _window(str(path), (everything, damage), None, plan.hold_s, say)
+    return calibration.headings_side_by_side(lying), damage is not None
 
 
 def _mounted(plan: CalibrationPlan, summary: HoldSummary) -> HeadingReset | None:

@@ -13,7 +13,13 @@ from typing import TYPE_CHECKING, Any
 from edgepose.errors import ConfigError
 from edgepose.formats.bvh_names import BVH_NAMES
 from edgepose.utils.output_targets import FileTarget, parse_file, part_path
-from edgepose.utils.sockets import parse_datagram_address, parse_destination, parse_host_and_port
+from edgepose.utils.sockets import (
+    Address,
+    Destination,
+    parse_datagram_address,
+    parse_destination,
+    parse_host_and_port,
+)
 
 if TYPE_CHECKING:
     from edgepose.sinks.base import SinkFactory
@@ -31,6 +37,7 @@ class Output:
         help: help text of the flag.
         metavar: form of the flag's value; None for a switch.
         parse: makes the sink's target from that value. Raises ConfigError if the value has another form.
+        form: class of the targets; a tuple of the first of its values stands for one.
         suffix: ending of its files, such as ".csv"; empty if it does not write to a file.
         part: returns the name of the file that holds the poses during a run, given that of the output; None
             if there is no such file.
@@ -40,18 +47,21 @@ class Output:
     help: str
     metavar: str | None = "FILE"
     parse: Callable[[str], Any] = str
+    form: Callable[..., Any] | None = None
     suffix: str = ""
     part: Callable[[str], Path] | None = None
 
     def target(self, value: Any) -> Any:
-        """Return the sink's target for a value: text is parsed, anything else is a target already.
+        """Return the sink's target for a value: text is parsed, tuples are completed.
 
         Raises:
             ConfigError: the text has another form, or a switch is not True.
         """
         if self.metavar is None and value is not True:
             raise ConfigError(f"{value!r} is neither True nor False")
-        return self.parse(str(value)) if isinstance(value, str | Path) else value
+        if isinstance(value, str | Path):
+            return self.parse(str(value))
+        return value if self.form is None else self.form(*value)
 
     def file(self, target: Any) -> str:
         """Return the file to which a target of an output with a suffix leads."""
@@ -81,6 +91,7 @@ SINKS = {
         "Send each pose as a datagram.",
         "HOST:PORT[,format=json|binary][,broadcast]",
         parse_destination,
+        Destination,
     ),
     "osc": Output(
         "edgepose.sinks.vmc:open_sink",
@@ -88,6 +99,7 @@ SINKS = {
         "on port 39539.",
         "HOST:PORT[,broadcast]",
         parse_datagram_address,
+        Address,
     ),
     "tcp": Output(
         "edgepose.sinks.tcp:open_sink",

@@ -194,6 +194,8 @@ def calibrate(
         calibration.save(result, out, overwrite)
     say(_table(result, measured))
     say(f"Wrote {'stdout' if out == '-' else out}.")
+    if measured.damaged:
+        raise EdgeposeError("a part of the recording was left out, see the warnings above")
 
 
 def _check_use(source: SourceConfig, plan: CalibrationPlan) -> None:

@@ -243,7 +243,8 @@ def test_broken_files_cost_only_themselves(command, tmp_path):
     )
     assert list(lines(result.stdout).values()).count("ok") == 11
     said = messages(result.stderr)
-    assert re.match(r"damaged: .*3\.csv, row 11: 1 columns.*; 9 poses are kept", said["3.csv"])
+    damage = r"damaged: 1 bad rows left out, the first: row 11 has 1 columns.*; 20 poses are kept"
+    assert re.match(damage, said["3.csv"])
     assert re.match("failed: not a complete NPZ file", said["x.npz"])
     assert re.match("failed: .*has no poses, only a header", said["empty.csv"])
     assert sorted(path.name for path in out.iterdir()) == sorted(f"{i}.bvh" for i in range(12))

@@ -187,7 +187,7 @@ def test_full_device(case):
     out.symlink_to("/dev/full")
     if words[0] == "convert":
         result = CliRunner().invoke(cli, words)
-        assert "the disk is full" in result.stdout
+        assert "the disk is full" in result.stderr
     else:
         assert "the disk is full" in fails(words)
     assert stat.S_ISCHR(Path("/dev/full").stat().st_mode)

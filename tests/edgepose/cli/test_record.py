@@ -106,7 +106,7 @@ def test_seconds_progress_and_counts(tmp_path):
     assert span > 1.3
     assert re.search(r"\r\d s, \d+ \d+ \d+ \d+ \d+ \d+, \d+ a second, \d+ lost", said)
     assert f"samples  {count} in " in said
-    assert re.search(r"sensors  \d+ left_forearm, .*\d+ pelvis", said)
+    assert re.search(r"sensors  \d+ left_forearm, .*\d+\s+pelvis", said, re.DOTALL)
     lost = re.search(rf"packets  {count} good, (\d+) lost, ", said)
     assert int(lost[1]) > 0
     assert int(lost[1]) % 6 == 0

@@ -103,7 +103,7 @@ def test_vqf_that_is_not_installed(tmp_path):
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert result.returncode == 1
-    assert "pip install 'edgepose[vqf]'" in result.stdout
+    assert "pip install 'edgepose[vqf]'" in result.stderr
 
 
 def test_vqf_is_vqf(worn):

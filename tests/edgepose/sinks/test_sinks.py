@@ -226,7 +226,7 @@ def _damaged(lines: list[str], damage: str) -> bytes:
         ("text", "row 3 has a cell that is not a number"),
         ("nan", "row 3 has a number that is infinite, not a number"),
         ("cut row", r"row 6 has \d+ columns, the header has 99"),
-        ("two files", "6 bad rows left out, the first: row 7 has a cell that is not a number"),
+        ("two files", "5 bad rows left out, the first: row 8 has frame 0 after frame 4"),
         ("long line", "row 3 is longer than 16384 characters"),
         ("only a header", "no poses"),
         ("joints", "not a file of poses"),

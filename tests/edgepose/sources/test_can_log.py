@@ -68,11 +68,13 @@ def dates(lines: list[str]) -> list[str]:
 
 
 def from_zero(lines: list[str]) -> list[str]:
-    """As candump -tz shows the times; every third line comes too early, as with a second bus."""
-    stamps = [f"{float(line[line.index('(') + 1 : line.index(')')]) - START_S:010.6f}" for line in lines]
-    result = [f" ({s}){line[line.index(')') + 1 :]}" for s, line in zip(stamps, lines, strict=True)]
-    for i in range(0, len(result) - 3, 3):
-        result[i : i + 2] = result[i + 1], result[i]
+    """As candump -tz shows the times; lines of a second bus come a little late."""
+    result = []
+    for i, line in enumerate(lines):
+        stamp = float(line[line.index("(") + 1 : line.index(")")]) - START_S
+        result.append(f" ({stamp:010.6f}){line[line.index(')') + 1 :]}")
+        if i % 3 == 0:
+            result.append(f" ({max(0.0, stamp - 5e-5):010.6f})  can1  123   [1]  00\n")
     return result
 
 

@@ -106,7 +106,7 @@ def test_what_cannot_be_opened(command):
     assert result.returncode == 1
     assert result.stderr == "edgepose: cannot listen to /dev/nowhere7, socketcan:nowhere7\n"
     assert "/dev/nowhere7: no such port" in result.stdout
-    assert "socketcan:nowhere7: cannot open it" in result.stdout
+    assert re.search("socketcan:nowhere7: (cannot open it|this system has no CAN sockets)", result.stdout)
 
 
 def test_devices_without_names(command):
