@@ -147,7 +147,7 @@ def _run(words: list[str], folder: Path) -> int:
     environment = os.environ | {"HOME": str(folder)}
     request = {"words": ["-m", "edgepose", *words], "folder": str(folder), "environment": environment}
     try:
-        become(request | {"session": False})
+        become(request | {"session": False, "first": ""})
         return 0
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)

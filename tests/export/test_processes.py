@@ -23,6 +23,8 @@ from edgepose_export.training.config import TrainConfig
 from edgepose_export.training.dataset import read_take, tape
 from edgepose_export.training.distributed import ALONE, Processes
 from edgepose_export.training.trainer import Trainer, compute_statistics, read_checkpoint
+from tests.support import processes
+from tests.support.datagrams import free_address
 
 DATA = Path(__file__).parents[1] / "data" / "mocap"
 CONFIG = """
@@ -80,12 +82,35 @@ assert threads and not [name for name in threads if "gloo" in name], threads
 """
 
 
-def together(*words):
+def started_by_torchrun(*words):
     """Runs a program in two processes, to its end."""
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", *words]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     return subprocess.run(
         list(map(str, command)), capture_output=True, text=True, check=False, env=environment, timeout=120
+    )
+
+
+def together(*words):
+    """The same with the environment that torchrun makes, without a new Python for each process."""
+    host, port = free_address().split(":")
+    group = {"WORLD_SIZE": "2", "MASTER_ADDR": host, "MASTER_PORT": port, "TORCHELASTIC_RUN_ID": "test"}
+    command = [sys.executable, *map(str, words)]
+    started = [
+        processes.Popen(
+            command,
+            env=os.environ | group | {"RANK": str(rank), "LOCAL_RANK": str(rank)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for rank in range(2)
+    ]
+    ended = [process.communicate(timeout=120) for process in started]
+    return subprocess.CompletedProcess(
+        command,
+        max(abs(process.returncode) for process in started),
+        *("".join(texts) for texts in zip(*ended, strict=True)),
     )
 
 
@@ -108,7 +133,9 @@ def run(tmp_path_factory):
     for i, name in enumerate(("01_01", "01_02", "05_01", "03_01")):
         rows = {key: value[: 119 - 10 * i] if value.ndim else value for key, value in arrays.items()}
         np.savez(folder / "recordings" / f"{name}.npz", **rows)
-    done = together("-m", "edgepose", *words(folder), "--out", folder / "run", "--cache", folder / "cache")
+    done = started_by_torchrun(
+        *("-m", "edgepose", *words(folder), "--out", folder / "run", "--cache", folder / "cache")
+    )
     assert done.returncode == 0, done.stderr
     return folder, done.stderr
 

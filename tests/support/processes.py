@@ -8,11 +8,12 @@ import ctypes
 import inspect
 import json
 import os
+import pickle
 import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ _OWN_PYTHON = ("LANG", "LC_", "LD_", "MKL_", "OMP_", "PYTHON")
 class Popen(subprocess.Popen):
     """`subprocess.Popen`, but modules and scripts are forked from a Python that has imported PyTorch.
 
-    Started as always: `-c` and `-X`, other variables of the interpreter, functions between fork and exec.
+    Started as always: `-c` and `-X`, other variables of the interpreter, a `preexec_fn` that pickle refuses.
     """
 
     def _execute_child(self, *arguments: Any) -> None:
@@ -45,6 +46,7 @@ class Popen(subprocess.Popen):
                 "folder": str(Path(given["cwd"] or ".").absolute()),
                 "environment": environment,
                 "session": given["start_new_session"],
+                "first": _pickled(given["preexec_fn"]),
             },
             [name if stream == -1 else stream for name, stream in enumerate(streams)],
         )
@@ -66,9 +68,17 @@ def _can_be_forked(words: list[str], given: Mapping[str, Any], environment: Mapp
         and words[:1] == [sys.executable]
         and (words[1:2] == ["-m"] or words[1].endswith(".py"))
         and own(environment) == own(os.environ)
-        and given["preexec_fn"] is None
+        and _pickled(given["preexec_fn"]) is not None
         and not given["pass_fds"]
     )
+
+
+def _pickled(function: Callable[[], None] | None) -> str | None:
+    """A function in hexadecimal digits, "" for none; None if it cannot be pickled."""
+    try:
+        return "" if function is None else pickle.dumps(function).hex()
+    except (pickle.PicklingError, AttributeError):
+        return None
 
 
 @cache

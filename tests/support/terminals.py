@@ -12,10 +12,15 @@ import termios
 from tests.support import processes
 
 
-def own_terminal() -> None:
-    """In a new process: the terminal on its standard input becomes its own, as a shell's is."""
-    os.setsid()
+def take_terminal() -> None:
+    """In a new session: the terminal on its standard input becomes its own, as a shell's is."""
     fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+
+def own_terminal() -> None:
+    """In a new process: it begins a session, and takes the terminal on its standard input."""
+    os.setsid()
+    take_terminal()
 
 
 def rest_of(master: int) -> bytes:

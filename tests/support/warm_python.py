@@ -6,27 +6,31 @@ edgepose as a new one does, with its own arguments, folder, environment, standar
 
 from __future__ import annotations
 
+import atexit
 import gc
 import importlib
 import json
 import os
+import pickle
 import runpy
 import socket
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
 LIBRARIES = (
-    *("can", "click", "filterpy.kalman", "multiprocessing.pool", "numpy", "scipy.linalg", "scipy.spatial"),
-    *("serial", "torch"),
+    *("can", "click", "filterpy.kalman", "multiprocessing.pool", "numpy"),
+    *("scipy.linalg", "scipy.signal", "scipy.spatial", "serial", "torch"),
 )
 
 
 def serve(channel: socket.socket) -> dict[str, Any]:
     """Answer each request with the id of a new process; return the request in that process.
 
-    A request is JSON with `words`, `folder`, `environment` and `session`, sent with the descriptors of the
-    standard streams. The process is orphaned at once, and so becomes a child of the nearest reaper.
+    A request is JSON, sent with the descriptors of the standard streams: `words`, `folder`, `environment`,
+    `session`, and `first`, a function to call before the program starts, pickled, in hexadecimal digits. The
+    process is orphaned at once, and so becomes a child of the nearest reaper.
     """
     while True:
         message, streams, _, _ = socket.recv_fds(channel, 1 << 20, 3)
@@ -52,9 +56,35 @@ def serve(channel: socket.socket) -> dict[str, Any]:
 
 
 def become(request: dict[str, Any]) -> None:
-    """Run what `python WORD ...` runs: a module after -m, or a script."""
+    """Run what `python WORD ...` runs, a module after -m or a script, and end as Python does.
+
+    Freeing all objects of PyTorch at the end would take longer than most commands, so that is left out.
+    """
+    try:
+        run(request)
+        code = 0
+    except SystemExit as stop:
+        if stop.code is not None and not isinstance(stop.code, int):
+            raise  # a message
+        code = stop.code or 0
+    threading._shutdown()
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            if stream is not None:
+                stream.flush()
+        except (OSError, ValueError):
+            sys.exit(code)  # Python reports it
+    os._exit(code & 0xFF)
+
+
+def run(request: dict[str, Any]) -> None:
+    """Run a module or script with the arguments, folder, environment and streams of a request."""
+    first = pickle.loads(bytes.fromhex(request["first"])) if request["first"] else None
     if request["session"]:
         os.setsid()
+    if first is not None:
+        first()
     os.chdir(request["folder"])
     os.environ.clear()
     os.environ.update(request["environment"])
@@ -70,10 +100,18 @@ def become(request: dict[str, Any]) -> None:
 
 def open_standard_streams() -> None:
     """Open them as the interpreter does when it starts: the old ones remember what they were opened on."""
-    text = {"encoding": sys.stdout.encoding, "closefd": False}
-    sys.stdin = sys.__stdin__ = os.fdopen(0, **text)
-    sys.stdout = sys.__stdout__ = os.fdopen(1, "w", **text)
-    sys.stderr = sys.__stderr__ = os.fdopen(2, "w", 1, errors="backslashreplace", **text)
+    encoding = sys.stdout.encoding
+    sys.stdin = sys.__stdin__ = _stream(0, encoding=encoding)
+    sys.stdout = sys.__stdout__ = _stream(1, "w", encoding=encoding)
+    sys.stderr = sys.__stderr__ = _stream(2, "w", 1, encoding=encoding, errors="backslashreplace")
+
+
+def _stream(file: int, *mode: Any, **text: Any) -> Any:
+    try:
+        os.fstat(file)
+    except OSError:  # closed; Python starts without it
+        return None
+    return os.fdopen(file, *mode, closefd=False, **text)
 
 
 if __name__ == "__main__":

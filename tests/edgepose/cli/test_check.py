@@ -22,7 +22,7 @@ from edgepose.formats.recordings.npz import write_npz
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import open_source
-from tests.support import processes
+from tests.support import processes, terminals
 from tests.support.ports import Port
 from tests.support.processes import simulated
 from tests.support.terminals import rest_of
@@ -186,7 +186,7 @@ class Terminal:
             stdout=slave,
             stderr=slave,
             start_new_session=True,
-            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+            preexec_fn=terminals.take_terminal,
             env={k: v for k, v in os.environ.items() if k not in ("COLUMNS", "LINES", "NO_COLOR")}
             | {"TERM": "xterm"}
             | environment,

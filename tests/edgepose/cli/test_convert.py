@@ -35,7 +35,7 @@ from firmware_protocols import native_can
 from firmware_protocols.native import encode
 from firmware_protocols.native_packet import Packet
 from firmware_protocols.sample import STANDARD_G
-from tests.support import processes
+from tests.support import limits, processes
 from tests.support.terminals import on_a_terminal
 
 REAL = Path(__file__).parents[2] / "data" / "imu" / "six-sites-3s.npz"
@@ -332,7 +332,7 @@ def test_a_disk_that_fills_up(tmp_path):
         text=True,
         capture_output=True,
         check=False,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000)),
+        preexec_fn=limits.limit(resource.RLIMIT_FSIZE, 50_000),
     )
     assert process.returncode == 1
     assert (

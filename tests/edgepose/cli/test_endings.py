@@ -17,7 +17,7 @@ import pytest
 
 from edgepose.cli.terminal.stop_signal import REPEAT_S, StopSignal
 from edgepose.formats.poses.registry import read_poses
-from tests.support import processes
+from tests.support import limits, processes, terminals
 
 RUN = [sys.executable, "-m", "edgepose", "run", "--model", "rnn"]
 LIMIT_S = 60.0
@@ -96,7 +96,7 @@ def test_one_signal_ends_a_run_whose_output_nobody_reads(wearer, tmp_path, numbe
 @pytest.mark.parametrize("how", ["goes away", "closed at the start"])
 def test_standard_error_that_nobody_reads(wearer, tmp_path, how):
     """Messages are not what a run is for."""
-    options = {"stderr": subprocess.PIPE} if how == "goes away" else {"preexec_fn": lambda: os.close(2)}
+    options = {"stderr": subprocess.PIPE} if how == "goes away" else {"preexec_fn": limits.close(2)}
     process = started(wearer, "--realtime", "--csv", tmp_path / "p.csv", short=True, **options)
     if how == "goes away":
         process.stderr.readline()
@@ -107,14 +107,14 @@ def test_standard_error_that_nobody_reads(wearer, tmp_path, how):
 
 def test_every_command_works_without_standard_error():
     done = processes.run(
-        [sys.executable, "-m", "edgepose", "models"], stdout=subprocess.PIPE, preexec_fn=lambda: os.close(2)
+        [sys.executable, "-m", "edgepose", "models"], stdout=subprocess.PIPE, preexec_fn=limits.close(2)
     )
     assert done.returncode == 0
     assert b"birnn" in done.stdout
 
 
 def test_standard_output_that_is_closed(wearer):
-    process = started(wearer, "--csv", "-", text=True, stderr=subprocess.PIPE, preexec_fn=lambda: os.close(1))
+    process = started(wearer, "--csv", "-", text=True, stderr=subprocess.PIPE, preexec_fn=limits.close(1))
     code, errors = ended(process)
     assert code == 1
     assert errors.endswith("edgepose: cannot write poses: standard output is closed\n")
@@ -129,7 +129,7 @@ def test_a_terminal_that_is_closed_ends_a_run_with_whole_files(wearer, tmp_path)
         stdout=slave,
         stderr=slave,
         start_new_session=True,
-        preexec_fn=take_terminal,
+        preexec_fn=terminals.take_terminal,
     )
     os.close(slave)
     seen = b""
@@ -141,17 +141,13 @@ def test_a_terminal_that_is_closed_ends_a_run_with_whole_files(wearer, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["p.npz"]
 
 
-def take_terminal() -> None:
-    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-
-
 def test_nohup_goes_on(wearer, tmp_path):
     process = started(
         *(wearer, "--realtime", "--csv", tmp_path / "p.csv"),
         short=True,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN),
+        preexec_fn=limits.ignore_hangup,
     )
     process.stderr.readline()
     until(lambda: (tmp_path / "p.csv").stat().st_size > 20_000, "poses")

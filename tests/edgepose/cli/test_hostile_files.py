@@ -21,7 +21,7 @@ from edgepose.formats.recordings.registry import read_recording
 from edgepose.utils.safe_pickle import read_pickle
 from firmware_protocols import native_can
 from firmware_protocols.native_packet import Packet
-from tests.support import processes
+from tests.support import limits, processes
 
 RUN = [sys.executable, "-m", "edgepose", "run", "--model", "rnn"]
 LIMIT_S = 60.0
@@ -264,7 +264,7 @@ def test_a_device_without_an_end_as_a_text_file(wearer, flag):
         capture_output=True,
         timeout=LIMIT_S,
         check=False,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (20, 20)),
+        preexec_fn=limits.limit(resource.RLIMIT_CPU, 20),
     )
     assert done.returncode == 1
     assert re.fullmatch(

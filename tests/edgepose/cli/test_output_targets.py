@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import json
 import os
 import resource
@@ -28,7 +27,7 @@ from edgepose.formats.recordings.registry import read_recording, recording_suffi
 from edgepose.pose import PoseFrame
 from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.registry import SINKS
-from tests.support import processes
+from tests.support import limits, processes
 from tests.support.recordings import part
 
 OLD = b"what was there before\n"
@@ -260,13 +259,6 @@ def edgepose(words: list[str], **options: object) -> subprocess.CompletedProcess
     return processes.run(command, text=True, capture_output=True, timeout=120, check=False, **options)
 
 
-def mind_permissions() -> None:
-    """In a process that is to be started: folders that may not be written to are so for root, too."""
-    libc = ctypes.CDLL(None)
-    for capability in (1, 2):  # CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH
-        libc.prctl(24, capability, 0, 0, 0)  # PR_CAPBSET_DROP
-
-
 def test_a_folder_that_cannot_be_listed_costs_only_itself(wearer, tmp_path):
     (tmp_path / "in" / "closed").mkdir(parents=True)
     for folder in ("in", "in/closed"):
@@ -274,7 +266,7 @@ def test_a_folder_that_cannot_be_listed_costs_only_itself(wearer, tmp_path):
     (tmp_path / "in" / "closed").chmod(0)
     try:
         words = ["convert", "in", "--to", "csv", "--out", "out"]
-        result = edgepose(words, cwd=tmp_path, preexec_fn=mind_permissions)
+        result = edgepose(words, cwd=tmp_path, preexec_fn=limits.mind_permissions)
     finally:
         (tmp_path / "in" / "closed").chmod(0o755)
     assert result.returncode == 1
@@ -287,7 +279,7 @@ def test_read_only_folder(case):
     out.write_bytes(OLD)
     out.parent.chmod(0o555)
     try:
-        result = edgepose([*words, "--overwrite"], preexec_fn=mind_permissions)
+        result = edgepose([*words, "--overwrite"], preexec_fn=limits.mind_permissions)
     finally:
         out.parent.chmod(0o755)
     assert result.returncode == 1
@@ -301,7 +293,7 @@ def test_read_only_file(case):
     out, words = case
     out.write_bytes(OLD)
     out.chmod(0o444)
-    result = edgepose([*words, "--overwrite"], preexec_fn=mind_permissions)
+    result = edgepose([*words, "--overwrite"], preexec_fn=limits.mind_permissions)
     assert result.returncode == 1
     assert "Permission denied" in result.stdout + result.stderr
     assert out.read_bytes() == OLD
@@ -314,7 +306,7 @@ def test_full_disk(case):
     out.write_bytes(OLD)
     result = edgepose(
         [*words, "--overwrite"],
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+        preexec_fn=limits.limit(resource.RLIMIT_FSIZE, limit),
     )
     assert result.returncode == 1
     assert "File too large" in result.stdout + result.stderr

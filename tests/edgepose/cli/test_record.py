@@ -26,6 +26,7 @@ from edgepose.sources import open_source
 from firmware_protocols import native_can
 from firmware_protocols.native import encode
 from firmware_protocols.native_packet import Packet
+from tests.support import limits
 from tests.support.ports import Port, Sender
 from tests.support.processes import end, start
 from tests.support.terminals import on_a_terminal
@@ -346,7 +347,7 @@ def test_a_disk_that_fills_up(tmp_path, name):
     limit = 50_000
     process = start(
         *("record", file, "--file", REAL),
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+        preexec_fn=limits.limit(resource.RLIMIT_FSIZE, limit),
     )
     code, errors = end(process)
     assert code == 1

@@ -35,6 +35,7 @@ from edgepose.skeleton import JOINTS, PARENTS
 from firmware_protocols import native_can
 from firmware_protocols.native import encode
 from firmware_protocols.native_packet import Packet
+from tests.support import limits
 from tests.support.datagrams import Listener
 from tests.support.ports import Port, Sender
 from tests.support.processes import end, simulated, start
@@ -305,7 +306,7 @@ def test_a_disk_that_fills_up(wearer, tmp_path):
             "--csv",
             file,
         ),
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+        preexec_fn=limits.limit(resource.RLIMIT_FSIZE, limit),
     )
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 1
@@ -610,5 +611,5 @@ def test_a_bad_row_costs_only_itself(command, wearer, tmp_path):
         *("calibrate", "--file", path, "--body-frame", "heading:0", "--from", 1, "--hold", 3),
         *("--out", tmp_path / "calibration.json"),
     )
-    assert result.returncode == 0
+    assert result.returncode == 1
     assert f"warning: {says}" in result.stdout + result.stderr
