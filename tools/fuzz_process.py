@@ -19,7 +19,7 @@ from typing import NamedTuple, TypeVar
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from tests.support.warm_python import LIBRARIES, become
+from tests.support.warm_python import LIBRARIES, run_program
 
 LIMIT_S = 10.0
 """Longest time of a command: seconds of the processor, of which a busy machine gives it only a part."""
@@ -147,7 +147,7 @@ def _run(words: list[str], folder: Path) -> int:
     environment = os.environ | {"HOME": str(folder)}
     request = {"words": ["-m", "edgepose", *words], "folder": str(folder), "environment": environment}
     try:
-        become(request | {"session": False, "first": ""})
+        run_program(request | {"session": False, "first": ""})
         return 0
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)

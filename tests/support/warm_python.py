@@ -61,7 +61,7 @@ def become(request: dict[str, Any]) -> None:
     Freeing all objects of PyTorch at the end would take longer than most commands, so that is left out.
     """
     try:
-        run(request)
+        run_program(request)
         code = 0
     except SystemExit as stop:
         if stop.code is not None and not isinstance(stop.code, int):
@@ -78,7 +78,7 @@ def become(request: dict[str, Any]) -> None:
     os._exit(code & 0xFF)
 
 
-def run(request: dict[str, Any]) -> None:
+def run_program(request: dict[str, Any]) -> None:
     """Run a module or script with the arguments, folder, environment and streams of a request."""
     first = pickle.loads(bytes.fromhex(request["first"])) if request["first"] else None
     if request["session"]:

@@ -237,7 +237,7 @@ def test_ctrl_c_keeps_what_is_done(wearer, tmp_path, jobs):
     }
     path, out = tmp_path / "long.npz", tmp_path / "poses.csv"
     write_npz(path, Recording(repeated, {}))
-    words = [sys.executable, "-u", "-m", "edgepose", "solve", path, "--calibration", wearer.calibration]
+    words = [sys.executable, "-m", "edgepose", "solve", path, "--calibration", wearer.calibration]
     words += ["--csv", out, "--jobs", jobs, "--evaluations", 6]
     master, slave = os.openpty()  # a terminal, on which progress shows
     process = processes.Popen([str(word) for word in words], stderr=slave, start_new_session=True)
