@@ -80,13 +80,19 @@ class HeadingRezero:
                 self._notify(f"re-zero ignored: no headings have been found yet; {pose}, facing forward")
             self._first_hold(frame)
         else:
-            for delay_s in requests[-1:]:
-                self._hold, self._hold_from_s = [], frame.time_s + delay_s
-                wait = f"in {delay_s:g} s" if delay_s else "now"
-                self._notify(f"re-zero {wait}: {_POSE[self._calibration.pose]}, facing forward")
+            if requests:
+                self._request(frame.time_s, min(requests))
             if self._hold_from_s is not None and frame.time_s >= self._hold_from_s:
                 self._later_hold(frame)
         return self._blended(frame.time_s)
+
+    def _request(self, time_s: float, delay_s: float) -> None:
+        """Plan a hold, unless an earlier one is planned: many requests must not put it off."""
+        if self._hold_from_s is not None and self._hold_from_s <= time_s + delay_s:
+            return
+        self._hold, self._hold_from_s = [], time_s + delay_s
+        wait = f"in {delay_s:g} s" if delay_s else "now"
+        self._notify(f"re-zero {wait}: {_POSE[self._calibration.pose]}, facing forward")
 
     def _first_hold(self, frame: ImuFrame) -> None:
         self._hold.append(frame)

@@ -25,6 +25,7 @@ from edgepose.sinks.udp import decode
 from edgepose.skeleton import Body, forward_kinematics
 from edgepose.viewer.body_mesh import build, ground
 from edgepose.viewer.camera import FollowingCameras, place_first_camera
+from edgepose.viewer.same_origin import same_origin_only
 
 Array = NDArray[np.float64]
 
@@ -135,7 +136,7 @@ class Viewer:
             ) from error
         _check_free(host, 0 if next_free else port)
         # viser prints a greeting to standard output, which belongs to the caller.
-        with redirect_stdout(io.StringIO()):
+        with redirect_stdout(io.StringIO()), same_origin_only():
             self._server: Any = viser.ViserServer(host=host, port=port, label="edgepose", verbose=False)
         self.port: int = self._server.get_port()  # viser takes the next free one
         self._body = body

@@ -75,6 +75,26 @@ def apart(found: cal.Calibration, orientation: np.ndarray) -> np.ndarray:
 DRIFT = np.radians([20.0, -35.0, 5.0, 0.0, 170.0, -12.0])
 
 
+def test_many_requests_do_not_put_off_a_hold():
+    walk = Walk()
+    walk.wishes = [3.0]
+    walk.go(0.5, worn(STRAIGHT))
+    for _ in range(20):
+        walk.wishes = [60.0, 3.0]
+        walk.go(0.1, worn(STRAIGHT))
+    walk.go(2.5, worn(STRAIGHT))
+    assert [line.partition(":")[0] for line in walk.said] == ["re-zero in 3 s", "re-zeroed"]
+    walk.wishes = [60.0]
+    walk.go(0.1, worn(STRAIGHT))
+    walk.wishes = [0.0]
+    walk.go(2.0, worn(STRAIGHT))
+    assert [line.partition(":")[0] for line in walk.said[2:]] == [
+        "re-zero in 60 s",
+        "re-zero now",
+        "re-zeroed",
+    ]
+
+
 def test_nothing_changes_unless_it_is_asked_for():
     walk = Walk()
     assert {id(found) for found in walk.go(3.0, worn(STRAIGHT, DRIFT))} == {id(walk.headings._calibration)}

@@ -23,7 +23,9 @@ import click
 import matplotlib.image
 import numpy as np
 import pytest
+import viser
 from scipy.spatial.transform import Rotation
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from edgepose.cli import cli
@@ -525,6 +527,24 @@ def test_a_port_in_use_moves_the_page_of_a_run():
             assert b"<title>" in page.read()
     with pytest.raises(EdgeposeError, match=r"choose another --host"):
         Viewer("nosuch.invalid", port, default_body(), next_free=True)
+
+
+@pytest.mark.parametrize(
+    ("origin", "status"),
+    [("http://evil.example", 403), ("null", 403), ("http://127.0.0.1:1", 403), (None, 101), ("its own", 101)],
+)
+def test_pages_of_others_cannot_read_the_view(origin, status):
+    with contextlib.closing(Viewer("127.0.0.1", free_port(), default_body())) as viewer:
+        address = f"127.0.0.1:{viewer.port}"
+        origin = f"http://{address}" if origin == "its own" else origin
+        if status == 403:
+            with pytest.raises(InvalidStatus, match="403"):
+                connect(f"ws://{address}", origin=origin)
+        else:
+            with connect(
+                f"ws://{address}", origin=origin, subprotocols=[f"viser-v{viser.__version__}"]
+            ) as line:
+                assert line.recv(timeout=60)
 
 
 def test_two_wearers_have_a_page_each(caplog):
