@@ -75,7 +75,7 @@ def soak(minutes: float, model: str, core: int, faults: bool) -> None:
                 f"{passed_s / 60:6.1f}  {(now_s - used_s) / passed_s:11.1%}  {megabytes(run.pid):6.1f} MB"
             )
         time.sleep(max(0.0, started + length_s - time.monotonic()))
-        run.send_signal(signal.SIGINT)
+        run.send_signal(signal.SIGTERM)  # not SIGINT, which a shell ignores for programs in the background
         run.wait()
         messages = (folder / "messages.txt").read_text()
         if run.returncode:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -104,6 +105,11 @@ def _speed_tables(report: dict[str, Any], budget_us: float) -> str:
     return "\n".join(lines)
 
 
+def _known(value: Any) -> Any:
+    """Return a value for JSON, which has no NaN: other packages' filters compute it from some data."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def _row(cells: list[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
@@ -137,8 +143,8 @@ def orientation(data: Path, as_json: bool) -> None:
     scores = [score for trial_scores in _with_progress(compare(files), len(files)) for score in trial_scores]
     cost = cost_us(read_trial(files[0]))
     if as_json:
-        rows = [score._asdict() for score in scores]
-        show(json.dumps({"scores": rows, "us_a_sample_at_286_hz": cost}, indent=1))
+        rows = [{key: _known(value) for key, value in score._asdict().items()} for score in scores]
+        show(json.dumps({"scores": rows, "us_a_sample_at_286_hz": cost}, indent=1, allow_nan=False))
         return
     show(f"{len(files)} trials; RMSE over movement in deg, mean over trials; us a sample on one core\n")
     show("with magnetometer")
@@ -189,4 +195,5 @@ def _table(scores: list[Score], magnetometer: bool) -> str:
 
 
 def _mean(values: list[float]) -> str:
-    return f"{sum(values) / len(values):.2f}" if values else "-"
+    mean = sum(values) / len(values) if values else math.nan
+    return f"{mean:.2f}" if math.isfinite(mean) else "-"

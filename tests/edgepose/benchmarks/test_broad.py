@@ -160,6 +160,18 @@ def test_the_command(six, tmp_path):
     assert all(0 < score["total"] < 180 and score["us"] > 0 for score in scores)
 
 
+def test_what_another_filter_cannot_compute_is_no_number(six, tmp_path):
+    """A field along gravity shows no heading."""
+    arrays = as_arrays(cut(six[0], slice(4000, 4200)))
+    np.savez(tmp_path / "trial.npz", **arrays | {"imu_mag": arrays["imu_acc"]})
+    command = [sys.executable, "-m", "edgepose", "bench", "orientation", "--data", tmp_path]
+    shown = processes.run([*command, "--json"], capture_output=True, check=True).stdout
+    scores = json.loads(shown, parse_constant=lambda name: pytest.fail(name))["scores"]
+    assert None in [score["total"] for score in scores]
+    assert None not in [score["total"] for score in scores if score["filter"] == "edgepose"]
+    assert "nan" not in processes.run(command, capture_output=True, text=True, check=True).stdout
+
+
 def test_the_command_without_data(tmp_path):
     command = [sys.executable, "-m", "edgepose", "bench", "orientation", "--data", tmp_path]
     result = processes.run(command, capture_output=True, text=True, check=False)
