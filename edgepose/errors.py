@@ -41,6 +41,9 @@ def as_edgepose_error(error: Exception) -> EdgeposeError:
     text = (str(error).splitlines() or [""])[0]
     if isinstance(error, MemoryError):
         reported = EdgeposeError("not enough memory; use a shorter file")
+    elif isinstance(error, OSError) and error.filename is not None and error.strerror:
+        name = str(error.filename)  # the system's answer about a file, such as a name that is too long
+        reported = EdgeposeError(f"{name if len(name) <= 200 else f'{name[:200]}...'}: {error.strerror}")
     else:
         reported = EdgeposeError(
             f"unexpected error ({type(error).__name__}: {text}); please report it, with the output of "

@@ -270,3 +270,10 @@ def test_a_device_without_an_end_as_a_text_file(wearer, flag):
     assert re.fullmatch(
         r"edgepose: /dev/zero: larger than \d+ kB, too large for such a file; .*\n", done.stderr
     )
+
+
+@pytest.mark.parametrize("words", [["check"], ["record", "o.csv"]])
+def test_a_name_that_is_too_long(command, words):
+    result = command(*words, "--file", "a" * 5000 + ".csv")
+    assert result.returncode in (1, 2)
+    assert re.fullmatch(r"edgepose: a{200}\.\.\.: File name too long\n", result.stderr), result.stderr[-200:]
