@@ -115,7 +115,7 @@ def check(
         state, error = _listen(opened, health, source.file is None, seconds, lambda: stop.asked, watch)
         differences = [] if loaded is None else other_devices(loaded, opened.devices)
         for difference in [*differences, *missing_heading_reset(loaded, opened.devices)]:
-            _log.warning("%s", difference.removeprefix("warning: "))
+            _log.warning("%s", difference)
     if page is not None:
         for warning in warnings:
             say(f"warning: {warning}")

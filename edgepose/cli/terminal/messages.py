@@ -24,8 +24,9 @@ _WAIT_MS = 1000
 
 _LEAST_COLUMNS = 20
 """Narrowest terminal that messages are fitted into; some report a width of 0."""
+
 _LONGEST_LINE = 4000
-"""Characters of a line of a message; the rest, quoted from a damaged file, is left out."""
+"""Longest line of a message, characters; longer ones quote damaged files and are cut off."""
 
 _status = False  # whether the cursor stands at the end of a status line
 _bar = False  # whether a progress bar is shown, which is drawn again below a message
