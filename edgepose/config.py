@@ -166,9 +166,9 @@ class OutputConfig:
         return bool(self.targets)
 
     @property
-    def files(self) -> dict[str, str | Path | None]:
+    def files(self) -> dict[str, str | Path]:
         """The files that are written, by flag."""
-        files: dict[str, str | Path | None] = {}
+        files: dict[str, str | Path] = {}
         for name, target in self._files():
             part = SINKS[name].part
             files[f"--{name}"] = target

@@ -40,7 +40,7 @@ class Kind(NamedTuple):
     """A kind of file.
 
     Attributes:
-        name: what it is called.
+        name: for `--only`, and for messages.
         seed: a whole file or folder of the kind.
         commands: words of the commands that read it; {file} is the damaged one, {out} a folder for outputs,
             {seeds} the folder of the whole files.
@@ -313,7 +313,7 @@ def settings_kinds(folder: Path, recording: Recording) -> Iterator[Kind]:
         yield Kind(f"lines-{name}", folder / f"{name}.bin", (words,))
 
 
-def other_kinds(folder: Path, recording: Recording) -> Iterator[Kind]:
+def other_kinds(folder: Path) -> Iterator[Kind]:
     """Yield bodies, priors, motion capture and model archives."""
     use = "{seeds}/recordings/npz.npz --calibration {seeds}/calibration.json --csv {out}/p.csv"
     solve = f"solve {use} --method sop"
@@ -346,7 +346,7 @@ def make_kinds(folder: Path, run: Run) -> dict[str, Kind]:
     kinds += pose_kinds(folder, npz, run)
     kinds += wire_kinds(folder, recording)
     kinds += settings_kinds(folder, recording)
-    kinds += other_kinds(folder, recording)
+    kinds += other_kinds(folder)
     kinds += [Kind(*seed) for seed in training_seeds(folder, run)]
     return {kind.name: kind for kind in kinds}
 

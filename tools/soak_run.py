@@ -61,7 +61,8 @@ def soak(minutes: float, model: str, core: int, faults: bool) -> None:
         sensors, source = stack.enter_context(demo.simulator(folder / "walk.npz", "native", flags))
         if faults:
             stack.enter_context(busy_core(core))
-        receiver = stack.enter_context(Receiver())
+        receiver = Receiver()
+        receiver.start()
         run = stack.enter_context(running(folder, [*source, "--udp", receiver.address], model, core))
         time.sleep(3.0)  # until the model is loaded
         sensors.stdin.write("go\n")
@@ -160,7 +161,7 @@ def busy_core(core: int) -> Iterator[None]:
 
 
 class Receiver(threading.Thread):
-    """Counts the datagrams that come to a free port of this machine.
+    """Counts the datagrams that come to a free port of this machine, until the program ends.
 
     Attributes:
         address: HOST:PORT.
@@ -176,18 +177,10 @@ class Receiver(threading.Thread):
         self.count = 0
 
     def run(self) -> None:
-        """Receive until the program ends."""
+        """Receive."""
         while True:
             self._socket.recv(65536)
             self.count += 1
-
-    def __enter__(self) -> Receiver:
-        """Start."""
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """The thread ends with the program."""
 
 
 if __name__ == "__main__":

@@ -70,7 +70,7 @@ def joint_angles(local: Array) -> dict[str, Array]:
 
 
 def held_angles(held: NDArray[np.bool_]) -> dict[str, NDArray[np.bool_]]:
-    """Return in which poses (T,) each angle of `joint_angles` was not measured, from `held` (T, 6).
+    """Return for each angle of `joint_angles` in which poses (T,) it was not measured, given `held` (T, 6).
 
     An angle needs the pelvis and the sensor at the end of its limb; those of the trunk need the head.
     """

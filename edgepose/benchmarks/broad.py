@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from edgepose import rotations as rot
 from edgepose.errors import EdgeposeError
+from edgepose.formats.recordings.base import MAX_VALUE
 from edgepose.utils.safe_npz import BROKEN, open_npz
 
 Array = NDArray[np.float64]
@@ -21,7 +22,6 @@ Array = NDArray[np.float64]
 ENDINGS = (".mat", ".npz")
 _COLUMNS = {"imu_gyr": 3, "imu_acc": 3, "imu_mag": 3, "opt_quat": 4}
 _START_S = 1.0
-_LARGEST = 1e6  # more than any sensor measures, in any of the units
 _TOLERANCE = 0.1  # of the length of a quaternion
 
 
@@ -102,11 +102,11 @@ def read_trial(path: Path) -> Trial:
             )
         # Row after row in memory: some filters read the buffer directly.
         numbers[key] = np.ascontiguousarray(arrays[key], float)
-        size = np.linalg.norm(np.clip(numbers[key], -_LARGEST, _LARGEST), axis=1)
+        size = np.linalg.norm(np.clip(numbers[key], -MAX_VALUE, MAX_VALUE), axis=1)
         if key == "opt_quat":
             good = np.isnan(numbers[key]).any(axis=1) | (abs(size - 1.0) < _TOLERANCE)
         else:
-            good = size < _LARGEST
+            good = size < MAX_VALUE
         if not good.all():
             raise EdgeposeError(f"{path}: {key!r} has impossible values, the first in row {np.argmin(good)}")
     movement = np.asarray(arrays["movement"]).astype(bool)

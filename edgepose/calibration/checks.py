@@ -29,7 +29,7 @@ RATE_LIMIT_DEG_S = (
 )
 GRAVITY_TILT_LIMIT_DEG = 10.0
 
-_EARLIER = (2, 3)  # samples back of one device among those of two
+_EARLIER = (2, 3)  # samples between those of one device, if two alternate
 
 
 class HoldError(CalibrationError):

@@ -83,7 +83,7 @@ class MisfitDetector:
 
     def _comparison(self) -> list[str]:
         self._compared = True
-        return self._compare()
+        return [f"warning: {line}" for line in self._compare()]
 
     def _check_bones(self, frame: ImuFrame, bones: Array) -> list[str]:
         wrong = [name for name in impossible_bones(bones) if not frame.held[PLACEMENTS.index(name)]]

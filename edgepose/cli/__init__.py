@@ -36,7 +36,7 @@ def own_commands() -> list[str]:
 
 
 def summary(name: str) -> str:
-    """Return what the list of commands says of a command: the first line of its module, after the colon."""
+    """Return a command's line in the list of commands: the first line of its module, after the colon."""
     with (COMMANDS / f"{name}.py").open(encoding="utf-8") as file:
         text = file.readline().strip().strip('"').partition(": ")[2]
     return text[:1].upper() + text[1:]
@@ -141,6 +141,6 @@ def main() -> NoReturn:
         say(traceback.format_exc().rstrip() if debug else f"edgepose: {as_edgepose_error(error)}")
         sys.exit(1)
     finally:
-        # All is done; an interrupt while Python ends would only print a traceback.
+        # An interrupt while Python shuts down would only print a traceback.
         for number in stop_signals():
             signal.signal(number, signal.SIG_IGN)

@@ -21,6 +21,7 @@ from edgepose.orientation.stage import OrientationStage
 from edgepose.pipeline.rig_comparison import without_common_heading
 from edgepose.sources import Device, open_source
 from edgepose.sources.replay import is_recording
+from edgepose.utils.fault_messages import HEADING_RESETS
 
 END_S = 0.1
 """Longest time from the last sample of a recording to its end, seconds."""
@@ -186,7 +187,7 @@ def _side_by_side(
     if not fresh.north:
         raise EdgeposeError(
             "without magnetometers the filter starts each recording with arbitrary headings, which another "
-            "recording cannot reset: use --heading-reset motion, live or mounting"
+            f"recording cannot reset: use {HEADING_RESETS}"
         )
     lying, _ = _window(str(path), (everything, damage), None, plan.hold_s, say)
     return calibration.headings_side_by_side(lying), damage is not None
@@ -214,8 +215,7 @@ def _check_north(orient: OrientationStage, plan: CalibrationPlan, devices: Mappi
     # A reset from another recording assumes that headings have a north.
     if (plan.heading_reset is None or plan.side_by_side is not None) and not orient.north:
         raise EdgeposeError(
-            "without a magnetometer in each sensor the filter's headings are arbitrary: "
-            "add --heading-reset motion, live or mounting"
+            f"without a magnetometer in each sensor the filter's headings are arbitrary: add {HEADING_RESETS}"
         )
 
 

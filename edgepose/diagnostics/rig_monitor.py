@@ -16,7 +16,7 @@ _EVERY_S = 2.0
 
 
 class RigMonitor:
-    """Judges samples as `edgepose check` does, and reports each fault once, in the same words."""
+    """Checks samples like `edgepose check`, and reports each fault once, in the same words."""
 
     def __init__(self) -> None:
         """Start the watch with the first samples."""

@@ -127,13 +127,13 @@ class _Lines(CountedLines):
 
     def __init__(self, name: str, file: TextIO, longest: int) -> None:
         super().__init__(file, longest)
-        self._name, self._longest = name, longest
+        self._name = name
 
     def __next__(self) -> str:
         line = super().__next__()
         if self.too_long:
             raise FileFormatError(
-                f"{self._name}: row {self.number} is longer than {self._longest} characters; is it a table?"
+                f"{self._name}: row {self.number} is longer than {self.limit} characters; is it a table?"
             )
         return line
 

@@ -104,7 +104,7 @@ class Network:
 
     @property
     def faster(self) -> list[str]:
-        """Flags of `edgepose run`, not in use yet, with which the poses take less time."""
+        """Flags of `edgepose run` that would make it faster."""
         flags = ["--online stream"] if self.windowed else []
         return flags if self.kind == "rnn" else [*flags, "--model rnn"]
 

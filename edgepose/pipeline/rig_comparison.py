@@ -29,7 +29,7 @@ def other_devices(calibration: Calibration, devices: Mapping[int, Device]) -> li
         return []
     more = f" (and {len(different) - 1} others)" if different[1:] else ""
     return [
-        f"warning: the calibration was made with other sensors: {different[0]}{more}; "
+        f"the calibration was made with other sensors: {different[0]}{more}; "
         "calibrate again unless each is worn exactly as the other was"
     ]
 
@@ -51,7 +51,7 @@ def missing_heading_reset(calibration: Calibration | None, devices: Mapping[int,
     """
     message = without_common_heading(devices)
     aligned = calibration is not None and (calibration.filter != "none" or calibration.heading_offset.any())
-    return [] if message is None or aligned else [f"warning: {message}"]
+    return [] if message is None or aligned else [message]
 
 
 def _differs(then: Device, now: Device) -> bool:

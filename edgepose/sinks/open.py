@@ -64,7 +64,7 @@ def open_outputs(
 
 
 def _rank(output: tuple[str, Any]) -> int:
-    """Return when to open an output: pipes come last, because opening one waits for its reader.
+    """Return the rank of an output in the order of opening: a pipe is last, because it waits for its reader.
 
     Poses are written in the same order, so what shows or forwards them comes before the files.
     """

@@ -1,4 +1,4 @@
-"""The table of outputs: how users ask for each, and the location of its sink."""
+"""The table of outputs: the flag of each, and the location of its sink."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from edgepose.errors import ConfigError
 from edgepose.formats.bvh_names import BVH_NAMES
+from edgepose.formats.poses.npz_amass import JOINT_COUNTS
 from edgepose.utils.output_targets import FileTarget, parse_file, part_path
 from edgepose.utils.sockets import (
     Address,
@@ -68,14 +69,16 @@ class Output:
         return target.path if isinstance(target, FileTarget) else str(target)
 
 
+_JOINTS = tuple(map(str, JOINT_COUNTS))
+
 SINKS = {
     "csv": Output("edgepose.sinks.csv:open_sink", "Write poses as CSV; - is standard output.", suffix=".csv"),
     "npz": Output(
         "edgepose.sinks.npz:open_sink",
-        "Write poses as NPZ with the keys of AMASS at the end. 24 joints are SMPL's, 52 SMPL-H's, "
-        "55 SMPL-X's.",
-        "FILE[,joints=24|52|55]",
-        partial(parse_file, key="joints", choices=("24", "52", "55")),
+        "Write poses as NPZ with the keys of AMASS at the end. Numbers of joints: "
+        f"{', '.join(f'{count} as in {model}' for count, model in JOINT_COUNTS.items())}.",
+        f"FILE[,joints={'|'.join(_JOINTS)}]",
+        partial(parse_file, key="joints", choices=_JOINTS),
         suffix=".npz",
         part=part_path,
     ),
@@ -89,7 +92,7 @@ SINKS = {
     "udp": Output(
         "edgepose.sinks.udp:open_sink",
         "Send each pose as a datagram.",
-        "HOST:PORT[,format=json|binary][,broadcast]",
+        "HOST:PORT[,format=json|binary][,broadcast|multicast]",
         parse_destination,
         Destination,
     ),
@@ -97,7 +100,7 @@ SINKS = {
         "edgepose.sinks.vmc:open_sink",
         "Send each pose over OSC (the VMC protocol) to programs that show VRM avatars; most of them listen "
         "on port 39539.",
-        "HOST:PORT[,broadcast]",
+        "HOST:PORT[,broadcast|multicast]",
         parse_datagram_address,
         Address,
     ),

@@ -18,7 +18,7 @@ from edgepose.pose import PoseFrame, format_status, parse_status
 from edgepose.rotations import matrix_to_quat, matrix_to_rotvec, quat_to_matrix, rotvec_to_matrix
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.skeleton import JOINTS
-from edgepose.utils.sockets import Destination, resolve
+from edgepose.utils.sockets import Destination, address_text, resolve
 
 MAGIC = b"EPOS"
 VERSION = 1
@@ -119,7 +119,7 @@ class DatagramSink(Sink):
                 machines although `cast` does not say so.
         """
         self.unsent = 0
-        self._address = f"{host}:{port}"
+        self._address = address_text(host, port)
         try:
             family, address = resolve(host, port, socket.SOCK_DGRAM)
         except (OSError, UnicodeError) as error:
@@ -175,10 +175,10 @@ class DatagramSink(Sink):
 
 def _many_machines(host: str, port: int, cast: str) -> str:
     """Return the message about an address that stands for many machines."""
-    target = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+    target = f"{address_text(host, port)},{cast}"
     return (
-        f"{host} is a {cast} address, at which many machines receive: write {target},{cast} to send "
-        "there, or the address of one machine"
+        f"{host} is a {cast} address, at which many machines receive: write {target} to send there, or the "
+        "address of one machine"
     )
 
 

@@ -241,7 +241,7 @@ class CaptureClock:
     (reboot; a pause over a minute), is set to the newest time reached.
 
     Attributes:
-        restarts: number of times that each sensor's clock was set so after its first sample.
+        restarts: number of times that each sensor's clock was set in this way after its first sample.
     """
 
     def __init__(self, wrap_us: int = WRAP_US) -> None:

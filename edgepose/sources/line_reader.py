@@ -78,7 +78,7 @@ class LineSpec(NamedTuple):
 
 
 class Arrival(NamedTuple):
-    """Data that came over a line, or the news that none did.
+    """Data that came over a line, or a report that none did.
 
     Attributes:
         line: the line.

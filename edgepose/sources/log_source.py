@@ -27,20 +27,20 @@ ChunkReader = Callable[[Path, Ledger], Iterator[tuple[str, float, Chunk | None]]
 _log = logging.getLogger(__name__)
 
 
-class RestartCounts(Protocol):
-    """Counts of the restarts of devices' clocks."""
-
-    @property
-    def restarts(self) -> Counter[int]:
-        """Number of times that the clock of each placement's device has restarted."""
-
-
 SET_BACK_S = 0.5
 """A log's times that go back by more are those of a clock that was set back, seconds."""
 
 _HEAD, _STEP = 100, 16  # chunks in which the first packet is, bytes of a step towards it
 
 _FEW = 5  # frames whose times are wrong, rather than the clock
+
+
+class RestartCounts(Protocol):
+    """Counts of the restarts of devices' clocks."""
+
+    @property
+    def restarts(self) -> Counter[int]:
+        """Number of times that the clock of each placement's device has restarted."""
 
 
 class LogSource:

@@ -22,8 +22,8 @@ class ProbeResult(NamedTuple):
     Attributes:
         protocol: name of the wire format; None if none could be decoded.
         amount: bytes or frames received.
-        refused: what could be understood but not used, see `Decoder.refused`.
         rates_hz: samples per second by sensor id.
+        refused: input that could be understood but not used, see `Decoder.refused`.
     """
 
     protocol: str | None

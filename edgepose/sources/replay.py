@@ -52,7 +52,7 @@ FOREIGN = {
     ".fbx": "an animation, not data of sensors",
     ".gz": "packed with gzip; unpack it first",
 }
-"""What files of other programs are, by their ending, and what to do with them."""
+"""Descriptions of other programs' files, by ending, with advice."""
 
 
 class RecordingSource:

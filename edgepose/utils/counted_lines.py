@@ -14,11 +14,12 @@ class CountedLines:
     Attributes:
         number: of the current line, from 1.
         line: the current line, or piece.
+        limit: longest piece, characters.
     """
 
     def __init__(self, file: TextIO, limit: int = MAX_LINE) -> None:
-        """Start before the first line of an open file; `limit` is that of a line, characters."""
-        self._file, self._limit = file, limit
+        """Start before the first line of an open file."""
+        self._file, self.limit = file, limit
         self.number = 0
         self.line = "\n"
 
@@ -28,7 +29,7 @@ class CountedLines:
 
     def __next__(self) -> str:
         """Return the next line, or piece of one."""
-        line = self._file.readline(self._limit)
+        line = self._file.readline(self.limit)
         if not line:
             raise StopIteration
         self.number += self.ended
@@ -43,4 +44,4 @@ class CountedLines:
     @property
     def too_long(self) -> bool:
         """Whether the current line is a piece, or as long as one."""
-        return len(self.line) == self._limit
+        return len(self.line) == self.limit

@@ -1,6 +1,6 @@
-"""Messages on faults of sensors that several commands find; each names the fault and what to do.
+"""Messages about faults of sensors that several commands find; each names the fault and what to do.
 
-They do not name the sensor: put `placement: ` before them.
+The messages do not name the sensor: put `placement: ` before them.
 """
 
 from __future__ import annotations
@@ -16,20 +16,24 @@ NO_GRAVITY_M_S2 = 0.5
 """Acceleration at rest below which gravity has been removed, m/s^2."""
 
 HEADING_RESETS = "--heading-reset motion, live or mounting"
-
+"""Advice for headings that no reset aligns."""
 
 JUMPS_OF_TWO = 20
 """Restarts of a clock within a second, or in a log, that a single device does not make."""
 
 
 def two_devices(apart_deg: float | None = None) -> str:
-    """Two devices that send under one id, with the angle between them; None if only their clocks differ."""
+    """Return the message about two devices with one id.
+
+    Args:
+        apart_deg: angle between their orientations, degrees; None if only their clocks differ.
+    """
     how = "whose clocks differ" if apart_deg is None else f"{apart_deg:.0f} deg apart"
     return f"two devices, {how}, send under its id: give each an id of its own"
 
 
 def no_gravity(norm_m_s2: float) -> str | None:
-    """An acceleration without gravity; None if it has some."""
+    """Return the message about an acceleration that lacks gravity, by its size at rest; None if it has it."""
     if not norm_m_s2 < NO_GRAVITY_M_S2:
         return None
     return (
@@ -39,7 +43,7 @@ def no_gravity(norm_m_s2: float) -> str | None:
 
 
 def wrong_unit(norm_m_s2: float) -> str | None:
-    """An acceleration in a unit other than m/s^2; None if its size at rest shows none."""
+    """Return the message about an acceleration in another unit; None if its size at rest fits none."""
     for unit, size in (("g", 1.0), ("milli-g", 1000.0), ("cm/s²", 100.0 * GRAVITY)):
         if abs(norm_m_s2 / size - 1.0) < 2.0 * GRAVITY_SCALE_LIMIT:
             return f"it reads {norm_m_s2:.4g} at rest, which is in {unit}: send m/s², {GRAVITY} at rest"
@@ -47,7 +51,7 @@ def wrong_unit(norm_m_s2: float) -> str | None:
 
 
 def wrong_scale(norm_m_s2: float) -> str | None:
-    """An acceleration that is too large or too small; None if its size at rest is right, or unknown."""
+    """Return the message about a wrong size of the acceleration at rest; None if it is right, or unknown."""
     if not abs(norm_m_s2 / GRAVITY - 1.0) > GRAVITY_SCALE_LIMIT:
         return None
     return (
@@ -57,7 +61,12 @@ def wrong_scale(norm_m_s2: float) -> str | None:
 
 
 def wrong_frame(tilt_deg: float, convention: str | None) -> str:
-    """An orientation that does not turn the acceleration at rest upwards, and the convention that would."""
+    """Return the message about an orientation that does not rotate the acceleration at rest upwards.
+
+    Args:
+        tilt_deg: angle between that acceleration and up, degrees.
+        convention: the convention that would, if one is known.
+    """
     why = convention or "no usual convention fits"
     return f"orientation and gravity disagree by {tilt_deg:.0f} deg at rest: {why}"
 
@@ -76,12 +85,12 @@ def shared_convention(fitting: Mapping[str, Sequence[str]]) -> dict[str, str | N
 
 
 def clock_restarted(times: int = 1) -> str:
-    """A device that was switched off on the way, or has restarted by itself."""
+    """Return the message about a device that was switched off and on, or restarted by itself."""
     count = f" {times} times" if times > 1 else ""
     return f"its clock restarted{count}; its heading may differ after that"
 
 
 def no_common_heading(protocols: Iterable[str]) -> str:
-    """Devices whose headings have no common zero, by their protocols."""
+    """Return the message about devices of these protocols, whose headings have no common zero."""
     names = ", ".join(sorted(set(protocols)))
     return f"sensors of {names} have no common heading: calibrate with {HEADING_RESETS}"

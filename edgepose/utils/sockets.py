@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from edgepose.errors import ConfigError
@@ -25,6 +26,8 @@ def resolve(host: str, port: int, kind: socket.SocketKind) -> tuple[socket.Addre
 CASTS = ("broadcast", "multicast")
 """Words that permit an address of many machines."""
 
+_FORMATS = ("format=json", "format=binary")
+
 
 class Address(NamedTuple):
     """Host name or address, UDP port, and "broadcast" or "multicast" if it stands for many machines."""
@@ -41,6 +44,11 @@ class Destination(NamedTuple):
     port: int
     format: str
     cast: str = ""
+
+
+def address_text(host: str, port: int) -> str:
+    """Return HOST:PORT, with brackets around an IPv6 address."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 def parse_address(text: str) -> tuple[str, int]:
@@ -80,12 +88,8 @@ def parse_datagram_address(text: str) -> Address:
     Raises:
         ConfigError: the text has another form.
     """
-    address, *options = text.split(",")
-    host, port = parse_address(address)
-    for option in options:
-        if option not in CASTS:
-            raise ConfigError(f"unknown option {option!r} in {text!r}: possible are {', '.join(CASTS)}")
-    return Address(host, port, options[-1] if options else "")
+    host, port, options = _split_options(text, CASTS)
+    return Address(host, port, _last(options, CASTS, ""))
 
 
 def parse_destination(text: str) -> Destination:
@@ -94,20 +98,19 @@ def parse_destination(text: str) -> Destination:
     Raises:
         ConfigError: the text has another form.
     """
+    host, port, options = _split_options(text, (*_FORMATS, *CASTS))
+    form = _last(options, _FORMATS, _FORMATS[0]).removeprefix("format=")
+    return Destination(host, port, form, _last(options, CASTS, ""))
+
+
+def _split_options(text: str, possible: Sequence[str]) -> tuple[str, int, list[str]]:
     address, *options = text.split(",")
     host, port = parse_address(address)
-    form, cast = "json", ""
     for option in options:
-        key, _, value = option.partition("=")
-        if option in CASTS:
-            cast = option
-        elif key != "format":
-            raise ConfigError(
-                f"unknown option {option!r} in {text!r}: possible are format=json, format=binary, "
-                f"{', '.join(CASTS)}"
-            )
-        elif value not in ("json", "binary"):
-            raise ConfigError(f"unknown format {value!r} in {text!r}: choose json or binary")
-        else:
-            form = value
-    return Destination(host, port, form, cast)
+        if option not in possible:
+            raise ConfigError(f"unknown option {option!r} in {text!r}: possible are {', '.join(possible)}")
+    return host, port, options
+
+
+def _last(options: Sequence[str], among: Sequence[str], default: str) -> str:
+    return next((option for option in reversed(options) if option in among), default)

@@ -14,10 +14,10 @@ POSITION = LOOK_AT + np.array([0.8, 0.4, 2.1])
 """Camera of a new page, for a figure at the origin, metres."""
 
 SMALLEST_STEP_M = 0.02
-"""Cameras that are moved all the time could not be turned by hand."""
+"""Smallest movement of a camera: one that moved all the time could not be turned by hand."""
 
 LEVEL_M = 0.6
-"""Height by which the pelvis may rise and sink before the camera follows: sitting down is no reason to."""
+"""Height by which the pelvis may rise or sink before the camera follows, so that it ignores sitting down."""
 
 
 def wanted_shift(pelvis: Array) -> Array:
@@ -40,7 +40,7 @@ class FollowingCameras:
         """Put the switch on the page of a viser server."""
         self._server = server
         self._switch = server.gui.add_checkbox("camera follows", True)
-        self._shifts: dict[int, Array] = {}  # what each client's camera has been moved by
+        self._shifts: dict[int, Array] = {}  # displacement of each client's camera
 
     def follow(self, pelvis: Array) -> None:
         """Move the cameras for a figure whose pelvis is at (3,), metres."""

@@ -1,4 +1,4 @@
-"""What a test does in a new process before the program starts: arguments for `preexec_fn`.
+"""Preparations of a new process before its program starts: arguments for `preexec_fn`.
 
 All of them can be pickled, so that `processes.Popen` can fork the process from the warm Python.
 """
@@ -24,7 +24,7 @@ def close(file: int) -> Callable[[], None]:
 
 
 def ignore_hangup() -> None:
-    """Do what nohup does."""
+    """Ignore SIGHUP, as under nohup."""
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
 
 
@@ -37,7 +37,7 @@ class _Sets(ctypes.Structure):
 
 
 def mind_permissions() -> None:
-    """Folders that may not be written to are so for root, too."""
+    """Make the permissions of files and folders hold for root, too."""
     libc = ctypes.CDLL(None)
     header, sets = _Header(0x20080522, 0), (_Sets * 2)()
     libc.capget(ctypes.byref(header), ctypes.byref(sets))

@@ -7,7 +7,6 @@ import json
 import logging
 import math
 import shutil
-import textwrap
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -18,7 +17,7 @@ import click
 
 from edgepose.cli.options.source import source_options
 from edgepose.cli.terminal.live_page import Page, is_coloured, is_terminal
-from edgepose.cli.terminal.messages import printable, say, show
+from edgepose.cli.terminal.messages import LEAST_COLUMNS, pieces, printable, say, show
 from edgepose.cli.terminal.stop_signal import StopSignal
 from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
@@ -115,7 +114,7 @@ def check(
         state, error = _listen(opened, health, source.file is None, seconds, lambda: stop.asked, watch)
         differences = [] if loaded is None else other_devices(loaded, opened.devices)
         for difference in [*differences, *missing_heading_reset(loaded, opened.devices)]:
-            _log.warning("%s", difference.removeprefix("warning: "))
+            _log.warning("%s", difference)
     if page is not None:
         for warning in warnings:
             say(f"warning: {warning}")
@@ -138,7 +137,7 @@ def _page_lines(name: str, state: State, warnings: list[str]) -> list[str]:
     width = shutil.get_terminal_size().columns
     title = printable(f"edgepose check  {name}; Ctrl-C ends")
     table = ["listening ..."] if state.seconds < LISTEN_S else _lines(state, width)
-    return [title[:width], *table, *_wrapped(warnings, width)]
+    return [title[:width], *table, *(piece[:width] for piece in _wrapped(warnings, width))]
 
 
 def _listen(
@@ -297,9 +296,11 @@ def _colour(finding: Diagnosis) -> str:
 
 
 def _wrapped(lines: list[str], width: int | None) -> list[str]:
-    if width is None:
+    if width is None or not lines:
         return lines
-    return [piece for line in lines for piece in textwrap.wrap(line, max(width, 20), subsequent_indent="  ")]
+    return [
+        piece for line in "\n".join(lines).split("\n") for piece in pieces(line, max(width, LEAST_COLUMNS))
+    ]
 
 
 def _json(name: str, state: State, warnings: list[str]) -> str:

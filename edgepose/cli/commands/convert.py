@@ -65,7 +65,8 @@ if TYPE_CHECKING:
     type=click.Choice(list(map(str, JOINT_COUNTS))),
     default="24",
     show_default=True,
-    help="Number of joints in NPZ files of poses: 24 as in SMPL, 52 as in SMPL-H, 55 as in SMPL-X.",
+    help="Number of joints in NPZ files of poses: "
+    f"{', '.join(f'{count} as in {model}' for count, model in JOINT_COUNTS.items())}.",
 )
 @click.option(
     "--names",

@@ -82,7 +82,7 @@ def record(source: SourceConfig, out: str, seconds: float | None, overwrite: boo
 
 
 def _metadata(source: SourceConfig, of_file: Mapping[str, str]) -> dict[str, str]:
-    """Return the metadata of a recording; what the file that is read says of itself is kept."""
+    """Return the metadata of a recording; those of the file that is read are kept."""
     written = {"program": f"edgepose {__version__}", "frame": "Z up", "units": "s, m/s^2, rad/s, uT"}
     about = {"source": source.name, "protocol": source.protocol}
     if source.file is not None:

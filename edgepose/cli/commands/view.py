@@ -12,7 +12,7 @@ import click
 from edgepose.cli.terminal.messages import say
 from edgepose.cli.terminal.stop_signal import StopSignal
 from edgepose.errors import EdgeposeError
-from edgepose.utils.sockets import resolve
+from edgepose.utils.sockets import address_text, resolve
 
 if TYPE_CHECKING:
     from edgepose.skeleton import Body
@@ -88,8 +88,8 @@ def _open(host: str, port: int, body: Body, for_run: bool = False) -> Viewer:
     from edgepose.viewer.viewer import Viewer
 
     viewer = Viewer(host, port, body, next_free=for_run)
-    name = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
-    say(f"open http://{name}:{viewer.port} in a browser" + ("" if for_run else "; Ctrl-C ends the view"))
+    address = address_text({"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host), viewer.port)
+    say(f"open http://{address} in a browser" + ("" if for_run else "; Ctrl-C ends the view"))
     return viewer
 
 

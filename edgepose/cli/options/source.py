@@ -41,8 +41,7 @@ sensors_option = click.option(
     "--sensors",
     type=click.Path(path_type=Path, dir_okay=False),
     help="TOML file that says which port, bus and id is worn where; see docs/guide/sensors.md in the "
-    "repository. Ports and "
-    "buses named in it need no --port or --can.  [default: ids in the usual order]",
+    "repository. Ports and buses named in it need no --port or --can.  [default: ids in the usual order]",
 )
 """The flag --sensors."""
 

@@ -22,10 +22,11 @@ import click
 _WAIT_MS = 1000
 """Longest wait for a slow reader of standard error, milliseconds."""
 
-_LEAST_COLUMNS = 20
+LEAST_COLUMNS = 20
 """Narrowest terminal that messages are fitted into; some report a width of 0."""
+
 _LONGEST_LINE = 4000
-"""Characters of a line of a message; the rest, quoted from a damaged file, is left out."""
+"""Longest line of a message, characters; longer ones quote damaged files and are cut off."""
 
 _status = False  # whether the cursor stands at the end of a status line
 _bar = False  # whether a progress bar is shown, which is drawn again below a message
@@ -59,10 +60,11 @@ def wrapped(text: str, stream: IO[str]) -> str:
     columns = _columns(stream)
     if columns is None:
         return text
-    return "\n".join(piece for line in text.split("\n") for piece in _pieces(line, columns))
+    return "\n".join(piece for line in text.split("\n") for piece in pieces(line, columns))
 
 
-def _pieces(line: str, columns: int) -> list[str]:
+def pieces(line: str, columns: int) -> list[str]:
+    """Return a line broken between words into pieces that fit a number of columns."""
     if len(line) <= columns:
         return [line]
     return textwrap.wrap(
@@ -80,7 +82,7 @@ def _columns(stream: IO[str]) -> int | None:
     if not stream.isatty():
         return None
     try:
-        return max(_LEAST_COLUMNS, os.get_terminal_size(stream.fileno()).columns or 80)
+        return max(LEAST_COLUMNS, os.get_terminal_size(stream.fileno()).columns or 80)
     except OSError:  # the terminal is gone
         return None
 

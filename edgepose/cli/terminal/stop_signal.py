@@ -43,7 +43,7 @@ class StopSignal:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Restore the previous signal handlers; after a stop signal, when another comes after REPEAT_S."""
+        """Restore the previous signal handlers; after a stop signal, leave that to one after REPEAT_S."""
         if not self.asked:
             self._restore()
 

@@ -1,4 +1,4 @@
-"""Poses from CSV files, in any of the representations of `edgepose run`, however a program rewrote them."""
+"""Poses from CSV files in any representation of `edgepose run`, even if another program rewrote them."""
 
 from __future__ import annotations
 

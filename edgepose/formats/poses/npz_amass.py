@@ -31,7 +31,7 @@ JOINT_COUNTS = {24: "SMPL", 52: "SMPL-H", 55: "SMPL-X"}
 """Numbers of joints that can be written, and the body models that have them; fingers and face are at rest."""
 
 ABOUT = ("model", "calibration", "source", "date", "edgepose")
-"""What a file says about its origin."""
+"""Keys of the facts about the origin of the poses."""
 
 _LONGEST_ABOUT = 10_000  # characters
 
@@ -151,7 +151,7 @@ def _states(
 
 
 def _about(arrays: Mapping[str, NDArray[Any]]) -> dict[str, str]:
-    """Return what the file says about its origin; nothing if that is not text as edgepose writes it."""
+    """Return the facts about the origin of the poses; empty if they are not in edgepose's form."""
     with suppress(KeyError, ValueError, RecursionError):
         found = json.loads(str(arrays["about"])[:_LONGEST_ABOUT])
         if isinstance(found, dict):
@@ -193,7 +193,6 @@ def write_npz(
         count: total number of poses.
         rate: frames per second.
         joints: a key of `JOINT_COUNTS`.
-        about: see `PoseSequence`.
         about: see `PoseSequence`.
 
     Raises:

@@ -32,7 +32,9 @@ QUANTITIES = {"quat": 4, "acc": 3, "gyr": 3, "mag": 3}
 MAX_SAMPLES = 20_000_000
 """Largest number of samples that are read into memory: 9 hours of six sensors at 100 Hz."""
 
-_MAX_VALUE = 1e6  # no sensor measures more, in any of the units
+MAX_VALUE = 1e6
+"""More than any sensor measures, in any of the units."""
+
 _MAX_TIME_S = 1e11
 _CHUNK = 4096
 _RESTART_S = 1.0  # rows in the wrong order are nearer
@@ -201,7 +203,7 @@ class SampleTable:
         check(np.isnan(times), "has no time")
         check(~(np.abs(times) < _MAX_TIME_S), "has a time too large for seconds; is it in milliseconds?")
         check(
-            (np.abs(values) < _MAX_VALUE).sum(axis=1) + empty != values.shape[1],
+            (np.abs(values) < MAX_VALUE).sum(axis=1) + empty != values.shape[1],
             "has a number that is NaN or absurd",
         )
         start = 0

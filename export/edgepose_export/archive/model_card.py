@@ -120,9 +120,8 @@ def _own_reproduction(metadata: dict[str, Any]) -> list[str]:
     several = metadata["training"].get("checkpoints", 1) > 1
     window = f" --past {metadata['past']} --future {metadata['future']}" if metadata["future"] else ""
     flags = "" if metadata["precision"] == "f32" else f" --precision {metadata['precision']}"
-    flags += " --rounded" * metadata.get("rounded", False) + " --measure RECORDINGS" * bool(
-        metadata["measures"]
-    )
+    flags += " --rounded" if metadata.get("rounded") else ""
+    flags += " --measure RECORDINGS" if metadata["measures"] else ""
     return [
         "## Reproduce",
         "",

@@ -16,6 +16,7 @@ from torch import Tensor
 from edgepose import rotations as rot
 from edgepose.calibration import GRAVITY
 from edgepose.errors import EdgeposeError
+from edgepose.formats.recordings.base import MAX_VALUE
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import PARENTS, forward_kinematics
 from edgepose.utils.safe_npz import BROKEN, open_npz
@@ -24,9 +25,6 @@ from edgepose_export.training.splits import HELD_OUT, SPLITS, part_of
 
 SEATED = ".seated"
 """End of the names of takes with legs made by `edgepose_export.synthesis.sitting`."""
-
-_LARGEST = 1e6
-"""More than any sensor measures, m/s^2; or rad."""
 
 RATE = 60.0
 """Frames per second of all networks."""
@@ -97,7 +95,7 @@ def read_take(path: Path) -> Take:
 def _check_numbers(quats: NDArray[Any], force: NDArray[Any], poses: NDArray[Any]) -> None:
     """Raise ValueError unless quaternions, forces and rotation vectors are possible."""
     for name, array in (("a quaternion", quats), ("an acceleration", force), ("a pose", poses)):
-        if array.dtype.kind not in "fiu" or not (np.abs(array) < _LARGEST).all():
+        if array.dtype.kind not in "fiu" or not (np.abs(array) < MAX_VALUE).all():
             raise ValueError(f"{name} is not finite, or absurd")
     if not len(poses) or not (np.abs(np.linalg.norm(quats.astype(float), axis=-1) - 1.0) < 0.01).all():
         raise ValueError("no frames, or a quaternion is not of unit length")

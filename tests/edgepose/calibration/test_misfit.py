@@ -116,7 +116,7 @@ def test_other_devices_are_told(calibrated):
     made = replace(calibration, metadata={"devices": noted})
     same = {i: Device("native", "/dev/ttyUSB0", i) for i in range(6)}
     assert other_devices(made, same) == []
-    assert other_devices(calibration, same) == []  # nobody knows
+    assert other_devices(calibration, same) == []  # unknown
     assert other_devices(made, {i: device._replace(line=None) for i, device in same.items()}) == []
     (line,) = other_devices(made, same | {2: Device("native", "/dev/ttyUSB0", 7)})
     assert "left_lower_leg was native id 2 on /dev/ttyUSB0 and is native id 7 on /dev/ttyUSB0" in line

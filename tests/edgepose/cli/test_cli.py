@@ -289,7 +289,7 @@ def test_an_archive_of_unknown_sum(fail, tmp_path):
         ("127.0.0.1:0", "from 1 to 65535"),
         ("127.0.0.1:ninety", "from 1 to 65535"),
         (":9000", "no host"),
-        ("127.0.0.1:9000,format=xml", "choose json or binary"),
+        ("127.0.0.1:9000,format=xml", "possible are format=json, format=binary"),
         ("127.0.0.1:9000,rate=3", "unknown option"),
     ],
 )
