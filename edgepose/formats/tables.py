@@ -33,6 +33,7 @@ COMMENTS = ("#", "//")
 """Beginnings of lines that are no rows."""
 
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+_PACKED = "PK\x03\x04"  # at the start of .zip, .xlsx and .ods
 _BOMS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 
 
@@ -107,6 +108,8 @@ def open_table(
         first = next((line for line in head if line), None)
         if first is None:
             raise FileFormatError(f"{name}: the file is empty")
+        if first.startswith(_PACKED):
+            raise FileFormatError(f"{name}: a workbook or another packed file; save the sheet as .csv")
         raise FileFormatError(f"{name}: starts with {first[:40]!r}, not with {wanted!r}")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gzip
+import io
 import logging
 import re
 import sqlite3
@@ -14,13 +15,14 @@ from datetime import datetime
 from itertools import islice, pairwise
 from pathlib import Path
 from statistics import median
-from typing import Any, NamedTuple, TextIO, cast
+from typing import Any, BinaryIO, NamedTuple, TextIO, cast
 
 import can
 
 from edgepose.errors import FileFormatError
 from edgepose.formats.ledger import Ledger
 from edgepose.utils.counted_lines import CountedLines
+from edgepose.utils.safe_npz import check_size
 
 # python-can warns about every vendor library and every clock that is not installed.
 logging.getLogger("can").setLevel(logging.CRITICAL)
@@ -109,10 +111,14 @@ class _Lines(CountedLines):
 
 
 class _CandumpLines(_Lines):
-    """Lines of a candump log with times in seconds; those of candump's screen become lines of its files."""
+    """Lines of a candump log with times in seconds; those of candump's screen become lines of its files.
 
-    def __init__(self, file: TextIO) -> None:
+    Of a line with several times, to which a second logger added its first line, the last part is read.
+    """
+
+    def __init__(self, file: TextIO, ledger: Ledger) -> None:
         super().__init__(file)
+        self._ledger = ledger
         self._deltas = _are_deltas(_first_times(_Lines(file)))
         file.seek(0)
         self._time_s = 0.0
@@ -121,6 +127,10 @@ class _CandumpLines(_Lines):
         line = super().__next__()
         if self.number == 1 and line.startswith("***BUSMASTER"):
             raise FileFormatError("logs of BUSMASTER cannot be read: save it as .asc or .blf")
+        torn = line.rfind("(")
+        if torn > 0 and line[:torn].strip() and _STAMP.match(line, torn):
+            self._ledger.leave_out(self.number, "is not a frame")
+            line = line[torn:]
         stamp = _STAMP.match(line)
         shown = _SCREEN.fullmatch(line, stamp.end() if stamp else 0)
         if stamp is None:
@@ -199,6 +209,15 @@ class _AscReader(can.ASCReader):
         self._in_header = False
 
 
+class _Packed(gzip.GzipFile):
+    """A packed log that is read no further than a file of its size may plausibly unpack to."""
+
+    def read1(self, size: int = -1) -> bytes:
+        data = super().read1(size)
+        check_size(Path(self.name), self.tell())
+        return data
+
+
 class _TextLog(NamedTuple):
     """A text log.
 
@@ -216,10 +235,10 @@ def _open_text(path: Path, ledger: Ledger) -> _TextLog | None:
     endings = [ending.lower() for ending in path.suffixes if ending.lower() != ".gz"]
     if endings[-1:] not in ([".log"], [".asc"]):
         return None
-    opened = gzip.open if path.suffix.lower() == ".gz" else open
-    file = cast(TextIO, opened(path, "rt", encoding="utf-8", errors="replace"))
+    raw = cast(BinaryIO, _Packed(path) if path.suffix.lower() == ".gz" else path.open("rb"))
+    file = io.TextIOWrapper(raw, encoding="utf-8", errors="replace")
     if endings[-1] == ".log":
-        lines: _Lines = _CandumpLines(file)
+        lines: _Lines = _CandumpLines(file, ledger)
         return _TextLog(can.CanutilsLogReader(cast(TextIO, lines)), lines)
     lines = _AscLines(file, ledger)
     return _TextLog(_AscReader(cast(TextIO, lines)), lines)
@@ -285,7 +304,7 @@ def read_log(path: Path, ledger: Ledger) -> Iterator[Frame]:
             else:
                 yield channel, 0.0, None
     except FileFormatError as error:
-        raise FileFormatError(f"{path}: {error}") from None
+        raise FileFormatError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
     except OSError as error:
         raise FileFormatError(f"{path}: cannot read it: {error.strerror or error}") from None
     # python-can's readers raise arbitrary exceptions for damaged files.

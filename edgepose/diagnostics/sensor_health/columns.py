@@ -36,6 +36,19 @@ def row_of(sample: ImuSample, arrival_s: float) -> tuple[float, ...]:
     return (time_s, *(quat or _NAN4), *(acc or _NAN3), *(gyr or _NAN3), *(mag or _NAN3), arrival_s)
 
 
+def joined_rows(first: tuple[float, ...], second: tuple[float, ...]) -> tuple[float, ...] | None:
+    """Return two rows of one instant that hold different quantities as one row; None for any others.
+
+    Some devices send their magnetometer in packets of its own.
+    """
+    if first[TIME] != second[TIME]:
+        return None
+    pairs = list(zip(first[1:ARRIVAL], second[1:ARRIVAL], strict=True))
+    if any(not math.isnan(a) and not math.isnan(b) for a, b in pairs):
+        return None
+    return (first[TIME], *(b if math.isnan(a) else a for a, b in pairs), first[ARRIVAL])
+
+
 def deviation(values: Array) -> float:
     """Return the standard deviation of rows (n, k), over all columns together."""
     return float(np.sqrt(values.var(axis=0).sum()))

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 
 from edgepose.calibration.checks import GRAVITY_TILT_LIMIT_DEG
 from edgepose.calibration.sensor_to_segment import Calibration
-from edgepose.diagnostics.sensor_health.columns import row_of
+from edgepose.diagnostics.sensor_health.columns import joined_rows, row_of
 from edgepose.diagnostics.sensor_health.comparison import HeadingComparison, compare_values
 from edgepose.diagnostics.sensor_health.report import SensorHealth
 from edgepose.diagnostics.sensor_health.sensor import Sensor
@@ -39,7 +39,12 @@ class SensorHealthMonitor:
         """
         for sample in samples:
             pending = self._sensors[sample.sensor].pending
-            pending.append(row_of(sample, arrival_s))
+            row = row_of(sample, arrival_s)
+            joined = joined_rows(pending[-1], row) if pending else None
+            if joined is None:
+                pending.append(row)
+            else:
+                pending[-1] = joined
             if sample.time_s >= self._next_fold_s or len(pending) >= _MOST_PENDING:
                 self._fold()
                 self._next_fold_s = sample.time_s + _FOLD_S

@@ -134,6 +134,34 @@ def shorten(text: str) -> str:
     return repr(text.strip() if len(text) < 80 else text[:77] + "...")
 
 
+class _RowClock:
+    """The times of a sensor's rows, which start again if its clock does."""
+
+    def __init__(self) -> None:
+        """Start before the first row."""
+        self._reached_s = self._last_s = -inf
+        self._restarted = False
+
+    def restarted(self, times: Array) -> NDArray[np.bool_]:
+        """Return which of the next rows (n,) cannot be dated, since the clock restarted before them.
+
+        Their times may reach and pass those before the restart, and are wrong all the same. A single row that
+        goes back, with a row after it that does not go on from there, is no restart.
+        """
+        result = np.zeros(len(times), dtype=bool)
+        reached = np.maximum.accumulate(np.concatenate([[self._reached_s], times]))
+        if self._restarted or (times < reached[:-1] - _RESTART_S).any():
+            for i, time_s in enumerate(times.tolist()):
+                goes_on = self._restarted and abs(time_s - self._last_s) < _RESTART_S
+                self._restarted = goes_on or time_s < self._reached_s - _RESTART_S
+                result[i] = self._restarted
+                self._reached_s = self._reached_s if self._restarted else max(self._reached_s, time_s)
+                self._last_s = time_s
+        elif len(times):
+            self._reached_s, self._last_s = float(reached[-1]), float(times[-1])
+        return result
+
+
 class SampleTable:
     """Rows of numbers (time, then the quantities) by sensor, checked a block at a time.
 
@@ -156,6 +184,7 @@ class SampleTable:
         self._rows: dict[str, list[list[float]]] = {}
         self._marks: dict[str, list[tuple[int, int]]] = {}  # row number and number of empty cells
         self._blocks: dict[str, list[Array]] = {}
+        self._clocks: dict[str, _RowClock] = {}
         self._checked = 0
         self.count = 0
 
@@ -213,10 +242,11 @@ class SampleTable:
             start += size
         norm = np.linalg.norm(values[:, :4], axis=1)
         check(np.abs(norm - 1.0) > 0.1, "has a quaternion that is not of unit length")
-        reached = np.maximum.accumulate(np.concatenate([[before], np.where(good, times, -inf)]))[:-1]
-        back = good & (times < reached - _RESTART_S)
+        back = np.zeros(len(rows), dtype=bool)
+        back[good] = self._clocks.setdefault(sensor, _RowClock()).restarted(times[good])
         advice = f"{clock_restarted()}: split the recording there, or sort the rows by time_s"
         check(back, f"goes back in time by more than a second: {advice}")
+        reached = np.maximum.accumulate(np.concatenate([[before], np.where(good, times, -inf)]))[:-1]
         check(good & (times < reached), "goes back in time; sort the rows by time_s")
         if not good.all():
             rows, norm = rows[good], norm[good]

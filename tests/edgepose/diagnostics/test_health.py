@@ -236,6 +236,22 @@ def test_two_devices_under_one_name(still):
     assert findings(only(HEAD, mixed, still))[HEAD].name == "two devices"
 
 
+def test_a_magnetometer_in_packets_of_its_own(still):
+    """They have the time of the packet before them; the two are one sample."""
+    rows = [
+        part
+        for sample in iter_samples(still)
+        for part in (
+            sample._replace(mag=None),
+            ImuSample(sample.sensor, sample.time_s, None, None, None, (20.0, 1.0, -40.0)),
+        )
+    ]
+    for health in report(rows):
+        assert diagnose(health).name == "ok"
+        assert health.rate_hz == pytest.approx(100.0, abs=2.0)
+        assert health.field_ut == pytest.approx(44.7, abs=0.1)
+
+
 def test_a_sensor_that_hangs(still):
     def hanging(data: SensorData) -> SensorData:
         return SensorData(data.time_s, *(np.tile(q[0], (300, 1)) for q in data[1:4]))

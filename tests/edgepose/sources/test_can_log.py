@@ -167,7 +167,7 @@ def test_a_clock_that_is_set_back(tmp_path, back_s, form):
 
 
 BAD = {
-    "half a line": "(1700000001.5000) can0 4(1700000001.500200) can0 440#1400FEFFFEFF0000\n",
+    "half a line": "(1700000001.5000) can0 4\n",
     "zeros": "\0" * 10_000 + "\n",
     "two pieces": "\0" * 8191 + "\n",
     "no number": "(17000000xx.500000) can0 400#00\n",
@@ -188,6 +188,26 @@ def test_a_bad_line_costs_only_itself(tmp_path, name):
     check_whole(times)
     if name != "an odd digit":  # which is a frame of no sensor
         assert damage == f"{path}: 1 bad lines left out, the first: line 1001 is not a frame"
+
+
+@pytest.mark.parametrize("length", range(1, 45))
+def test_a_line_that_another_logger_continues(tmp_path, length):
+    """The first frame of the second logger is whole; half a frame is none, even if it looks like one."""
+    lines = lines_of(messages())
+    lines[1001] = lines[1001][:length]
+    path = tmp_path / "a.log"
+    path.write_text("".join(lines))
+    times, damage = read(path)
+    check_whole(times, missing=1)
+    assert sum(map(len, times.values())) == SENSORS * FRAMES - 1
+    assert damage.startswith(f"{path}: 1 bad lines left out, the first: line 1002 is not a frame")
+
+
+def test_a_packed_log_far_larger_than_its_file(tmp_path):
+    path = tmp_path / "a.log.gz"
+    path.write_bytes(gzip.compress(bytes(1 << 20)) * 257)
+    with pytest.raises(EdgeposeError, match=r"a\.log\.gz: unpacks to 256 MB; the limits are"):
+        read(path)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -127,6 +128,16 @@ def test_refused(tmp_path, lines, change, says):
     path = tmp_path / "a.csv"
     path.write_text("\n".join(change(lines)) + "\n")
     with pytest.raises(FileFormatError, match=says):
+        salvage_poses(path)
+
+
+def test_a_workbook_is_named(tmp_path):
+    path = tmp_path / "a.xlsx"
+    with zipfile.ZipFile(path, "w") as book:
+        book.writestr("[Content_Types].xml", "<Types/>")
+    with pytest.raises(
+        FileFormatError, match=r"a\.xlsx is not a file of poses: a workbook or .*; save the sheet"
+    ):
         salvage_poses(path)
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.base import iter_samples, recording_from_samples
+from edgepose.formats.recordings.base import SampleTable, iter_samples, recording_from_samples
 from edgepose.formats.recordings.csv import COLUMNS, csv_header, csv_row, write_csv
 from edgepose.formats.recordings.npz import write_npz
 from edgepose.formats.recordings.registry import missing_sensors, read_recording, salvage_recording
@@ -372,6 +372,27 @@ def test_a_sensor_that_was_restarted(tmp_path):
     assert salvaged.damage.startswith(f"{tmp_path / 'a.npz'}: ")
     assert 200 <= len(salvaged.sensors["head"].time_s) < len(time_s)
     assert len(salvaged.sensors["pelvis"].time_s) == len(time_s)
+
+
+@pytest.mark.parametrize("block", [1, 7, 1000])
+def test_rows_after_a_restart_are_left_out_even_if_they_pass_the_times_before_it(block):
+    times = np.concatenate([0.01 * np.arange(200), 0.01 * np.arange(500)])
+    table = SampleTable("a", salvage=True)
+    for start in range(0, len(times), block):
+        part = times[start : start + block]
+        rows = np.column_stack([part, np.tile([1.0, 0, 0, 0, 0, 0, 9.81, 0, 0, 0, 0, 0, 0], (len(part), 1))])
+        table.add_block("head", start + 1 + np.arange(len(part)), rows, np.zeros(len(part), dtype=int))
+    assert table.sensors()["head"].time_s == pytest.approx(times[:200])
+    assert table.damage().startswith("a: 500 bad rows left out, the first: row 201 (head) goes back")
+
+
+def test_one_row_that_goes_back_is_no_restart(tmp_path):
+    rows = [row._replace(time_s=row.time_s * 10) for row in rig(60)]
+    spoilt = 6 * 40 + PLACEMENTS.index("head")
+    rows[spoilt] = rows[spoilt]._replace(time_s=0.0)
+    recording = salvage_recording(write(tmp_path / "a.csv", text(rows)))
+    assert len(recording.sensors["head"].time_s) == 59
+    assert recording.damage.startswith(f"{tmp_path / 'a.csv'}: 1 bad rows left out")
 
 
 def semicolons(content):
