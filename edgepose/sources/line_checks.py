@@ -17,6 +17,9 @@ SILENCE_S = 5.0
 NOISE_S = 3.0
 """Longest time with data but no usable packet at the start, seconds."""
 
+REFUSED_S = 1.0
+"""The same with packets that could be understood, but not used."""
+
 
 def check_start(line: LineReader, now_s: float, start_s: float) -> None:
     """Check that usable packets come from a line.
@@ -33,15 +36,19 @@ def check_start(line: LineReader, now_s: float, start_s: float) -> None:
     if decoder.first_s is None:
         if now_s - start_s > SILENCE_S and line.transport is not None:
             raise DeviceError(f"{spec.name}: no data for {SILENCE_S:g} s; check {spec.check[0]}")
-    elif now_s - decoder.first_s > NOISE_S and not decoder.counters.packets:
+        return
+    passed_s = now_s - decoder.first_s
+    if decoder.counters.packets or passed_s <= REFUSED_S:
+        return
+    if decoder.refused is not None and not decoder.unknown_ids:
+        raise DeviceError(f"{spec.name}: {decoder.refused}")
+    if passed_s > NOISE_S:
         if decoder.unknown_ids:
             ids = ", ".join(map(str, decoder.unknown_ids))
             raise DeviceError(
                 f"{spec.name}: packets come only from sensor ids {ids}; set the ids to {decoder.ids}, "
                 "or assign them to placements with --sensors"
             )
-        if decoder.refused is not None:
-            raise DeviceError(f"{spec.name}: {decoder.refused}")
         kind = "" if decoder.protocol is None else f"{decoder.protocol.name} "
         raise DeviceError(
             f"{spec.name}: {decoder.amount} {spec.unit} in {NOISE_S:g} s but no valid {kind}packet; "

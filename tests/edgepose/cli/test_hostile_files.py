@@ -277,3 +277,22 @@ def test_a_name_that_is_too_long(command, words):
     result = command(*words, "--file", "a" * 5000 + ".csv")
     assert result.returncode in (1, 2)
     assert re.fullmatch(r"edgepose: a{200}\.\.\.: File name too long\n", result.stderr), result.stderr[-200:]
+
+
+@pytest.mark.parametrize("words", [["report"], ["check", "--file"], ["convert", "--to", "npz", "--out", "o"]])
+def test_a_loop_of_links(command, tmp_path, words):
+    loop = tmp_path / "a.csv"
+    loop.symlink_to("a.csv")
+    result = command(*words, loop, cwd=tmp_path)
+    assert result.returncode in (1, 2)
+    assert "Traceback" not in result.stderr
+    assert "unexpected" not in result.stderr
+    assert "a.csv" in result.stderr
+
+
+def test_a_simulation_that_would_not_fit_into_memory(command, tmp_path):
+    clip = Path(__file__).parents[3] / "tools" / "data" / "09_12.bvh"
+    result = command("synthesize", clip, "--out", tmp_path / "o", "--hold", 600, "--rate", 1000)
+    assert result.returncode == 2
+    assert "--hold" in result.stderr
+    assert not (tmp_path / "o").exists()
