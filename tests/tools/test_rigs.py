@@ -89,24 +89,33 @@ def follow(recording: Path, protocol: str, out: Path) -> tuple[float, float, Pat
     return begin, end, poses
 
 
+KEYS = ("joint_angle_error_15_deg", "joint_angle_error_10_deg", "sip_error_deg")
+
+
+def errors_of(name, followed, truth):
+    """Mean errors of the poses while the clip moved, by name."""
+    begin, end, path = followed
+    frames, time_s, poses = read_poses(path)[:3]
+    assert frames.tolist() == list(range(len(frames))), name
+    moving = (time_s >= begin + 1.0) & (time_s <= end - 0.1)
+    assert moving.sum() in range(262, 266), name
+    result = summary(poses[moving], truth.at(time_s[moving] - begin), default_body().offsets, 60.0)
+    return {key: result[key].mean for key in KEYS}
+
+
 def test_the_same_poses_over_every_wire(clip, tmp_path):
     recording, truth = clip
     # Two at a time: wires without time stamps are timed by arrival, which a crowded machine shifts.
     with ThreadPoolExecutor(2) as pool:
         results = list(pool.map(lambda name: follow(recording, name, tmp_path / name), RIGS))
-    errors = {}
-    for name, (begin, end, path) in zip(RIGS, results, strict=True):
-        frames, time_s, poses = read_poses(path)[:3]
-        assert frames.tolist() == list(range(len(frames))), name
-        moving = (time_s >= begin + 1.0) & (time_s <= end - 0.1)
-        assert moving.sum() in range(262, 266), name
-        result = summary(poses[moving], truth.at(time_s[moving] - begin), default_body().offsets, 60.0)
-        errors[name] = result
+    errors = {name: errors_of(name, result, truth) for name, result in zip(RIGS, results, strict=True)}
     native = errors.pop("native")
-    assert native["joint_angle_error_15_deg"].mean < 8.0
-    for name, result in errors.items():
-        for key in ("joint_angle_error_15_deg", "joint_angle_error_10_deg", "sip_error_deg"):
-            assert result[key].mean == pytest.approx(native[key].mean, abs=0.5), f"{name}: {key}"
+    assert native["joint_angle_error_15_deg"] < 8.0
+    expected = {key: pytest.approx(mean, abs=0.5) for key, mean in native.items()}
+    for name, found in errors.items():
+        if found != expected:  # once more alone: other tests may have held it up
+            found = errors_of(name, follow(recording, name, tmp_path / f"{name} again"), truth)
+        assert found == expected, name
 
 
 def test_bytes_of_an_adapter_are_fetched_at_once():
