@@ -86,7 +86,8 @@ def test_every_frame_of_a_sequence_is_that_of_a_longer_one(batch):
 def test_turns_are_those_of_the_table(batch):
     many = tuple(part[:, :93].expand(1200, *part[:, :93].shape[1:]) for part in batch)
     after = vary_postures(many, one_take(many), 1.0, generator())[2]
-    got = np.sqrt(np.square(turns(inner(many[2]), after)).mean(axis=(0, 1)))
+    # Postures sway slowly: neighbouring frames say the same.
+    got = np.sqrt(np.square(turns(inner(many[2])[:, ::8], after[:, ::8])).mean(axis=(0, 1)))
     expected = np.rad2deg(DEVIATION.numpy())
     np.testing.assert_allclose(got, expected, rtol=0.08, atol=0.05)
     still = {JOINTS[i] for i in np.flatnonzero(expected.max(axis=1) == 0)}
