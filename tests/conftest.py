@@ -28,6 +28,13 @@ sys.dont_write_bytecode = False
 torch.set_num_threads(1)
 
 WITH_STATE = [name for name, kind in NETWORKS.items() if kind.archive is not field_archive]
+
+
+def pytest_collection_modifyitems(items):
+    """Begin with the tests of tools, which take longest: no worker is left alone with them at the end."""
+    items.sort(key=lambda item: item.path.parent.name != "tools")
+
+
 SHAPES = [
     NetworkShape(kind, 8, targets, measured)
     for kind in WITH_STATE
