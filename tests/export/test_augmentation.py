@@ -20,7 +20,7 @@ from edgepose_export.synthesis.augmentation import (
     rotations_of,
 )
 from edgepose_export.synthesis.virtual_imus import recording_arrays, virtual_imus
-from edgepose_export.training.dataset import read_take, root_relative_pose
+from edgepose_export.training.dataset import Batch, read_take, tape
 
 WALK = Path(__file__).parents[1] / "data" / "mocap" / "dataset-2_walk_normal_001.bvh"
 FLIP = np.diag([-1.0, 1.0, 1.0])
@@ -39,7 +39,9 @@ def batch(sequences=400, frames=3):
         )
 
     acceleration = torch.randn(sequences, frames, 6, 3, generator=generator(9)) * 3
-    return turns(sequences, frames, 6), acceleration, turns(sequences, frames, 24)
+    place = torch.randn(sequences, frames, 10, generator=generator(5))
+    place[..., :7] = (place[..., :7] > 0).float()
+    return Batch(turns(sequences, frames, 6), acceleration, turns(sequences, frames, 24), place)
 
 
 def angles(a, b):
@@ -77,13 +79,11 @@ def test_mirrored_sensors_are_those_of_the_mirrored_motion(tmp_path):
     for i, one in enumerate((motion, mirrored)):
         path = tmp_path / f"{i}.npz"
         np.savez(path, **recording_arrays(one, virtual_imus(one, symmetric_body()), ""))
-        take = read_take(path)
-        pose = torch.from_numpy(take.pose)
-        takes.append(
-            (torch.tensor(take.orientation), torch.tensor(take.acceleration), root_relative_pose(pose))
-        )
-    for got, expected, tolerance in zip(mirror(*takes[0]), takes[1], (1e-5, 2e-3, 1e-5), strict=True):
-        torch.testing.assert_close(got, expected, rtol=0, atol=tolerance)
+        packed = tape([read_take(path)])
+        takes.append(packed.at(torch.arange(len(packed.relative))))
+    tolerances = (1e-5, 2e-3, 1e-5, 1e-4)
+    for got, expected, tolerance in zip(mirror(*takes[0]), takes[1], tolerances, strict=True):
+        torch.testing.assert_close(got, expected, rtol=0, atol=tolerance, equal_nan=True)
 
 
 def test_share_of_mirrored_sequences():
@@ -92,6 +92,7 @@ def test_share_of_mirrored_sequences():
     changed = [(a != b).flatten(1).any(1) for a, b in zip(got, data, strict=True)]
     assert torch.equal(changed[0], changed[1])
     assert torch.equal(changed[0], changed[2])
+    assert torch.equal(changed[0], changed[3])
     assert 0.2 < changed[0].float().mean() < 0.4
     for a, b in zip(got, mirror(*data), strict=True):
         torch.testing.assert_close(a[changed[0]], b[changed[0]])
@@ -105,7 +106,7 @@ def test_rotations_of_against_scipy():
 
 def test_misalignment_is_one_turn_a_sensor_behind_its_orientation():
     data = batch()
-    orientation, acceleration, relative = augment(
+    orientation, acceleration, relative, place = augment(
         data, Augmentation(mirror=0, misalignment_deg=4.0), generator()
     )
     error = data[0].mT @ orientation
@@ -115,12 +116,13 @@ def test_misalignment_is_one_turn_a_sensor_behind_its_orientation():
     torch.testing.assert_close(orientation @ orientation.mT, torch.eye(3).expand_as(orientation))
     assert acceleration is data[1]
     assert relative is data[2]
+    assert place is data.place
 
 
 def test_another_pelvis_turns_with_its_sensor_under_the_same_body():
     data = batch()
     data[2][:, :, 0] = torch.eye(3)
-    orientation, acceleration, relative = augment(
+    orientation, acceleration, relative, place = augment(
         data, Augmentation(mirror=0, pelvis_pitch_deg=5.0), generator()
     )
     turn = data[0][:, :, -1].mT @ orientation[:, :, -1]
@@ -130,14 +132,16 @@ def test_another_pelvis_turns_with_its_sensor_under_the_same_body():
     assert size.square().mean().sqrt().item() == pytest.approx(5.0, rel=0.1)
     assert torch.equal(orientation[:, :, :-1], data[0][:, :, :-1])
     assert acceleration is data[1]
-    bodies = (o[:, :, -1:] @ r for o, r in ((orientation, relative), data[::2]))
+    assert place is data.place
+    before = data.orientation, data.relative
+    bodies = (o[:, :, -1:] @ r for o, r in ((orientation, relative), before))
     torch.testing.assert_close(*(body[:, :, 1:] for body in bodies), rtol=0, atol=1e-5)
     assert torch.equal(relative[:, :, 0], data[2][:, :, 0])
 
 
 def test_heading_turns_all_but_the_pelvis_about_the_vertical():
     data = batch()
-    orientation, acceleration, _ = augment(data, Augmentation(mirror=0, heading_deg=3.0), generator())
+    orientation, acceleration, *_ = augment(data, Augmentation(mirror=0, heading_deg=3.0), generator())
     turn = orientation @ data[0].mT
     torch.testing.assert_close(turn[..., 1, :], torch.tensor([0.0, 1, 0]).expand(400, 3, 6, 3))
     torch.testing.assert_close(turn[:, :, -1], torch.eye(3).expand(400, 3, 3, 3))
@@ -150,7 +154,7 @@ def test_heading_turns_all_but_the_pelvis_about_the_vertical():
 def test_a_share_of_the_sequences_stays_aligned():
     data = batch()
     how = Augmentation(mirror=0, misalignment_deg=4.0, heading_deg=3.0, aligned=0.25)
-    orientation, acceleration, _ = augment(data, how, generator())
+    orientation, acceleration, *_ = augment(data, how, generator())
     untouched = (orientation - data[0]).abs().amax((1, 2, 3, 4)) < 1e-6
     assert 0.18 < untouched.float().mean() < 0.32
     still = (acceleration - data[1]).abs().amax((1, 2, 3)) < 1e-5
@@ -205,7 +209,9 @@ def test_silent_sensors_are_those_of_a_run():
 
 def test_share_of_sequences_with_a_silent_sensor():
     data = batch(frames=40)
-    orientation, acceleration, relative = augment(data, Augmentation(mirror=0, silent=0.5), generator())
+    orientation, acceleration, relative, place = augment(
+        data, Augmentation(mirror=0, silent=0.5), generator()
+    )
     changed = (acceleration != data[1]).any(-1)
     one = changed.any(1)
     assert 0.35 < one.any(1).float().mean() < 0.5  # of some the silence ends before the sequence begins
@@ -213,3 +219,4 @@ def test_share_of_sequences_with_a_silent_sensor():
     assert (one.float().mean(0) > 0.04).all()
     assert torch.equal((orientation != data[0]).any(-1).any(-1) | changed, changed)
     assert relative is data[2]
+    assert place is data.place

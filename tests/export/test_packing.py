@@ -57,7 +57,7 @@ def test_packed_tape_is_the_tape(paths, tmp_path):
         assert torch.equal(got, wanted)
     frames = len(packed.orientation)
     sizes = {path.name: path.stat().st_size for path in (tmp_path / "tape").glob("*.f32")}
-    assert sum(sizes.values()) == 1152 * frames
+    assert sum(sizes.values()) == 1192 * frames
     assert sizes["relative.f32"] == 4 * 24 * 9 * frames
 
 

@@ -250,7 +250,7 @@ def test_windows_in_other_postures(takes):
     assert starts[0] == 0
     assert starts.max() == one.train_tape.starts[-1] - length
     plain = windows(one.train_tape, starts, length)
-    orientation, acceleration, relative = one._windows(starts)
+    orientation, acceleration, relative, _ = one._windows(starts)
     assert torch.equal(orientation[:, :, ROOT], plain[0][:, :, ROOT])
     bones = orientation[:, :, ROOT:] @ relative[:, :, list(BONES[:ROOT])]
     torch.testing.assert_close(orientation[:, :, :ROOT], bones)

@@ -47,7 +47,7 @@ def _config_path(name: str) -> Path:
 @click.option(
     "--cache",
     type=click.Path(path_type=Path, file_okay=False),
-    help="Folder for packed takes, 1152 bytes per frame, which are memory-mapped instead of read: for more "
+    help="Folder for packed takes, 1192 bytes per frame, which are memory-mapped instead of read: for more "
     "motion than fits into memory  [default: everything in memory]",
 )
 @click.option(

@@ -10,7 +10,8 @@ from torch import Tensor, nn
 from edgepose.placements import PLACEMENTS, ROOT
 from edgepose.skeleton import JOINTS
 from edgepose_export.networks.normalisation import rotations_of, turn_about_y
-from edgepose_export.synthesis.posture_variation import Batch
+from edgepose_export.synthesis.contacts import CONTACTS, PLACE
+from edgepose_export.training.dataset import Batch
 
 
 def _mirror_indices(names: tuple[str, ...]) -> list[int]:
@@ -24,6 +25,7 @@ def _mirror_indices(names: tuple[str, ...]) -> list[int]:
 
 SENSOR_MIRROR = _mirror_indices(PLACEMENTS)
 JOINT_MIRROR = _mirror_indices(JOINTS)
+PLACE_MIRROR = [*_mirror_indices(CONTACTS), *range(len(CONTACTS), PLACE)]
 
 
 class Augmentation(NamedTuple):
@@ -58,18 +60,24 @@ class Augmentation(NamedTuple):
     posture: float = 0.0
 
 
-def mirror(orientation: Tensor, acceleration: Tensor, relative: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Swap left and right by a reflection in the plane X = 0 of T.
-
-    The shapes are (..., 6, 3, 3), (..., 6, 3) and (..., 24, 3, 3).
-    """
+def mirror(orientation: Tensor, acceleration: Tensor, relative: Tensor, place: Tensor) -> Batch:
+    """Swap left and right of sequences, see `Batch`, by a reflection in the plane X = 0 of T."""
     flip = torch.tensor([-1.0, 1.0, 1.0])
     signs = flip[:, None] * flip
-    return (
+    return Batch(
         orientation[..., SENSOR_MIRROR, :, :] * signs,
         acceleration[..., SENSOR_MIRROR, :] * flip,
         relative[..., JOINT_MIRROR, :, :] * signs,
+        place[..., PLACE_MIRROR] * torch.cat([torch.ones(len(CONTACTS)), flip]),
     )
+
+
+def _mirror_some(batch: Batch, chosen: Tensor) -> Batch:
+    """Return a copy of sequences in which those chosen (B,) are mirrored."""
+    result = Batch(*(part.clone() for part in batch))
+    for part, mirrored in zip(result, mirror(*(part[chosen] for part in batch)), strict=True):
+        part[chosen] = mirrored
+    return result
 
 
 def drop_sensor(
@@ -116,20 +124,18 @@ def _heading_changes(orientation: Tensor) -> Tensor:
 def augment(batch: Batch, sizes: Augmentation, generator: torch.Generator) -> Batch:
     """Return disturbed copies of sequences.
 
-    The true poses change only by mirroring and by the pelvis pitch. `posture` is not applied here, because it
-    needs the frames around the sequences; see `vary_postures`.
+    The true poses change only by mirroring and by the pelvis pitch, contacts and velocity only by mirroring.
+    `posture` is not applied here, because it needs the frames around the sequences; see `vary_postures`.
     """
-    orientation, acceleration, relative = batch
-    size = len(orientation)
+    size = len(batch.orientation)
 
     def normal(*shape: int) -> Tensor:
         return torch.randn(shape, generator=generator)
 
     if sizes.mirror:
         chosen = torch.rand(size, generator=generator) < sizes.mirror
-        mirrored = mirror(orientation[chosen], acceleration[chosen], relative[chosen])
-        orientation, acceleration, relative = orientation.clone(), acceleration.clone(), relative.clone()
-        orientation[chosen], acceleration[chosen], relative[chosen] = mirrored
+        batch = _mirror_some(batch, chosen)
+    orientation, acceleration, relative, place = batch
     if sizes.pelvis_pitch_deg:
         pitch = torch.zeros(size, 1, 3)
         pitch[..., 0] = torch.deg2rad(sizes.pelvis_pitch_deg * normal(size, 1))
@@ -172,4 +178,4 @@ def augment(batch: Batch, sizes: Augmentation, generator: torch.Generator) -> Ba
             orientation[rows], acceleration[rows] = drop_sensor(
                 orientation[rows], acceleration[rows], sensor, first[rows].clamp(1, frames), end[rows]
             )
-    return orientation, acceleration, relative
+    return Batch(orientation, acceleration, relative, place)

@@ -10,12 +10,7 @@ from torch import Tensor
 from edgepose.placements import BONES, ROOT
 from edgepose.skeleton import JOINTS, PARENTS, default_body
 from edgepose_export.networks.normalisation import rotations_of
-from edgepose_export.training.dataset import RATE
-
-Batch = tuple[Tensor, Tensor, Tensor]
-"""Orientations R_TB (B, T, 6, 3, 3), accelerations in T (B, T, 6, 3), m/s^2, and true rotations relative to
-the root (B, T, 24, 3, 3).
-"""
+from edgepose_export.training.dataset import RATE, Batch
 
 BEFORE, AFTER = 2, 1
 """Frames that `vary_postures` needs before and after those it returns, because accelerations are second
@@ -87,7 +82,7 @@ def vary_postures(batch: Batch, take: Tensor, size: float, generator: torch.Gene
     Returns:
         The batch without the additional frames.
     """
-    relative = batch[2]
+    relative = batch.relative
     shape = (len(relative), 1, len(VARIED), 3)
     constant, sway = torch.randn(2, *shape, generator=generator)
     frequency, phase = torch.rand(2, *shape, generator=generator)
@@ -109,9 +104,10 @@ def vary_postures(batch: Batch, take: Tensor, size: float, generator: torch.Gene
 def moved(batch: Batch, take: Tensor, relative: Tensor) -> Batch:
     """Return the sequences that sensors measure when bones get new root-relative rotations (B, T, 24, 3, 3).
 
-    The pelvis moves as in the batch. The other arguments and the result are those of `vary_postures`.
+    The pelvis moves as in the batch, and contacts and velocity stay. The other arguments and the result are
+    those of `vary_postures`.
     """
-    orientation, acceleration, before = batch
+    orientation, acceleration, before, place = batch
     root = orientation[:, :, ROOT, None]
     shift = torch.einsum("btjxy,ijy->btix", relative - before, LEVERS)
     shift = (root @ shift.unsqueeze(-1)).squeeze(-1)
@@ -122,4 +118,4 @@ def moved(batch: Batch, take: Tensor, relative: Tensor) -> Batch:
     wanted = slice(BEFORE, relative.shape[1] - AFTER)
     bones = (root @ relative[:, :, list(BONES[:ROOT])])[:, wanted]
     orientation = torch.cat([bones, orientation[:, wanted, ROOT:]], dim=2)
-    return orientation, acceleration[:, wanted] + change, relative[:, wanted]
+    return Batch(orientation, acceleration[:, wanted] + change, relative[:, wanted], place[:, wanted])

@@ -20,6 +20,7 @@ from edgepose.formats.recordings.base import MAX_VALUE
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import PARENTS, forward_kinematics
 from edgepose.utils.safe_npz import BROKEN, open_npz
+from edgepose_export.synthesis.contacts import CONTACTS, PLACE
 from edgepose_export.synthesis.virtual_imus import INERTIAL_FROM_BODY
 from edgepose_export.training.splits import HELD_OUT, SPLITS, part_of
 
@@ -39,6 +40,7 @@ class Take(NamedTuple):
         acceleration: (T, 6, 3) float32 accelerations in T without gravity, m/s^2.
         pose: (T, 24, 3, 3) float32 true local rotations.
         license: licence of the motion that the take was made from.
+        place: (T, 10) float32 contacts and velocity, see `Batch`; None if they are unknown.
     """
 
     name: str
@@ -46,6 +48,14 @@ class Take(NamedTuple):
     acceleration: NDArray[np.float32]
     pose: NDArray[np.float32]
     license: str
+    place: NDArray[np.float32] | None = None
+
+    @property
+    def place_or_nan(self) -> NDArray[np.float32]:
+        """Contacts and velocity (T, 10), all NaN if they are unknown."""
+        if self.place is None:
+            return np.full((len(self.pose), PLACE), np.nan, np.float32)
+        return self.place
 
 
 def read_take(path: Path) -> Take:
@@ -60,7 +70,8 @@ def read_take(path: Path) -> Take:
             force = np.stack([data[f"{name}_acc"] for name in PLACEMENTS], axis=1)
             poses = data["poses"].reshape(-1, 24, 3)
             rate, license_note = float(data["mocap_framerate"]), str(data["license"])
-        if not len(poses) == len(quats) == len(force):
+            place = _place(data)
+        if not len(poses) == len(quats) == len(force) == (len(poses) if place is None else len(place)):
             raise ValueError("sensors and poses differ in length")
         _check_numbers(quats, force, poses)
     except (OSError, *BROKEN) as error:
@@ -89,7 +100,20 @@ def read_take(path: Path) -> Take:
         acceleration.astype(np.float32),
         local.astype(np.float32),
         license_note,
+        place,
     )
+
+
+def _place(data: Any) -> NDArray[np.float32] | None:
+    """Return contacts and velocity (T, 10) of a recording; None for those of versions that had none."""
+    if "contact" not in data or "velocity" not in data:
+        return None
+    contact, velocity = data["contact"], data["velocity"]
+    if contact.shape[1:] != (len(CONTACTS),) or contact.dtype.kind not in "iub" or not (contact <= 1).all():
+        raise ValueError("contacts are not 0 or 1")
+    if velocity.shape != (len(contact), 3) or not (np.abs(velocity) < MAX_VALUE).all():
+        raise ValueError("a velocity is not finite, or absurd")
+    return np.concatenate([contact, velocity], axis=1).astype(np.float32)
 
 
 def _check_numbers(quats: NDArray[Any], force: NDArray[Any], poses: NDArray[Any]) -> None:
@@ -159,6 +183,23 @@ def measured_parts(folder: Path) -> tuple[list[str], list[str]]:
     return present, lacking
 
 
+class Batch(NamedTuple):
+    """Sequences for training.
+
+    Attributes:
+        orientation: (B, T, 6, 3, 3) R_TB.
+        acceleration: (B, T, 6, 3) in T, m/s^2.
+        relative: (B, T, 24, 3, 3) true global rotations in the root's frame.
+        place: (B, T, 10) contacts, 0 or 1, of the joints `contacts.CONTACTS`, then the velocity of the pelvis
+            in its level frame, m/s; NaN where they are unknown.
+    """
+
+    orientation: Tensor
+    acceleration: Tensor
+    relative: Tensor
+    place: Tensor
+
+
 class PackedTakes(NamedTuple):
     """Takes joined one after the other, as tensors.
 
@@ -169,6 +210,7 @@ class PackedTakes(NamedTuple):
         starts: first frame of each take, and N as the last entry.
         names: names of the takes.
         licenses: licence of each take's motion.
+        place: (N, 10) contacts and velocity, see `Batch`.
     """
 
     orientation: Tensor
@@ -177,6 +219,12 @@ class PackedTakes(NamedTuple):
     starts: Tensor
     names: list[str]
     licenses: list[str]
+    place: Tensor
+
+    def at(self, index: Tensor) -> Batch:
+        """Return the sequences of some frames (B, T)."""
+        parts = self.orientation, self.acceleration, self.relative, self.place
+        return Batch(*(part[index] for part in parts))
 
     @property
     def free(self) -> list[bool]:
@@ -201,6 +249,7 @@ def tape(takes: list[Take]) -> PackedTakes:
         torch.tensor([0, *accumulate(lengths)]),
         [take.name for take in takes],
         [take.license for take in takes],
+        torch.cat([torch.zeros(0, PLACE), *(torch.from_numpy(take.place_or_nan) for take in takes)]),
     )
 
 

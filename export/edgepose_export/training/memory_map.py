@@ -17,9 +17,15 @@ import numpy as np
 import torch
 
 from edgepose.errors import EdgeposeError
+from edgepose_export.synthesis.contacts import PLACE
 from edgepose_export.training.dataset import PackedTakes, read_take, root_relative_pose
 
-FRAME = {"orientation": (6, 3, 3), "acceleration": (6, 3), "relative": (24, 3, 3)}
+FRAME: dict[str, tuple[int, ...]] = {
+    "orientation": (6, 3, 3),
+    "acceleration": (6, 3),
+    "relative": (24, 3, 3),
+    "place": (PLACE,),
+}
 """Shape of one frame in each file."""
 
 _INDEX = "tape.json"
@@ -69,7 +75,8 @@ def _pack(
         for path in progress(paths):
             take = read_take(path)
             relative = root_relative_pose(torch.from_numpy(take.pose)).numpy()
-            for name, array in zip(FRAME, (take.orientation, take.acceleration, relative), strict=True):
+            arrays = (take.orientation, take.acceleration, relative, take.place_or_nan)
+            for name, array in zip(FRAME, arrays, strict=True):
                 files[name].write(np.ascontiguousarray(array, "<f4").data)
             names.append(take.name)
             licenses.append(take.license)

@@ -20,7 +20,7 @@ from edgepose_export.archive.torchscript import Statistics, new_network
 from edgepose_export.networks.normalisation import network_inputs, seen_from_first
 from edgepose_export.networks.shape import NetworkShape, smoothed
 from edgepose_export.synthesis.augmentation import augment
-from edgepose_export.synthesis.posture_variation import AFTER, BEFORE, Batch, vary_postures
+from edgepose_export.synthesis.posture_variation import AFTER, BEFORE, vary_postures
 from edgepose_export.training.checkpoints import (
     CHECKPOINT,
     WEIGHTS_ONLY,
@@ -30,7 +30,7 @@ from edgepose_export.training.checkpoints import (
     shape_of,
 )
 from edgepose_export.training.config import TrainConfig, config_values
-from edgepose_export.training.dataset import PackedTakes, describe
+from edgepose_export.training.dataset import Batch, PackedTakes, describe
 from edgepose_export.training.distributed import ALONE, Processes
 from edgepose_export.training.losses import likelihood_loss, smoothness_loss
 from edgepose_export.training.windows import sample_windows, window_starts, windows, windows_with_sitting
@@ -156,7 +156,7 @@ class Trainer:
         smoothness: float = 0.0,
     ) -> Tensor:
         config, s = self.config, self.statistics
-        orientation, acceleration, relative = (part.to(self.processes.device) for part in batch)
+        orientation, acceleration, relative, _ = (part.to(self.processes.device) for part in batch)
         x = (network_inputs_of(orientation, acceleration, config.network) - s.input_mean) / s.input_std
         target = (pose_targets(relative, config.network) - s.target_mean) / s.target_std
         if config.acceleration_loss:
@@ -215,8 +215,7 @@ class Trainer:
             for rows, chosen in groups
             if rows.any()
         ]
-        orientation, acceleration, relative = map(torch.cat, zip(*parts, strict=True))
-        return orientation, acceleration, relative
+        return Batch(*map(torch.cat, zip(*parts, strict=True)))
 
     def _windows(self, starts: Tensor) -> Batch:
         """Return windows by their first frames, in varied postures if the config asks for them."""
@@ -226,8 +225,7 @@ class Trainer:
         index = starts[:, None] + torch.arange(-BEFORE, window + AFTER)
         take = torch.searchsorted(tape.starts, index, right=True)
         index = index.clamp(0, len(tape.relative) - 1)
-        batch = tape.orientation[index], tape.acceleration[index], tape.relative[index]
-        return vary_postures(batch, take, size, self.generator)
+        return vary_postures(tape.at(index), take, size, self.generator)
 
     def _validation_starts(self) -> Tensor:
         window = self.config.window

@@ -7,8 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from edgepose_export.synthesis.posture_variation import Batch
-from edgepose_export.training.dataset import PackedTakes
+from edgepose_export.training.dataset import Batch, PackedTakes
 
 Starts = tuple[Tensor, Tensor]
 """First frames of the windows in other takes, and in CMU's takes."""
@@ -64,6 +63,5 @@ def sample_windows(starts: Starts, count: int, free_share: float, generator: tor
 
 
 def windows(tape: PackedTakes, starts: Tensor, length: int) -> Batch:
-    """Return orientations, accelerations and true rotations of windows, each (len(starts), length, ...)."""
-    index = starts[:, None] + torch.arange(length)
-    return tape.orientation[index], tape.acceleration[index], tape.relative[index]
+    """Return windows of some length by their first frames."""
+    return tape.at(starts[:, None] + torch.arange(length))
