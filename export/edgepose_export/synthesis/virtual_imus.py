@@ -12,6 +12,7 @@ from edgepose.calibration import GRAVITY
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import Body, forward_kinematics, local_from_global
 from edgepose_export.mocap import Motion
+from edgepose_export.synthesis.contacts import contacts, level_velocity
 
 Array = NDArray[np.float64]
 
@@ -63,11 +64,13 @@ class VirtualImus(NamedTuple):
         orientation: (T, 6, 4) unit quaternions, sensor to inertial (R_IS), in the order of PLACEMENTS.
         force: (T, 6, 3) specific force in the sensor frames, m/s^2.
         rate_of_turn: (T, 6, 3) angular rates in the sensor frames, rad/s.
+        joints: (T, 24, 3) positions of the body's joints in T, metres.
     """
 
     orientation: Array
     force: Array
     rate_of_turn: Array
+    joints: Array
 
 
 def virtual_imus(motion: Motion, body: Body, mounting: Array | None = None) -> VirtualImus:
@@ -104,13 +107,14 @@ def virtual_imus(motion: Motion, body: Body, mounting: Array | None = None) -> V
         orientation=rot.quat_continuous(rot.matrix_to_quat(sensors)),
         force=np.einsum("tsji,tsj->tsi", sensors, force_inertial),
         rate_of_turn=rates,
+        joints=joints,
     )
 
 
 def recording_arrays(motion: Motion, imus: VirtualImus, license_note: str) -> dict[str, NDArray]:
     """Return the arrays of an .npz file that is both an IMU recording and an AMASS-like motion file.
 
-    It holds the sensors and the poses that they were made from.
+    It holds the sensors and the poses that they were made from, and contacts and velocities, see `contacts`.
     """
     arrays: dict[str, NDArray] = {"t": np.arange(len(motion.rotations)) / motion.rate}
     for i, name in enumerate(PLACEMENTS):
@@ -120,6 +124,9 @@ def recording_arrays(motion: Motion, imus: VirtualImus, license_note: str) -> di
     poses = rot.matrix_to_rotvec(local_from_global(motion.rotations))
     arrays["poses"] = poses.reshape(len(poses), 72).astype(np.float32)
     arrays["trans"] = motion.translation.astype(np.float32)
+    arrays["contact"] = contacts(imus.joints, motion.rate)
+    velocity = level_velocity(imus.joints[:, 0], motion.rotations[:, 0], motion.rate)
+    arrays["velocity"] = velocity.astype(np.float32)
     arrays["mocap_framerate"] = np.array(motion.rate)
     arrays["source"] = np.array(motion.source)
     arrays["license"] = np.array(license_note)
