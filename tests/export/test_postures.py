@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from edgepose.placements import BONES, ROOT
 from edgepose.skeleton import JOINTS, PARENTS, default_body
 from edgepose_export.mocap import read_motion, resample
-from edgepose_export.synthesis.posture_variation import AFTER, BEFORE, DEVIATION, SWAY_HZ, vary_postures
+from edgepose_export.synthesis.posture_variation import AFTER, BEFORE, DEVIATION, SWAY_HZ, vary_bodies
 from edgepose_export.synthesis.virtual_imus import recording_arrays, virtual_imus
 from edgepose_export.training.dataset import Batch, read_take, tape
 
@@ -58,7 +58,7 @@ def turns(before, after):
 
 
 def test_sensors_measure_what_they_would_on_a_body_in_that_posture(walk, batch, tmp_path):
-    orientation, acceleration, relative, place = vary_postures(batch, one_take(batch), 2.0, generator(3))
+    orientation, acceleration, relative, place = vary_bodies(batch, one_take(batch), 2.0, None, generator(3))
     whole = batch[2].clone()
     whole[:, BEFORE : whole.shape[1] - AFTER] = relative
     rotations = walk.rotations[:, :1] @ whole[0].double().numpy()
@@ -76,16 +76,16 @@ def test_sensors_measure_what_they_would_on_a_body_in_that_posture(walk, batch, 
 def test_every_frame_of_a_sequence_is_that_of_a_longer_one(batch):
     """What comes out has whole accelerations at both ends."""
     many = Batch(*(part[:, 10:80] for part in batch))
-    long = vary_postures(many, one_take(many), 1.0, generator(4))
+    long = vary_bodies(many, one_take(many), 1.0, None, generator(4))
     # The same postures, begun eleven frames later, do not exist; the same frames, ended earlier, do.
     short = Batch(*(part[:, :-20] for part in many))
-    for got, expected in zip(vary_postures(short, one_take(short), 1.0, generator(4)), long, strict=True):
+    for got, expected in zip(vary_bodies(short, one_take(short), 1.0, None, generator(4)), long, strict=True):
         torch.testing.assert_close(got, expected[:, : got.shape[1]], atol=2e-3, rtol=0, equal_nan=True)
 
 
 def test_turns_are_those_of_the_table(batch):
     many = Batch(*(part[:, :93].expand(1200, *part[:, :93].shape[1:]) for part in batch))
-    after = vary_postures(many, one_take(many), 1.0, generator())[2]
+    after = vary_bodies(many, one_take(many), 1.0, None, generator())[2]
     # Postures sway slowly: neighbouring frames say the same.
     got = np.sqrt(np.square(turns(inner(many[2])[:, ::8], after[:, ::8])).mean(axis=(0, 1)))
     expected = np.rad2deg(DEVIATION.numpy())
@@ -99,7 +99,7 @@ def test_turns_are_those_of_the_table(batch):
 
 
 def test_postures_sway_slowly_and_the_pelvis_stays(batch):
-    orientation, _, relative, _ = vary_postures(batch, one_take(batch), 1.0, generator(1))
+    orientation, _, relative, _ = vary_bodies(batch, one_take(batch), 1.0, None, generator(1))
     assert torch.equal(orientation[:, :, ROOT], inner(batch[0])[:, :, ROOT])
     assert torch.equal(relative[:, :, 0], inner(batch[2])[:, :, 0])
     course = turns(inner(batch[2]), relative)[0][:, DEVIATION.any(dim=-1).numpy()]
@@ -122,7 +122,7 @@ def test_the_seam_of_two_takes_gives_no_blow(batch, jump_deg):
     turn = torch.from_numpy(Rotation.from_euler("x", jump_deg, degrees=True).as_matrix()).float()
     relative[:, half:, 1:] = turn @ relative[:, half:, 1:]
     orientation[:, :, :ROOT] = orientation[:, :, ROOT:] @ relative[:, :, list(BONES[:ROOT])]
-    got = vary_postures(Batch(orientation, acceleration, relative, place), take, 2.0, generator(2))[1]
+    got = vary_bodies(Batch(orientation, acceleration, relative, place), take, 2.0, None, generator(2))[1]
     change = (got - inner(acceleration)).norm(dim=-1)[0]
     near = slice(half - BEFORE - 2, half - BEFORE + 3)
     elsewhere = torch.cat([change[: near.start], change[near.stop :]])

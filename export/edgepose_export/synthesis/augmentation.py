@@ -11,6 +11,7 @@ from edgepose.placements import PLACEMENTS, ROOT
 from edgepose.skeleton import JOINTS
 from edgepose_export.networks.normalisation import rotations_of, turn_about_y
 from edgepose_export.synthesis.contacts import CONTACTS, PLACE
+from edgepose_export.synthesis.loose_wear import biased, drifted, worn_loosely
 from edgepose_export.training.dataset import Batch
 
 
@@ -38,8 +39,8 @@ class Augmentation(NamedTuple):
         heading_deg: standard deviation of each sensor's heading relative to the pelvis sensor.
         acceleration_noise: standard deviation of white noise on the accelerations of each frame, m/s^2.
         acceleration_scale: standard deviation of each sensor's scale error.
-        aligned: share of sequences without misalignment and heading errors, so that a network trusts sensors
-            that agree with each other.
+        aligned: share of sequences whose sensors have no errors but noise and scale of the accelerations, so
+            that a network trusts sensors that agree with each other.
         pelvis_pitch_deg: standard deviation of a rotation of the pelvis, bone and sensor, about its own X
             axis. It imitates actors whose trunk leans differently relative to the pelvis. `Trainer` does not
             apply it to sequences with synthetic sitting, since the pelvis pitch is what tells sitting from
@@ -47,6 +48,17 @@ class Augmentation(NamedTuple):
         silent: share of sequences in which one sensor is silent for some time. In an eighth of them that time
             lies before or after the sequence.
         posture: factor on `posture_variation.DEVIATIONS`, the variation of how wearers hold their joints.
+        stature: relative standard deviation of the wearers' statures, from 1.45 to 2.0 m.
+        proportions: factor on the variation of segments' lengths and of where sensors sit on them, see
+            `body_shapes`.
+        swing_deg: rms angle by which sensors swing on clothing when walking; impacts swing them further, and
+            tight straps less.
+        slip_deg: standard deviation of slips about the length of a segment; three of ten sensors slip.
+        drift_deg: standard deviation of the rates at which sensors' headings drift away from the pelvis
+            sensor's, degrees per minute, for two minutes on average since the calibration.
+        tilt_walk_deg: standard deviation of the errors of sensors' tilts, which wander and leak gravity into
+            the accelerations.
+        acceleration_bias: standard deviation of the accelerations' biases, which wander slowly, m/s^2.
     """
 
     mirror: float = 0.5
@@ -58,6 +70,13 @@ class Augmentation(NamedTuple):
     pelvis_pitch_deg: float = 0.0
     silent: float = 0.0
     posture: float = 0.0
+    stature: float = 0.0
+    proportions: float = 0.0
+    swing_deg: float = 0.0
+    slip_deg: float = 0.0
+    drift_deg: float = 0.0
+    tilt_walk_deg: float = 0.0
+    acceleration_bias: float = 0.0
 
 
 def mirror(orientation: Tensor, acceleration: Tensor, relative: Tensor, place: Tensor) -> Batch:
@@ -125,57 +144,101 @@ def augment(batch: Batch, sizes: Augmentation, generator: torch.Generator) -> Ba
     """Return disturbed copies of sequences.
 
     The true poses change only by mirroring and by the pelvis pitch, contacts and velocity only by mirroring.
-    `posture` is not applied here, because it needs the frames around the sequences; see `vary_postures`.
+    `posture`, `stature` and `proportions` are not applied here, because they need the frames around the
+    sequences; see `vary_bodies`.
     """
     size = len(batch.orientation)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(shape, generator=generator)
-
     if sizes.mirror:
         chosen = torch.rand(size, generator=generator) < sizes.mirror
         batch = _mirror_some(batch, chosen)
-    orientation, acceleration, relative, place = batch
     if sizes.pelvis_pitch_deg:
-        pitch = torch.zeros(size, 1, 3)
-        pitch[..., 0] = torch.deg2rad(sizes.pelvis_pitch_deg * normal(size, 1))
-        rotation = rotations_of(pitch)
-        orientation, relative = orientation.clone(), relative.clone()
-        orientation[:, :, ROOT] = orientation[:, :, ROOT] @ rotation
-        relative[:, :, 1:] = rotation.mT.unsqueeze(2) @ relative[:, :, 1:]
-    misaligned = (
-        (torch.rand(size, generator=generator) >= sizes.aligned).float()
-        if sizes.aligned
-        else torch.ones(size)
-    )
+        batch = _pitch_pelvis(batch, sizes.pelvis_pitch_deg, generator)
+    disturbed = torch.ones(size)
+    if sizes.aligned:
+        disturbed = (torch.rand(size, generator=generator) >= sizes.aligned).float()
+    seen = _misplaced(*batch[:2], sizes, disturbed, generator)
+    orientation, acceleration = _with_chip_errors(*seen, sizes, disturbed, generator)
+    if sizes.silent:
+        orientation, acceleration = _drop_some(orientation, acceleration, sizes.silent, generator)
+    return batch._replace(orientation=orientation, acceleration=acceleration)
+
+
+def _pitch_pelvis(batch: Batch, size_deg: float, generator: torch.Generator) -> Batch:
+    """Return sequences in which the pelvis, bone and sensor, is rotated about its own X axis."""
+    orientation, relative = batch.orientation.clone(), batch.relative.clone()
+    pitch = torch.zeros(len(orientation), 1, 3)
+    pitch[..., 0] = torch.deg2rad(size_deg * torch.randn(len(orientation), 1, generator=generator))
+    rotation = rotations_of(pitch)
+    orientation[:, :, ROOT] = orientation[:, :, ROOT] @ rotation
+    relative[:, :, 1:] = rotation.mT.unsqueeze(2) @ relative[:, :, 1:]
+    return batch._replace(orientation=orientation, relative=relative)
+
+
+def _misplaced(
+    orientation: Tensor,
+    acceleration: Tensor,
+    sizes: Augmentation,
+    disturbed: Tensor,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor]:
+    """Return the measurements of sensors that are misaligned, swing and slip, where `disturbed` (B,) is 1."""
     if sizes.misalignment_deg:
-        angles = sizes.misalignment_deg * normal(size, 1, 6, 3) * misaligned[:, None, None, None]
-        error = rotations_of(torch.deg2rad(angles))
-        orientation = orientation @ error
-    if sizes.heading_deg:
-        vertical = torch.zeros(size, 1, 6, 3)
-        vertical[..., :-1, 1] = torch.deg2rad(
-            sizes.heading_deg * normal(size, 1, 5) * misaligned[:, None, None]
+        shape = (len(orientation), 1, len(PLACEMENTS), 3)
+        angles = (
+            sizes.misalignment_deg * torch.randn(shape, generator=generator) * disturbed[:, None, None, None]
         )
+        orientation = orientation @ rotations_of(torch.deg2rad(angles))
+    if sizes.swing_deg or sizes.slip_deg:
+        return worn_loosely(orientation, acceleration, sizes.swing_deg, sizes.slip_deg, disturbed, generator)
+    return orientation, acceleration
+
+
+def _with_chip_errors(
+    orientation: Tensor,
+    acceleration: Tensor,
+    sizes: Augmentation,
+    disturbed: Tensor,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor]:
+    """Return the measurements of imprecise chips; only noise and scale where `disturbed` (B,) is 0."""
+    size = len(orientation)
+    if sizes.acceleration_bias:
+        acceleration = biased(orientation, acceleration, sizes.acceleration_bias, disturbed, generator)
+    if sizes.heading_deg:
+        vertical = torch.zeros(size, 1, len(PLACEMENTS), 3)
+        angles = torch.randn(size, 1, len(PLACEMENTS) - 1, generator=generator) * disturbed[:, None, None]
+        vertical[..., :-1, 1] = torch.deg2rad(sizes.heading_deg * angles)
         rotation = rotations_of(vertical)
         orientation = rotation @ orientation
         acceleration = (rotation @ acceleration.unsqueeze(-1)).squeeze(-1)
-    if sizes.acceleration_scale:
-        acceleration = acceleration * (1.0 + sizes.acceleration_scale * normal(size, 1, 6, 1))
-    if sizes.acceleration_noise:
-        acceleration = acceleration + sizes.acceleration_noise * normal(*acceleration.shape)
-    if sizes.silent:
-        orientation, acceleration = orientation.clone(), acceleration.clone()
-        frames = orientation.shape[1]
-        # The silence may begin before the sequence, or last longer than it.
-        first, end = (
-            (frames * (2.0 * torch.rand(size, 2, generator=generator) - 0.5)).long().sort().values.unbind(1)
+    if sizes.drift_deg or sizes.tilt_walk_deg:
+        orientation, acceleration = drifted(
+            orientation, acceleration, sizes.drift_deg, sizes.tilt_walk_deg, disturbed, generator
         )
-        which = torch.randint(len(PLACEMENTS), (size,), generator=generator)
-        which[torch.rand(size, generator=generator) >= sizes.silent] = -1
-        for sensor in range(len(PLACEMENTS)):
-            rows = which == sensor
-            orientation[rows], acceleration[rows] = drop_sensor(
-                orientation[rows], acceleration[rows], sensor, first[rows].clamp(1, frames), end[rows]
-            )
-    return Batch(orientation, acceleration, relative, place)
+    if sizes.acceleration_scale:
+        scale = torch.randn(size, 1, len(PLACEMENTS), 1, generator=generator)
+        acceleration = acceleration * (1.0 + sizes.acceleration_scale * scale)
+    if sizes.acceleration_noise:
+        noise = torch.randn(acceleration.shape, generator=generator)
+        acceleration = acceleration + sizes.acceleration_noise * noise
+    return orientation, acceleration
+
+
+def _drop_some(
+    orientation: Tensor, acceleration: Tensor, share: float, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Return copies of sequences of which a share has one silent sensor for some time."""
+    size, frames = orientation.shape[:2]
+    orientation, acceleration = orientation.clone(), acceleration.clone()
+    # The silence may begin before the sequence, or last longer than it.
+    first, end = (
+        (frames * (2.0 * torch.rand(size, 2, generator=generator) - 0.5)).long().sort().values.unbind(1)
+    )
+    which = torch.randint(len(PLACEMENTS), (size,), generator=generator)
+    which[torch.rand(size, generator=generator) >= share] = -1
+    for sensor in range(len(PLACEMENTS)):
+        rows = which == sensor
+        orientation[rows], acceleration[rows] = drop_sensor(
+            orientation[rows], acceleration[rows], sensor, first[rows].clamp(1, frames), end[rows]
+        )
+    return orientation, acceleration

@@ -8,12 +8,14 @@ import torch
 from torch import Tensor
 
 from edgepose.placements import BONES, ROOT
-from edgepose.skeleton import JOINTS, PARENTS, default_body
+from edgepose.skeleton import JOINTS, PARENTS
 from edgepose_export.networks.normalisation import rotations_of
+from edgepose_export.synthesis.body_shapes import LEVERS, Shapes
+from edgepose_export.synthesis.contacts import CONTACTS
 from edgepose_export.training.dataset import RATE, Batch
 
 BEFORE, AFTER = 2, 1
-"""Frames that `vary_postures` needs before and after those it returns, because accelerations are second
+"""Frames that `vary_bodies` needs before and after those it returns, because accelerations are second
 differences, averaged over two frames.
 """
 
@@ -46,43 +48,37 @@ def _deviations() -> Tensor:
     return result
 
 
-def _levers() -> Tensor:
-    """Return levers (6, 24, 3), metres, of the default body.
-
-    Summed over all bones, the rotated levers give the sensors' positions relative to the pelvis.
-    """
-    body = default_body()
-    offsets, sensors = torch.tensor(body.offsets).float(), torch.tensor(body.sensors).float()
-    result = torch.zeros(len(BONES), len(PARENTS), 3)
-    for sensor, bone in enumerate(BONES):
-        result[sensor, bone] = sensors[sensor]
-        while bone:
-            result[sensor, PARENTS[bone]] += offsets[bone]
-            bone = PARENTS[bone]
-    return result
-
-
-DEVIATION, LEVERS = _deviations(), _levers()
+DEVIATION = _deviations()
 VARIED = tuple(torch.nonzero(DEVIATION.any(dim=-1)).flatten().tolist())
 
 
-def vary_postures(batch: Batch, take: Tensor, size: float, generator: torch.Generator) -> Batch:
-    """Return sequences in which wearers hold their joints differently.
+def vary_bodies(
+    batch: Batch, take: Tensor, posture: float, shapes: Shapes | None, generator: torch.Generator
+) -> Batch:
+    """Return sequences of wearers who hold their joints differently and have other bodies.
 
-    Each joint gets an extra rotation that is mostly constant and sways slowly. Its children follow, and the
-    sensors measure the new motion. The pelvis moves as before, so feet slide. Sensors have to be aligned with
-    their bones.
+    The sensors measure the new motion. The pelvis moves as before, or in proportion to the legs of the other
+    body, so feet slide a little. Sensors have to be aligned with their bones.
 
     Args:
         batch: see `Batch`, with `BEFORE` more frames before and `AFTER` more frames after those returned.
         take: (B, T) index of each frame's take; accelerations at the seam of two takes do not change.
-        size: factor on `DEVIATIONS`.
+        posture: factor on `DEVIATIONS`.
+        shapes: the other bodies; None for those of the batch.
         generator: source of the random numbers.
 
     Returns:
         The batch without the additional frames.
     """
-    relative = batch.relative
+    relative = other_postures(batch.relative, posture, generator) if posture else batch.relative
+    return moved(batch, take, relative, shapes)
+
+
+def other_postures(relative: Tensor, size: float, generator: torch.Generator) -> Tensor:
+    """Return root-relative rotations (B, T, 24, 3, 3) of wearers who hold their joints differently.
+
+    Each joint gets an extra rotation that is mostly constant and sways slowly. Its children follow.
+    """
     shape = (len(relative), 1, len(VARIED), 3)
     constant, sway = torch.randn(2, *shape, generator=generator)
     frequency, phase = torch.rand(2, *shape, generator=generator)
@@ -98,24 +94,42 @@ def vary_postures(batch: Batch, take: Tensor, size: float, generator: torch.Gene
             change = change @ before @ extra[joint] @ before.mT
         new.append(change @ before)
         accumulated.append(change)
-    return moved(batch, take, torch.stack(new, dim=2))
+    return torch.stack(new, dim=2)
 
 
-def moved(batch: Batch, take: Tensor, relative: Tensor) -> Batch:
+def moved(batch: Batch, take: Tensor, relative: Tensor, shapes: Shapes | None = None) -> Batch:
     """Return the sequences that sensors measure when bones get new root-relative rotations (B, T, 24, 3, 3).
 
-    The pelvis moves as in the batch, and contacts and velocity stay. The other arguments and the result are
-    those of `vary_postures`.
+    The pelvis moves as in the batch, scaled by the other bodies' factors. Contacts stay. The other arguments
+    and the result are those of `vary_bodies`.
     """
     orientation, acceleration, before, place = batch
+    wanted = slice(BEFORE, relative.shape[1] - AFTER)
+    acceleration, place = acceleration[:, wanted], place[:, wanted]
     root = orientation[:, :, ROOT, None]
-    shift = torch.einsum("btjxy,ijy->btix", relative - before, LEVERS)
+    if shapes is None:
+        shift = _rotated(relative - before, LEVERS)
+    else:
+        scale = shapes.scale[:, None, None]
+        # The old positions scaled are part of the acceleration scaled.
+        shift = _rotated(relative, shapes.levers) - _rotated(before, scale[..., None] * LEVERS)
+        acceleration = acceleration * scale[..., None]
+        place = torch.cat([place[..., : len(CONTACTS)], place[..., len(CONTACTS) :] * scale], dim=-1)
     shift = (root @ shift.unsqueeze(-1)).squeeze(-1)
     # Accelerations are made as in `synthesis.virtual_imus` and `dataset.read_take`.
     change = (shift[:, :-2] + shift[:, 2:] - 2.0 * shift[:, 1:-1]) * RATE**2
     change = change * (take[:, :-2] == take[:, 2:])[..., None, None]
     change = 0.5 * (change[:, 1:] + change[:, :-1])
-    wanted = slice(BEFORE, relative.shape[1] - AFTER)
     bones = (root @ relative[:, :, list(BONES[:ROOT])])[:, wanted]
     orientation = torch.cat([bones, orientation[:, wanted, ROOT:]], dim=2)
-    return Batch(orientation, acceleration[:, wanted] + change, relative[:, wanted], place[:, wanted])
+    return Batch(orientation, acceleration + change, relative[:, wanted], place)
+
+
+def _rotated(relative: Tensor, levers: Tensor) -> Tensor:
+    """Return positions (B, T, 6, 3) of sensors relative to the pelvis, in its frame.
+
+    Args:
+        relative: (B, T, 24, 3, 3) root-relative rotations.
+        levers: (6, 24, 3) or (B, 6, 24, 3), see `levers_of`.
+    """
+    return torch.einsum(f"btjxy,{'b' * (levers.dim() == 4)}ijy->btix", relative, levers)

@@ -20,7 +20,8 @@ from edgepose_export.archive.torchscript import Statistics, new_network
 from edgepose_export.networks.normalisation import network_inputs, seen_from_first
 from edgepose_export.networks.shape import NetworkShape, smoothed
 from edgepose_export.synthesis.augmentation import augment
-from edgepose_export.synthesis.posture_variation import AFTER, BEFORE, vary_postures
+from edgepose_export.synthesis.body_shapes import draw_shapes
+from edgepose_export.synthesis.posture_variation import AFTER, BEFORE, vary_bodies
 from edgepose_export.training.checkpoints import (
     CHECKPOINT,
     WEIGHTS_ONLY,
@@ -218,14 +219,17 @@ class Trainer:
         return Batch(*map(torch.cat, zip(*parts, strict=True)))
 
     def _windows(self, starts: Tensor) -> Batch:
-        """Return windows by their first frames, in varied postures if the config asks for them."""
-        tape, window, size = self.train_tape, self.config.window, self.config.augmentation.posture
-        if not size:
+        """Return windows by their first frames, of other bodies if the config asks for them."""
+        tape, window, sizes = self.train_tape, self.config.window, self.config.augmentation
+        if not (sizes.posture or sizes.stature or sizes.proportions):
             return windows(tape, starts, window)
         index = starts[:, None] + torch.arange(-BEFORE, window + AFTER)
         take = torch.searchsorted(tape.starts, index, right=True)
         index = index.clamp(0, len(tape.relative) - 1)
-        return vary_postures(tape.at(index), take, size, self.generator)
+        shapes = None
+        if sizes.stature or sizes.proportions:
+            shapes = draw_shapes(len(starts), sizes.stature, sizes.proportions, self.generator)
+        return vary_bodies(tape.at(index), take, sizes.posture, shapes, self.generator)
 
     def _validation_starts(self) -> Tensor:
         window = self.config.window
