@@ -207,7 +207,7 @@ def test_share_of_made_sitting(takes):
     one = Trainer(config, tape(made), tape(takes), ABOUT)
     end = len(made[0].pose)
     assert (torch.cat(one.starts) >= end).all()
-    assert len(torch.cat(one.seated_starts)) == end - 19
+    assert len(torch.cat(one.made_starts[".seated"])) == end - 19
     # A run that does not ask for them takes them like others.
     plain = Trainer(SMALL, tape(made), tape(takes), ABOUT)
     assert (torch.cat(plain.starts) < end).any()

@@ -16,10 +16,10 @@ from edgepose.placements import PLACEMENTS
 from edgepose_export.networks.normalisation import rotations_of
 from edgepose_export.training.dataset import RATE
 
-WALKING = 5.0
+WALKING = 6.0
 """Accelerations of a walker's sensors, m/s^2 rms, at which a sensor swings by its given size."""
 
-SWING_HZ = (4.0, 10.0)
+SWING_HZ = (3.0, 10.0)
 """Natural frequencies of sensors on clothes and soft tissue."""
 
 SWING_DAMPING = (0.15, 0.5)
@@ -27,7 +27,7 @@ SWING_DAMPING = (0.15, 0.5)
 SWING_LIMIT_DEG = 15.0
 """Straps do not let a sensor swing further, however hard the heel strikes."""
 
-SWING_LEVER = 0.05
+SWING_LEVER = 0.03
 """Greatest distance of a sensor from the point about which it swings, metres."""
 
 SLIPPING = 0.3

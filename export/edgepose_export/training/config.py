@@ -35,8 +35,9 @@ class TrainConfig:
         joined: whether sequences may cross the ends of takes, so that a network that is never reset learns to
             recover from a jump.
         free_share: share of the sequences taken from CMU's takes.
-        seated_share: share of the sequences taken from takes with synthetic sitting, if there are any; the
-            other shares refer to the rest.
+        seated_share: share of the sequences taken from takes with synthetic sitting, if there are any.
+        rests_share: share of the sequences taken from takes with synthetic rests, if there are any;
+            `free_share` refers to the sequences of neither kind.
         input_dropout: share of the inputs set to zero (DIP: 0.2).
         smoothness: jitter penalty: weight of the squared second differences in time of the pose error, in
             normalised units.
@@ -61,6 +62,7 @@ class TrainConfig:
     joined: bool = False
     free_share: float = 0.0
     seated_share: float = 0.0
+    rests_share: float = 0.0
     input_dropout: float = 0.2
     smoothness: float = 0.0
     learning_rate: float = 1e-3
@@ -133,6 +135,11 @@ def config_from(values: dict[str, Any]) -> TrainConfig:
         raise ValueError(
             "a network without accelerations cannot reconstruct them: set acceleration_loss = false"
         )
+    if config.seated_share + config.rests_share > 1.0:
+        raise ValueError(
+            f"seated_share and rests_share are {config.seated_share:g} and {config.rests_share:g}; "
+            "their sum must not exceed 1"
+        )
     kind = NETWORKS[config.network.kind]
     if config.streamed and not kind.streamed:
         raise ValueError(f"streamed needs {_kinds('streamed')}")
@@ -175,8 +182,11 @@ _RANGES: dict[str, tuple[float, float]] = {
     "input_dropout": (0.0, 0.99),
     "free_share": (0.0, 1.0),
     "seated_share": (0.0, 1.0),
+    "rests_share": (0.0, 1.0),
     "aligned": (0.0, 1.0),
     "mirror": (0.0, 1.0),
+    "stature": (0.0, 1.0),
+    "proportions": (0.0, 5.0),
     "silent": (0.0, 1.0),
     "smoothing": (0.0, 0.99),
 }

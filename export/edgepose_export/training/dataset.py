@@ -27,6 +27,9 @@ from edgepose_export.training.splits import HELD_OUT, SPLITS, part_of
 SEATED = ".seated"
 """End of the names of takes with legs made by `edgepose_export.synthesis.sitting`."""
 
+RESTS = ".rests"
+"""End of the names of takes with rests made by `edgepose_export.synthesis.rests`."""
+
 RATE = 60.0
 """Frames per second of all networks."""
 
@@ -232,9 +235,9 @@ class PackedTakes(NamedTuple):
         return [text.startswith("CMU") for text in self.licenses]
 
     @property
-    def seated(self) -> list[bool]:
-        """Whether each take's legs were made by `edgepose_export.synthesis.sitting`."""
-        return [name.endswith(SEATED) for name in self.names]
+    def made(self) -> list[str]:
+        """How each take's motion was made: `SEATED`, `RESTS`, or "" as captured."""
+        return [next((kind for kind in (SEATED, RESTS) if name.endswith(kind)), "") for name in self.names]
 
 
 def tape(takes: list[Take]) -> PackedTakes:

@@ -31,7 +31,7 @@ from edgepose_export.training.checkpoints import (
     shape_of,
 )
 from edgepose_export.training.config import TrainConfig, config_values
-from edgepose_export.training.dataset import Batch, PackedTakes, describe
+from edgepose_export.training.dataset import RESTS, SEATED, Batch, PackedTakes, describe
 from edgepose_export.training.distributed import ALONE, Processes
 from edgepose_export.training.losses import likelihood_loss, smoothness_loss
 from edgepose_export.training.windows import sample_windows, window_starts, windows, windows_with_sitting
@@ -118,9 +118,14 @@ class Trainer:
         torch.manual_seed(config.seed)
         self.config, self.train_tape, self.validation_tape = config, train, validation
         self.data, self.processes = data, processes
-        seated = train.seated if config.seated_share else [False] * len(train.names)
-        self.starts = window_starts(train, config.window, config.joined, lambda take: not seated[take])
-        self.seated_starts = window_starts(train, config.window, config.joined, seated.__getitem__)
+        self.shares = {SEATED: config.seated_share, RESTS: config.rests_share}
+        # Made takes without a share of their own are used like others.
+        kinds = [kind if self.shares.get(kind) else "" for kind in train.made]
+        self.starts, *made = (
+            window_starts(train, config.window, config.joined, lambda take, kind=kind: kinds[take] == kind)
+            for kind in ("", *self.shares)
+        )
+        self.made_starts = dict(zip(self.shares, made, strict=True))
         self.has_sitting = windows_with_sitting(train, config.window)
         counts = processes.gathered(len(torch.cat(self.starts)))
         if not all(counts):
@@ -188,11 +193,7 @@ class Trainer:
         for group in self.optimiser.param_groups:
             group["lr"] = rate * min(1.0, (self.step + 1) / (config.warm_up + 1))
         count = config.sequences // self.processes.size
-        seated = round(count * config.seated_share) if len(torch.cat(self.seated_starts)) else 0
-        starts = sample_windows(self.starts, count - seated, config.free_share, self.generator)
-        if seated:
-            starts = torch.cat([starts, sample_windows(self.seated_starts, seated, 0.0, self.generator)])
-        batch = self._batch(starts)
+        batch = self._batch(self._drawn_starts(count))
         loss = self._loss(self.parallel, batch, config.input_dropout, config.smoothness)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
@@ -205,6 +206,16 @@ class Trainer:
             for mean, new in zip(self.averaged.parameters(), self.network.parameters(), strict=True):
                 mean.lerp_(new, 1.0 - decay)
         return self.processes.total(loss.detach()).item() / self.processes.size
+
+    def _drawn_starts(self, count: int) -> Tensor:
+        """Return the first frames (count,) of random windows, those of made takes last."""
+        made, left = [], count
+        for kind, share in self.shares.items():
+            if len(torch.cat(self.made_starts[kind])):
+                made.append((self.made_starts[kind], min(round(count * share), left)))
+                left -= made[-1][1]
+        groups = [(self.starts, left, self.config.free_share), *((pool, size, 0.0) for pool, size in made)]
+        return torch.cat([sample_windows(*group, self.generator) for group in groups if group[1]])
 
     def _batch(self, starts: Tensor) -> Batch:
         """Return augmented windows by their first frames; those with synthetic sitting come last."""

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from edgepose_export.training.dataset import Batch, PackedTakes
+from edgepose_export.training.dataset import SEATED, Batch, PackedTakes
 
 Starts = tuple[Tensor, Tensor]
 """First frames of the windows in other takes, and in CMU's takes."""
@@ -40,7 +40,7 @@ def window_starts(
 def windows_with_sitting(tape: PackedTakes, window: int) -> Tensor:
     """Return whether the windows starting at each frame (T,) of a tape have frames of synthetic sitting."""
     frames = torch.zeros(int(tape.starts[-1]) + 1, dtype=torch.int32)
-    for i in (i for i, seated in enumerate(tape.seated) if seated):
+    for i in (i for i, kind in enumerate(tape.made) if kind == SEATED):
         frames[int(tape.starts[i]) + 1 : int(tape.starts[i + 1]) + 1] = 1
     before = frames.cumsum(0)
     first = torch.arange(len(before) - 1)
