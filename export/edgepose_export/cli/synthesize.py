@@ -40,6 +40,7 @@ class Job(NamedTuple):
     hold_s: float
     mounting_seed: int | None
     seated_seed: int | None
+    rests_seed: int | None
     overwrite: bool
 
 
@@ -87,6 +88,14 @@ class Job(NamedTuple):
     help="Keep only the motion of the upper body, play it to and fro, and let the wearer sit down, squat and "
     "rise at random, drawn with this seed; about half a minute per take.",
 )
+@click.option(
+    "--rests",
+    "rests_seed",
+    type=click.IntRange(0),
+    metavar="SEED",
+    help="Let the wearer slow down, rest and go on, forwards or backwards, at random, drawn with this seed; "
+    "mostly where the body is low; about half a minute per take.",
+)
 @overwrite_option
 @click.option(
     "--jobs", type=click.IntRange(1), default=1, show_default=True, help="Files to process in parallel."
@@ -100,6 +109,7 @@ def synthesize(
     hold: float,
     mounting_seed: int | None,
     seated_seed: int | None,
+    rests_seed: int | None,
     overwrite: bool,
     jobs: int,
 ) -> None:
@@ -113,6 +123,7 @@ def synthesize(
       edgepose synthesize mocap/ --out recordings/ --jobs 2
       edgepose synthesize walk.bvh --out . --hold 6 --mounting 1 --rate 100
       edgepose synthesize mocap/ --out recordings/seated --seated 1
+      edgepose synthesize mocap/ --out recordings/rests --rests 1
     """
     from edgepose.formats.smpl_model import read_smpl
     from edgepose.skeleton import default_body
@@ -122,13 +133,15 @@ def synthesize(
         raise click.UsageError(
             f"--hold {hold:g} at --rate {rate:g} takes too much memory: at most {MOST_HOLD_FRAMES} samples"
         )
+    if seated_seed is not None and rests_seed is not None:
+        raise click.UsageError("--seated and --rests make different takes: call synthesize once for each")
     if body_path and height:
         raise click.UsageError("--body sets the height: omit --height")
     body = read_smpl(body_path) if body_path else default_body(height or 1.75)
     files = [(root, path) for root in inputs for path in motion_files(root)]
     if not files:
         raise EdgeposeError(f"no motion files ({', '.join(KINDS)}) in {', '.join(map(str, inputs))}")
-    flags = (rate, body, hold, mounting_seed, seated_seed, overwrite)
+    flags = (rate, body, hold, mounting_seed, seated_seed, rests_seed, overwrite)
     tasks = [(path, Job(out, root if root.is_dir() else root.parent, *flags)) for root, path in files]
     _check_targets(tasks, overwrite)
     failed = []
@@ -175,9 +188,9 @@ def _check_targets(tasks: list[tuple[Path, Job]], overwrite: bool) -> None:
 
 def _target(path: Path, job: Job, part: str) -> Path:
     """Return the path of the recording made of a motion file, or of a part of it."""
-    from edgepose_export.training.dataset import SEATED
+    from edgepose_export.training.dataset import RESTS, SEATED
 
-    kind = "" if job.seated_seed is None else SEATED
+    kind = SEATED if job.seated_seed is not None else RESTS if job.rests_seed is not None else ""
     return job.out / path.relative_to(job.root).with_name(f"{path.stem}{part}{kind}.npz")
 
 
@@ -193,6 +206,7 @@ def convert(path: Path, job: Job) -> str | None:
     import numpy as np
 
     from edgepose_export.mocap import pieces, read_motion, resample
+    from edgepose_export.synthesis.rests import with_rests
     from edgepose_export.synthesis.sitting import seated
     from edgepose_export.synthesis.virtual_imus import (
         random_mounting,
@@ -212,6 +226,9 @@ def convert(path: Path, job: Job) -> str | None:
                 # Seeded by name, so that a take does not depend on the others in the call.
                 rng = np.random.default_rng([job.seated_seed, i, *path.stem.encode()])
                 motion = seated(motion, job.body, rng)
+            if job.rests_seed is not None:
+                rng = np.random.default_rng([job.rests_seed, i, *path.stem.encode()])
+                motion = with_rests(motion, job.body, rng)
             if job.hold_s:
                 motion = with_hold(motion, job.hold_s)
             imus = virtual_imus(motion, job.body, mounting)

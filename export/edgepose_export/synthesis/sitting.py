@@ -80,7 +80,7 @@ def seated(motion: Motion, body: Body, rng: np.random.Generator) -> Motion:
     """
     frames = round(rng.uniform(*LENGTH_S) * motion.rate)
     course, lean = _course(frames, motion.rate, rng)
-    sway = _smooth_noise(frames, motion.rate, 4, np.radians(1.2), rng)
+    sway = smooth_noise(frames, motion.rate, 4, np.radians(1.2), rng)
     pelvis_pitch = course[:, 2] + lean + sway[:, 0]
     pelvis = rot.rotation_about_axis("y", sway[:, 1]) @ rot.rotation_about_axis("x", pelvis_pitch)
     rotations = np.empty((frames, 24, 3, 3))
@@ -136,7 +136,7 @@ def _minimum_jerk(t: Array) -> Array:
     return smooth
 
 
-def _smooth_noise(frames: int, rate: float, columns: int, size: float, rng: np.random.Generator) -> Array:
+def smooth_noise(frames: int, rate: float, columns: int, size: float, rng: np.random.Generator) -> Array:
     """Return slow random movement (T, columns) with the standard deviation `size`."""
     knots = np.arange(-1, int(frames / rate / 1.2) + 4) * 1.2
     noise: Array = CubicSpline(knots, rng.normal(0.0, size, (len(knots), columns)))(np.arange(frames) / rate)
@@ -198,7 +198,7 @@ def _hips_and_ankles(
     width = abs(body.offsets[1][0]) + rng.uniform(0.0, 0.10)
     # On a seat the feet move about, also one at a time.
     seat = np.clip((thigh - np.radians(50.0)) / np.radians(30.0), 0.0, 1.0)
-    drift = _smooth_noise(len(course), rate, 4, 0.07, rng) * seat[:, None]
+    drift = smooth_noise(len(course), rate, 4, 0.07, rng) * seat[:, None]
     ankles = [
         np.stack([np.full(len(course), side * width) + 0.4 * drift[:, 2 * k], zero, drift[:, 2 * k + 1]], 1)
         for k, side in enumerate((1.0, -1.0))
