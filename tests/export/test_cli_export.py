@@ -331,6 +331,16 @@ def test_synthesize_options(tmp_path):
     assert np.linalg.norm(still[0]) == pytest.approx(9.81, abs=1e-4)
 
 
+def test_synthesize_rests(tmp_path):
+    edgepose("synthesize", WALK, "--out", tmp_path, "--rests", 1)
+    take = read_take(tmp_path / f"{WALK.stem}.rests.npz")
+    assert 20 * 60 - 1 <= len(take.pose) <= 50 * 60 + 1
+    still = np.abs(np.diff(take.orientation, axis=0)).max(axis=(1, 2, 3)) < 0.002
+    assert 0.2 < still.mean() < 0.95
+    both = ["synthesize", str(WALK), "--out", str(tmp_path), "--rests", "1", "--seated", "1"]
+    assert "--seated and --rests make different takes" in CliRunner().invoke(cli, both).output
+
+
 def test_synthesize_on_an_own_body(tmp_path):
     """A model file of SMPL's layout: another body gives other accelerations and the same orientations."""
     body = default_body(1.5, "female")

@@ -214,6 +214,23 @@ def test_share_of_made_sitting(takes):
     assert one.train_step() != plain.train_step()
 
 
+def test_shares_of_made_takes(takes):
+    """Each kind of made takes has its own share, whether or not there are takes of the other."""
+    sitting, resting = (takes[0]._replace(name=f"take.{kind}") for kind in ("seated", "rests"))
+    config = replace(SMALL, sequences=16, seated_share=0.25, rests_share=0.5, free_share=0.0)
+    end = len(sitting.pose)
+    for made, expected in (([sitting, resting], (4, 8)), ([sitting], (4,)), ([resting], (8,))):
+        one = Trainer(config, tape([*made, *takes]), tape(takes), ABOUT)
+        drawn = one._drawn_starts(16)
+        assert len(drawn) == 16
+        for i, count in enumerate(expected):
+            assert ((drawn >= i * end) & (drawn < (i + 1) * end)).sum() == count
+        assert (drawn >= len(made) * end).sum() == 16 - sum(expected)
+    whole = replace(config, seated_share=0.5, sequences=3)
+    one = Trainer(whole, tape([sitting, resting, *takes]), tape(takes), ABOUT)
+    assert len(one._drawn_starts(3)) == 3
+
+
 @pytest.mark.parametrize("joined", [False, True])
 def test_windows_with_made_sitting_keep_their_pelvis(takes, monkeypatch, joined):
     """Its pitch is what tells sitting from standing."""
@@ -240,6 +257,22 @@ def test_windows_with_made_sitting_keep_their_pelvis(takes, monkeypatch, joined)
     assert seated >= 32 if joined else seated == 32
     assert torch.equal(*kept)
     assert ((turned[0] - turned[1]).abs().amax((1, 2, 3, 4)) > 1e-3).all()
+
+
+def test_windows_of_other_bodies(takes):
+    """Accelerations and velocities are of another size, poses as before."""
+    how = Augmentation(mirror=0.0, stature=0.1)
+    one = Trainer(replace(SMALL, augmentation=how), tape(takes), tape(takes), ABOUT)
+    starts = torch.cat(one.starts)[:30]
+    plain, batch = windows(one.train_tape, starts, one.config.window), one._batch(starts)
+    order = torch.argsort(one.has_sitting[starts].int(), stable=True)
+    factor = batch.acceleration / plain.acceleration[order]
+    torch.testing.assert_close(factor, factor[:, :1, :1, :1].expand_as(factor), rtol=1e-3, atol=1e-3)
+    assert 0.05 < factor[:, 0, 0, 0].std() < 0.15
+    assert torch.equal(batch.relative, plain.relative[order])
+    torch.testing.assert_close(
+        batch.place[..., 7:], factor[:, :1, 0, :1] * plain.place[order][..., 7:], equal_nan=True
+    )
 
 
 def test_windows_in_other_postures(takes):
