@@ -95,7 +95,7 @@ def _reproduction(metadata: dict[str, Any]) -> list[str]:
         "edgepose synthesize MOCAP --out recordings --jobs 2",
         f"edgepose synthesize MOCAP/{'*_normal_*' if with_bandai else '*'}.bvh --hold 3 "
         "--out recordings/standing",
-        *(["edgepose synthesize SOME --seated 1 --out recordings/seated"] if _seated(metadata) else []),
+        *(f"edgepose synthesize SOME --{kind} 1 --out recordings/{kind}" for kind in _made_motion(metadata)),
         f"edgepose train --config {name} --data recordings --out runs/{name}",
         f"edgepose export runs/{name}/checkpoint.pt {'OTHERS ' * several}--out "
         f"{name}.pt{' --rounded' * metadata.get('rounded', False)} --measure recordings",
@@ -168,9 +168,10 @@ def _mean(training: dict[str, Any]) -> str:
     return f" in the last of {count} training runs, whose weights are averaged" if count > 1 else ""
 
 
-def _seated(metadata: dict[str, Any]) -> bool:
-    """Return whether the network was trained on synthetic sitting."""
-    return metadata["training"]["config"].get("seated_share", 0.0) > 0.0
+def _made_motion(metadata: dict[str, Any]) -> list[str]:
+    """Return the kinds of made motion that the network was trained on, as named by `synthesize`."""
+    config = metadata["training"]["config"]
+    return [kind for kind in ("seated", "rests") if config.get(f"{kind}_share", 0.0) > 0.0]
 
 
 def _deviations(parts: dict[str, dict[str, Any]]) -> list[str]:
