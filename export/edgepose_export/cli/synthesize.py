@@ -86,7 +86,7 @@ class Job(NamedTuple):
     type=click.IntRange(0),
     metavar="SEED",
     help="Keep only the motion of the upper body, play it to and fro, and let the wearer sit down, squat and "
-    "rise at random, drawn with this seed; about half a minute per take.",
+    "rise, or kneel and sit on the floor, at random, drawn with this seed; about half a minute per take.",
 )
 @click.option(
     "--rests",
@@ -206,6 +206,7 @@ def convert(path: Path, job: Job) -> str | None:
     import numpy as np
 
     from edgepose_export.mocap import pieces, read_motion, resample
+    from edgepose_export.synthesis.floor import SHARE, on_the_floor
     from edgepose_export.synthesis.rests import with_rests
     from edgepose_export.synthesis.sitting import seated
     from edgepose_export.synthesis.virtual_imus import (
@@ -224,8 +225,9 @@ def convert(path: Path, job: Job) -> str | None:
             motion = resample(take, job.rate)
             if job.seated_seed is not None:
                 # Seeded by name, so that a take does not depend on the others in the call.
-                rng = np.random.default_rng([job.seated_seed, i, *path.stem.encode()])
-                motion = seated(motion, job.body, rng)
+                seed = [job.seated_seed, i, *path.stem.encode()]
+                make = on_the_floor if np.random.default_rng([1, *seed]).random() < SHARE else seated
+                motion = make(motion, job.body, np.random.default_rng(seed))
             if job.rests_seed is not None:
                 rng = np.random.default_rng([job.rests_seed, i, *path.stem.encode()])
                 motion = with_rests(motion, job.body, rng)

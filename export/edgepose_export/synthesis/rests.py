@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 from edgepose import rotations as rot
 from edgepose.skeleton import Body, forward_kinematics, local_from_global, standing_pelvis_position
 from edgepose_export.mocap.motion import Array, Motion
-from edgepose_export.synthesis.sitting import smooth_noise
+from edgepose_export.synthesis.body_parts import smooth_noise
 
 LENGTH_S = (20.0, 50.0)
 """Least and greatest length of a take, seconds."""

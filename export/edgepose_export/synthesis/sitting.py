@@ -13,17 +13,24 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from edgepose import rotations as rot
-from edgepose.skeleton import Body, local_from_global
+from edgepose.skeleton import Body
 from edgepose_export.mocap.motion import Array, Motion
+from edgepose_export.synthesis.body_parts import (
+    LEGS,
+    leg,
+    leg_hinge,
+    minimum_jerk,
+    played_to_and_fro,
+    smooth_noise,
+    with_lap,
+    with_trunk,
+    with_upper_body,
+)
 
 LENGTH_S = (25.0, 50.0)
 """Least and greatest length of a synthetic take, seconds."""
-
-_LEGS = ((1, 4, 7, 10), (2, 5, 8, 11))
-_SPINE = (3, 6, 9)
 
 
 class Posture(NamedTuple):
@@ -85,20 +92,20 @@ def seated(motion: Motion, body: Body, rng: np.random.Generator) -> Motion:
     pelvis = rot.rotation_about_axis("y", sway[:, 1]) @ rot.rotation_about_axis("x", pelvis_pitch)
     rotations = np.empty((frames, 24, 3, 3))
     rotations[:, 0] = pelvis
-    local = _play_to_and_fro(motion, frames, rng)
-    local = _with_trunk(local, course[:, 3] + 0.4 * lean + sway[:, 2])
-    local = _with_lap(local, course[:, 4], rng)
+    local = played_to_and_fro(motion, frames, rng)
+    local = with_trunk(local, course[:, 3] + 0.4 * lean + sway[:, 2])
+    local = with_lap(local, course[:, 4], rng)
     hips, ankles = _hips_and_ankles(course, pelvis, body, motion.rate, rng)
-    for side, (leg, ankle) in enumerate(zip(_LEGS, ankles, strict=True)):
-        hip = hips + pelvis @ body.offsets[leg[0]]
-        thigh, shank = _leg(hip, ankle, body.offsets[list(leg)], side, rng)
-        rotations[:, leg[0]] = thigh
-        rotations[:, list(leg[1:])] = shank[:, None]
+    for side, (joints, ankle) in enumerate(zip(LEGS, ankles, strict=True)):
+        hip = hips + pelvis @ body.offsets[joints[0]]
+        outwards = np.radians(rng.uniform(-5.0, 22.0)) * (1.0 if side == 0 else -1.0)
+        hinge = leg_hinge(hip - ankle, outwards)
+        thigh, shank = leg(hip, ankle, body.offsets[list(joints)], hinge)
+        rotations[:, joints[0]] = thigh
+        rotations[:, list(joints[1:])] = shank[:, None]
         # The foot is flat on the floor; no sensor or target depends on it.
-        rotations[:, list(leg[2:])] = np.eye(3)
-    for joint, parent in ((3, 0), (6, 3), (9, 6), (12, 9), (13, 9), (14, 9), (15, 12), (16, 13), (17, 14),
-                          (18, 16), (19, 17), (20, 18), (21, 19), (22, 20), (23, 21)):  # fmt: skip
-        rotations[:, joint] = rotations[:, parent] @ local[:, joint]
+        rotations[:, list(joints[2:])] = np.eye(3)
+    rotations = with_upper_body(rotations, local)
     return Motion(rotations, hips, motion.rate, motion.source)
 
 
@@ -118,7 +125,7 @@ def _course(frames: int, rate: float, rng: np.random.Generator) -> tuple[Array, 
             kind = squatting if rng.random() < 0.25 else sitting
         following = kind(rng)
         move = round(rng.uniform(0.8, 2.6) * rate)
-        share = _minimum_jerk(np.arange(move) / move)[: frames - end]
+        share = minimum_jerk(np.arange(move) / move)[: frames - end]
         course[end : end + move] = (1.0 - share[:, None]) * np.array(posture) + share[:, None] * np.array(
             following
         )
@@ -128,59 +135,6 @@ def _course(frames: int, rate: float, rng: np.random.Generator) -> tuple[Array, 
         )
         posture, start = following, end + move
     return course, lean
-
-
-def _minimum_jerk(t: Array) -> Array:
-    """Return values from 0 to 1 with zero speed and acceleration at both ends (Flash and Hogan 1985)."""
-    smooth: Array = t**3 * (10.0 - 15.0 * t + 6.0 * t * t)
-    return smooth
-
-
-def smooth_noise(frames: int, rate: float, columns: int, size: float, rng: np.random.Generator) -> Array:
-    """Return slow random movement (T, columns) with the standard deviation `size`."""
-    knots = np.arange(-1, int(frames / rate / 1.2) + 4) * 1.2
-    noise: Array = CubicSpline(knots, rng.normal(0.0, size, (len(knots), columns)))(np.arange(frames) / rate)
-    return noise
-
-
-def _play_to_and_fro(motion: Motion, frames: int, rng: np.random.Generator) -> Array:
-    """Return local rotations (T, 24, 3, 3) of a take played to and fro, coming to rest at both ends."""
-    local = local_from_global(motion.rotations)
-    last = len(local) - 1
-    phase = np.pi * np.arange(frames) / max(last, 1) / rng.uniform(1.2, 1.8) + rng.uniform(0.0, 2.0 * np.pi)
-    position = 0.5 * last * (1.0 - np.cos(phase))
-    low = np.minimum(position.astype(int), max(last - 1, 0))
-    high = np.minimum(low + 1, last)
-    # Neighbouring frames are only a few degrees apart, so the orthonormalised mean is a good interpolation.
-    share = (position - low)[:, None, None, None]
-    return rot.nearest_rotation((1.0 - share) * local[low] + share * local[high])
-
-
-def _with_trunk(local: Array, bend: Array) -> Array:
-    """Return the same with the spine bent forwards; the head compensates for some of it."""
-    part = rot.rotation_about_axis("x", bend / len(_SPINE))
-    local = local.copy()
-    for joint in _SPINE:
-        local[:, joint] = part @ local[:, joint]
-    local[:, 12] = rot.rotation_about_axis("x", -0.3 * bend) @ local[:, 12]
-    return local
-
-
-def _with_lap(local: Array, share: Array, rng: np.random.Generator) -> Array:
-    """Return the same with the forearms laid on the thighs, to a share (T,) from 0 to 1."""
-    local = local.copy()
-    for shoulder, elbow, side in ((16, 18, 1.0), (17, 19, -1.0)):
-        upper, fore = np.radians([rng.uniform(10.0, 45.0), rng.uniform(55.0, 100.0)])
-        hang = rot.rotation_about_axis("z", -side * np.radians(rng.uniform(72.0, 88.0)))
-        arm = rot.rotation_about_axis("x", -upper) @ hang
-        inwards = rot.rotation_about_axis("y", -side * np.radians(rng.uniform(0.0, 35.0)))
-        twist = rot.rotation_about_axis("x", np.radians(rng.uniform(-60.0, 40.0)))
-        forearm = inwards @ rot.rotation_about_axis("x", -fore) @ hang @ twist
-        for joint, target in ((shoulder, arm), (elbow, arm.T @ forearm)):
-            start = rot.matrix_to_quat(local[:, joint])
-            goal = np.broadcast_to(rot.matrix_to_quat(target), start.shape)
-            local[:, joint] = rot.quat_to_matrix(rot.slerp(start, goal, share))
-    return local
 
 
 def _hips_and_ankles(
@@ -204,36 +158,3 @@ def _hips_and_ankles(
         for k, side in enumerate((1.0, -1.0))
     ]
     return middle - socket, ankles
-
-
-def _leg(
-    hip: Array, ankle: Array, offsets: Array, side: int, rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """Return global rotations (T, 3, 3) of thigh and shank between a hip and an ankle, knee forwards."""
-    above, below = np.linalg.norm(offsets[1]), np.linalg.norm(offsets[2])
-    line = hip - ankle
-    length = np.linalg.norm(line, axis=1)
-    reach = np.clip(length, abs(above - below) + 1e-3, 0.9995 * (above + below))
-    line = line / length[:, None]
-    outwards = np.radians(rng.uniform(-5.0, 22.0)) * (1.0 if side == 0 else -1.0)
-    pole = np.array([np.sin(outwards), 0.0, np.cos(outwards)])
-    hinge = np.cross(line, pole)
-    hinge /= np.linalg.norm(hinge, axis=1, keepdims=True)
-    # Angle at the ankle between the line to the hip and the shank (law of cosines).
-    cosine = (below**2 + reach**2 - above**2) / (2.0 * below * reach)
-    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-    shank_up = rot.rotvec_to_matrix(hinge * angle[:, None]) @ line[:, :, None]
-    knee = ankle + below * shank_up[:, :, 0]
-    return _bone(hip - knee, hinge, offsets[1]), _bone(knee - ankle, hinge, offsets[2])
-
-
-def _bone(up: Array, hinge: Array, offset: Array) -> Array:
-    """Return the rotation of a bone with far end `offset` in the zero pose; `up` points to its near end."""
-
-    def frame(direction: Array, side: Array) -> Array:
-        y = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
-        z = np.cross(side, y)
-        z /= np.linalg.norm(z, axis=-1, keepdims=True)
-        return np.stack([np.cross(y, z), y, z], axis=-1)
-
-    return frame(up, hinge) @ frame(-offset, np.array([1.0, 0.0, 0.0])).T

@@ -25,7 +25,7 @@ from edgepose_export.synthesis.virtual_imus import INERTIAL_FROM_BODY
 from edgepose_export.training.splits import HELD_OUT, SPLITS, part_of
 
 SEATED = ".seated"
-"""End of the names of takes with legs made by `edgepose_export.synthesis.sitting`."""
+"""End of the names of takes with legs made by `edgepose_export.synthesis.sitting` or `floor`."""
 
 RESTS = ".rests"
 """End of the names of takes with rests made by `edgepose_export.synthesis.rests`."""
