@@ -321,6 +321,7 @@ BIRNN = NetworkKind(
     windowed=True,
     streamed=True,
     smoothed=True,
+    placed=True,
 )
 
 RNN = NetworkKind(
@@ -328,4 +329,5 @@ RNN = NetworkKind(
     lambda network, *ends: RnnArchive(network, _ends(network, *ends)),
     "unidirectional LSTM; the pose of a frame is known at once; two layers with {hidden} units per direction",
     smoothed=True,
+    placed=True,
 )
