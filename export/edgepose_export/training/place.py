@@ -29,7 +29,7 @@ def contact_weights(tape: PackedTakes, processes: Processes = ALONE) -> Tensor:
     known = tape.place[:, 0].isfinite()
     contacts = tape.place[:, : len(CONTACTS)][known].double()
     sums = processes.total(torch.cat([contacts.sum(0), known.sum()[None].double()]))
-    share = (sums[:-1] / sums[-1].clamp_min(1.0)).clamp(0.02, 0.98)
+    share = (sums[:-1] / sums[-1].clamp_min(1.0)).clamp(0.05, 0.95)
     return (1.0 / torch.distributions.Bernoulli(share).entropy()).float()
 
 
