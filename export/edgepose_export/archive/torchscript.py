@@ -22,7 +22,11 @@ from edgepose_export.networks.kind import Network, Statistics
 from edgepose_export.networks.normalisation import FirstFrameNormaliser
 from edgepose_export.networks.registry import NETWORKS
 from edgepose_export.networks.shape import NetworkShape, PoseDecoder
+from edgepose_export.synthesis.contacts import CONTACTS
 from edgepose_export.training.dataset import RATE
+
+PLACE_OUTPUTS = {"contacts": list(CONTACTS), "velocity": "level pelvis frame, m/s"}
+"""Description of the outputs of a head for the place, in the metadata of archives that have one."""
 
 
 def new_network(shape: NetworkShape) -> Network:
@@ -132,6 +136,11 @@ def describe(
             "config": json.loads(checkpoint["config"]),
         },
         "measures": {},
+        **(
+            {"place": {"contacts": list(CONTACTS), "velocity": "level pelvis frame, m/s"}}
+            if shape.place
+            else {}
+        ),
         "edgepose": __version__,
         "revision": revision(),
         "torch": torch.__version__,

@@ -143,15 +143,23 @@ def _fit(trainer, out: Path, report: Callable[[str], None]) -> None:  # type: ig
     config = trainer.config
     started, first = time.monotonic(), trainer.step
 
-    def report_validation(step: int, loss: float, validation: float) -> None:
+    def report_validation(line: dict[str, float]) -> None:
+        step = int(line["step"])
         elapsed = time.monotonic() - started
         speed = (step - first) * config.sequences * config.window / elapsed
         left = (config.steps - step) * elapsed / (step - first) / 60
         report(
-            f"step {step} of {config.steps}: loss {loss:.4f}, "
-            f"validation {validation:.4f}, {speed / 1e3:.1f} k frames/s, {left:.0f} min left"
+            f"step {step} of {config.steps}: loss {line['train']:.4f}, validation {line['validation']:.4f}, "
+            f"{_place(line)}{speed / 1e3:.1f} k frames/s, {left:.0f} min left"
         )
 
     with progress_bar(config.steps, "training", hidden=trainer.processes.rank > 0) as bar:
         bar.update(first)
         fit(trainer, out, lambda step, loss: bar.update(1), report_validation)
+
+
+def _place(line: dict[str, float]) -> str:
+    """Return the accuracy of the head for the place, for messages; "" if there is none."""
+    if "contact" not in line:
+        return ""
+    return f"contacts {100.0 * line['contact']:.1f} %, velocity off by {line['velocity']:.2f} m/s, "

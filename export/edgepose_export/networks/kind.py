@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 class Network(nn.Module):
     """Base of the networks: z-scored inputs (B, T, inputs) to means and deviations (B, T, outputs).
 
+    With a head for the place its outputs (B, T, 10) come third.
+
     Attributes:
         shape: the shape that it was built from.
     """
@@ -45,6 +47,7 @@ class NetworkKind(NamedTuple):
             the numbers are the attributes `past` and `future` of the network, 0 if it has none.
         streamed: whether it can be trained as a stream: its `forward` has an argument `future`.
         smoothed: whether its archive applies `NetworkShape.smoothing`.
+        placed: whether it can have a head for the place, `NetworkShape.place`.
     """
 
     network: Callable[[NetworkShape], Network]
@@ -53,3 +56,4 @@ class NetworkKind(NamedTuple):
     windowed: bool = False
     streamed: bool = False
     smoothed: bool = False
+    placed: bool = False

@@ -7,85 +7,16 @@ to rotations. Statistics are folded into the adjacent weights.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
 from edgepose_export.networks.kind import NetworkKind, Statistics
 from edgepose_export.networks.lstm_cell import LstmCell
-from edgepose_export.networks.normalisation import network_inputs, tilt_of
-from edgepose_export.networks.packed_linear import PackedLinear
-from edgepose_export.networks.shape import SIGMA_FLOOR, PoseDecoder, PoseNetwork, turned
-
-
-class NormalisationAndDecoding(nn.Module):
-    """The layers before and after the recurrent ones, which both archives share."""
-
-    def __init__(
-        self, network: PoseNetwork, input_mean: Tensor, input_std: Tensor, decoder: PoseDecoder
-    ) -> None:
-        """Copy the network's dense layers and fold in the statistics of its inputs (60 in the paper)."""
-        super().__init__()
-        shape = network.shape
-        self.scheme, self.with_acceleration = shape.normalisation, shape.acceleration
-        self.decoder = decoder
-        self.floor = SIGMA_FLOOR
-        self.smoothing = shape.smoothing
-        dense = network.dense.weight.detach() / input_std
-        self.dense = PackedLinear(dense, network.dense.bias.detach() - dense @ input_mean)
-        # The acceleration part of the outputs is needed in training only.
-        size = shape.pose_outputs
-        mean, deviation = network.mean, network.deviation
-        weights = [mean.weight[:size] * decoder.target_std[:, None], deviation.weight[:size]]
-        biases = [mean.bias[:size] * decoder.target_std + decoder.target_mean, deviation.bias[:size]]
-        self.heads = PackedLinear(torch.cat(weights), torch.cat(biases))
-
-    def forward(self, orientation: Tensor, acceleration: Tensor) -> Tensor:
-        """Return the first hidden layer (..., hidden) of calibrated frames."""
-        x = network_inputs(orientation, acceleration, self.scheme, self.with_acceleration)
-        return torch.relu(self.dense(x))
-
-    @torch.jit.export
-    def start(self, batch: int) -> Tensor:
-        """Return the initial state of the low-pass: the last outputs (B, 2, pose outputs) of its stages."""
-        return torch.zeros(batch, 2, self.decoder.target_mean.shape[0])
-
-    @torch.jit.export
-    def pose(
-        self, orientation: Tensor, hidden: Tensor, lowpass: Tensor, count: int
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return local rotations (B, count, 24, 3, 3) and deviations (B, count, 24) of the last frames.
-
-        Also return the new state of the low-pass.
-
-        Args:
-            orientation: (B, T, 6, 3, 3) frames.
-            hidden: (B, T, hidden) recurrent outputs of these frames.
-            lowpass: state of the low-pass.
-            count: number of frames to return.
-        """
-        pose, deviation = self.heads(hidden).chunk(2, dim=-1)
-        if self.smoothing > 0.0:
-            pose, lowpass = self.smoothed(pose, orientation[:, :, -1], lowpass)
-        first = hidden.shape[1] - count
-        deviation = nn.functional.softplus(deviation[:, first:]) + self.floor
-        rotations = self.decoder.rotations(orientation[:, first:], pose[:, first:])
-        return rotations, self.decoder.deviations(deviation), lowpass
-
-    def smoothed(self, pose: Tensor, root: Tensor, lowpass: Tensor) -> tuple[Tensor, Tensor]:
-        """Apply the low-pass to frames (B, T, pose outputs) in the level frame of the root (B, T, 3, 3).
-
-        Also return the new state. The state starts at zero without correction: the first outputs are too
-        small, but only their directions matter for rotations.
-        """
-        tilt = tilt_of(root)
-        first, second = lowpass.unbind(1)
-        outputs: list[Tensor] = []
-        for row in turned(pose, tilt).unbind(1):
-            first = torch.lerp(row, first, self.smoothing)
-            second = torch.lerp(first, second, self.smoothing)
-            outputs.append(second)
-        pose = turned(torch.stack(outputs, dim=1), tilt.transpose(-1, -2))
-        return pose, torch.stack([first, second], dim=1)
+from edgepose_export.networks.lstm_ends import NormalisationAndDecoding
+from edgepose_export.networks.lstm_place import PlaceMethods
+from edgepose_export.networks.shape import PoseDecoder, PoseNetwork
 
 
 class RnnArchive(nn.Module):
@@ -100,14 +31,19 @@ class RnnArchive(nn.Module):
 
     def forward(self, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
         """Return the poses of a whole sequence."""
+        rotations, std, _ = self.whole(orientation, acceleration)
+        return rotations, std
+
+    def whole(self, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what `forward` returns, and the recurrent outputs (B, T, hidden)."""
         return self.last(orientation, acceleration, orientation.shape[1])
 
-    def last(self, orientation: Tensor, acceleration: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        """Return the poses of the last `count` frames of a sequence."""
+    def last(self, orientation: Tensor, acceleration: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the poses and the recurrent outputs of the last `count` frames of a sequence."""
         x = self.cell1.run(self.cell1.inputs[0](self.ends(orientation, acceleration)), False)
         x = self.cell2.run(self.cell2.inputs[0](x), False)
         rotations, std, _ = self.ends.pose(orientation, x, self.ends.start(x.shape[0]), count)
-        return rotations, std
+        return rotations, std, x[:, x.shape[1] - count :]
 
     @torch.jit.export
     def pack(self, precision: str) -> None:
@@ -118,8 +54,14 @@ class RnnArchive(nn.Module):
     @torch.jit.export
     def window(self, orientation: Tensor, acceleration: Tensor, index: int) -> tuple[Tensor, Tensor]:
         """Return the pose of frame `index` of a window; later frames are not used."""
-        rotations, std = self.last(orientation[:, : index + 1], acceleration[:, : index + 1], 1)
-        return rotations[:, 0], std[:, 0]
+        rotations, std, _ = self.at(orientation, acceleration, index)
+        return rotations, std
+
+    def at(self, orientation: Tensor, acceleration: Tensor, index: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what `window` returns, and the recurrent outputs (B, hidden) of that frame."""
+        seen = orientation[:, : index + 1], acceleration[:, : index + 1]
+        rotations, std, hidden = self.last(seen[0], seen[1], 1)
+        return rotations[:, 0], std[:, 0], hidden[:, 0]
 
     @torch.jit.export
     def start(self, batch: int, future: int) -> list[Tensor]:
@@ -141,17 +83,34 @@ class RnnArchive(nn.Module):
         self, orientation: Tensor, acceleration: Tensor, state: list[Tensor]
     ) -> tuple[Tensor, Tensor, list[Tensor]]:
         """Process several frames (B, T, ...): return their poses, deviations and the new state."""
+        rotations, std, _, state = self.advanced(orientation, acceleration, state)
+        return rotations, std, state
+
+    def advanced(
+        self, orientation: Tensor, acceleration: Tensor, state: list[Tensor]
+    ) -> tuple[Tensor, Tensor, Tensor, list[Tensor]]:
+        """Return what `stream_many` returns, with the recurrent outputs of these frames before the state."""
         x = self.ends(orientation, acceleration)
         x, h1, c1 = self.cell1.carry(self.cell1.inputs[0](x), state[0], state[1])
         x, h2, c2 = self.cell2.carry(self.cell2.inputs[0](x), state[2], state[3])
         rotations, std, lowpass = self.ends.pose(orientation, x, state[4], x.shape[1])
-        return rotations, std, [h1, c1, h2, c2, lowpass]
+        return rotations, std, x, [h1, c1, h2, c2, lowpass]
 
     @torch.jit.export
     def drain(self, state: list[Tensor]) -> tuple[Tensor, Tensor]:
         """Return no poses: no frame ever waits."""
+        rotations, std, _ = self.drained(state)
+        return rotations, std
+
+    def drained(self, state: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what `drain` returns, and the recurrent outputs (B, 0, hidden)."""
         batch = state[0].shape[0]
-        return torch.zeros(batch, 0, 24, 3, 3), torch.zeros(batch, 0, 24)
+        none = torch.zeros(batch, 0, self.cell2.size)
+        return torch.zeros(batch, 0, 24, 3, 3), torch.zeros(batch, 0, 24), none
+
+
+class RnnPlaceArchive(PlaceMethods, RnnArchive):
+    """The same with a head for the place."""
 
 
 class BirnnArchive(nn.Module):
@@ -191,11 +150,16 @@ class BirnnArchive(nn.Module):
 
     def forward(self, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
         """Return the poses of a whole sequence."""
+        rotations, std, _ = self.whole(orientation, acceleration)
+        return rotations, std
+
+    def whole(self, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what `forward` returns, and the recurrent outputs (B, T, 2 hidden)."""
         ahead, back = self.layer1(orientation, acceleration)
         frames = orientation.shape[1]
         hidden = self.layer2(ahead, back, 0, frames)
         rotations, std, _ = self.ends.pose(orientation, hidden, self.ends.start(hidden.shape[0]), frames)
-        return rotations, std
+        return rotations, std, hidden
 
     def layer2(self, ahead: Tensor, back: Tensor, first: int, end: int) -> Tensor:
         """Return outputs (B, end - first, 2 hidden) of the second layer for frames `first` to `end` - 1."""
@@ -217,12 +181,17 @@ class BirnnArchive(nn.Module):
 
         The second layer runs only over frames that influence frame `index`; with smoothing, all of them do.
         """
+        rotations, std, _ = self.at(orientation, acceleration, index)
+        return rotations, std
+
+    def at(self, orientation: Tensor, acceleration: Tensor, index: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what `window` returns, and the recurrent outputs (B, 2 hidden) of that frame."""
         ahead, back = self.layer1(orientation, acceleration)
         first = 0 if self.ends.smoothing > 0.0 else index
         hidden = self.layer2(ahead, back, first, index + 1)
         seen = orientation[:, first : index + 1]
         rotations, std, _ = self.ends.pose(seen, hidden, self.ends.start(hidden.shape[0]), 1)
-        return rotations[:, 0], std[:, 0]
+        return rotations[:, 0], std[:, 0], hidden[:, -1]
 
     @torch.jit.export
     def start(self, batch: int, future: int) -> list[Tensor]:
@@ -238,8 +207,12 @@ class BirnnArchive(nn.Module):
         lowpass = self.ends.start(batch)
         return [zero, zero, zero, zero, waiting, waiting, waiting, orientations, lowpass, torch.zeros(future)]
 
-    def oldest(self, state: list[Tensor], count: int, future: int) -> tuple[Tensor, Tensor, list[Tensor]]:
+    def oldest(
+        self, state: list[Tensor], count: int, future: int
+    ) -> tuple[Tensor, Tensor, Tensor, list[Tensor]]:
         """Return the poses of the `count` oldest waiting frames, and the state without these frames.
+
+        In between are the recurrent outputs (B, count, 2 hidden).
 
         Each pose uses `future` frames that wait behind its own. Forward states carry over; the backward pass
         of each frame starts afresh at the last frame it uses (latency-controlled bidirectional LSTM). The
@@ -253,7 +226,8 @@ class BirnnArchive(nn.Module):
         hidden = torch.cat([past, later[:, 0].unflatten(0, (batch, count))], dim=-1)
         rotations, std, lowpass = self.ends.pose(state[7][:, :count], hidden, state[8], count)
         waiting = [state[4][:, count:], state[5][:, count:], state[6][:, count:], state[7][:, count:]]
-        return rotations, std, [state[0], state[1], h2, c2] + waiting + [lowpass, state[9]]  # noqa: RUF005
+        state = [state[0], state[1], h2, c2] + waiting + [lowpass, state[9]]  # noqa: RUF005
+        return rotations, std, hidden, state
 
     @torch.jit.export
     def stream(
@@ -270,6 +244,13 @@ class BirnnArchive(nn.Module):
         self, orientation: Tensor, acceleration: Tensor, state: list[Tensor]
     ) -> tuple[Tensor, Tensor, list[Tensor]]:
         """Process several frames (B, T, ...) and return all poses that `stream` would return one by one."""
+        rotations, std, _, state = self.advanced(orientation, acceleration, state)
+        return rotations, std, state
+
+    def advanced(
+        self, orientation: Tensor, acceleration: Tensor, state: list[Tensor]
+    ) -> tuple[Tensor, Tensor, Tensor, list[Tensor]]:
+        """Return what `stream_many` returns, with the recurrent outputs of these frames before the state."""
         x = self.ends(orientation, acceleration)
         ahead, h1, c1 = self.forward1.carry(self.forward1.inputs[0](x), state[0], state[1])
         state = [
@@ -288,20 +269,32 @@ class BirnnArchive(nn.Module):
         due = state[4].shape[1] - future
         if due <= 0:
             batch = x.shape[0]
-            return x.new_zeros(batch, 0, 24, 3, 3), x.new_zeros(batch, 0, 24), state
+            none = x.new_zeros(batch, 0, 2 * self.forward1.size)
+            return x.new_zeros(batch, 0, 24, 3, 3), x.new_zeros(batch, 0, 24), none, state
         return self.oldest(state, due, future)
 
     @torch.jit.export
     def drain(self, state: list[Tensor]) -> tuple[Tensor, Tensor]:
         """Return the poses of all frames that still wait when a stream ends, oldest first."""
+        rotations, std, _ = self.drained(state)
+        return rotations, std
+
+    def drained(self, state: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what `drain` returns, and the recurrent outputs (B, T, 2 hidden)."""
         batch = state[0].shape[0]
         rotations: list[Tensor] = [torch.zeros(batch, 0, 24, 3, 3)]
         stds: list[Tensor] = [torch.zeros(batch, 0, 24)]
+        outputs: list[Tensor] = [torch.zeros(batch, 0, 2 * self.forward1.size)]
         while state[4].shape[1] > 0:
-            rotation, std, state = self.oldest(state, 1, state[4].shape[1] - 1)
+            rotation, std, hidden, state = self.oldest(state, 1, state[4].shape[1] - 1)
             rotations.append(rotation)
             stds.append(std)
-        return torch.cat(rotations, dim=1), torch.cat(stds, dim=1)
+            outputs.append(hidden)
+        return torch.cat(rotations, dim=1), torch.cat(stds, dim=1), torch.cat(outputs, dim=1)
+
+
+class BirnnPlaceArchive(PlaceMethods, BirnnArchive):
+    """The same with a head for the place."""
 
 
 def _fields(waiting: Tensor, count: int, future: int) -> Tensor:
@@ -309,23 +302,31 @@ def _fields(waiting: Tensor, count: int, future: int) -> Tensor:
     return waiting.narrow(1, 0, count + future).unfold(1, future + 1, 1).transpose(2, 3).flatten(0, 1)
 
 
-def _ends(network: PoseNetwork, statistics: Statistics, decoder: PoseDecoder) -> NormalisationAndDecoding:
-    return NormalisationAndDecoding(network, statistics.input_mean, statistics.input_std, decoder)
+def _archive(plain: type[nn.Module], with_place: type[nn.Module]) -> Callable[..., nn.Module]:
+    """Return the function that makes an archive's module of either class, see `NetworkKind.archive`."""
+
+    def make(network: PoseNetwork, statistics: Statistics, decoder: PoseDecoder) -> nn.Module:
+        ends = NormalisationAndDecoding(network, statistics.input_mean, statistics.input_std, decoder)
+        return (with_place if network.shape.place else plain)(network, ends)
+
+    return make
 
 
 BIRNN = NetworkKind(
     PoseNetwork,
-    lambda network, *ends: BirnnArchive(network, _ends(network, *ends)),
+    _archive(BirnnArchive, BirnnPlaceArchive),
     "bidirectional LSTM; the pose of a frame is known once its {future} future frames have arrived "
     "({latency:.0f} ms); two layers with {hidden} units per direction",
     windowed=True,
     streamed=True,
     smoothed=True,
+    placed=True,
 )
 
 RNN = NetworkKind(
     PoseNetwork,
-    lambda network, *ends: RnnArchive(network, _ends(network, *ends)),
+    _archive(RnnArchive, RnnPlaceArchive),
     "unidirectional LSTM; the pose of a frame is known at once; two layers with {hidden} units per direction",
     smoothed=True,
+    placed=True,
 )

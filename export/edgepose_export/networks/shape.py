@@ -15,6 +15,7 @@ from edgepose.placements import BONES, PLACEMENTS, ROOT
 from edgepose.skeleton import PARENTS, PREDICTED, UNOBSERVED
 from edgepose_export.networks.kind import Network
 from edgepose_export.networks.normalisation import tilt_of
+from edgepose_export.synthesis.contacts import PLACE
 
 SIGMA_FLOOR = 0.02
 """Smallest standard deviation a network can predict, in normalised units.
@@ -41,6 +42,8 @@ class NetworkShape(NamedTuple):
             (`normalisation.tilt_of`). In the frame of the pelvis itself, a bone at rest moves whenever the
             pelvis shakes, and smoothing would not undo that. In the room's frame, the body would lag behind
             in every turn, which the inputs do not show. Needs "global-6d".
+        place: whether a recurrent network has a head for the place: contacts and velocity, see
+            `synthesis.contacts`.
     """
 
     kind: str = "birnn"
@@ -50,6 +53,7 @@ class NetworkShape(NamedTuple):
     normalisation: str = "root"
     acceleration: bool = True
     smoothing: float = 0.0
+    place: bool = False
 
     @property
     def inputs(self) -> int:
@@ -89,8 +93,10 @@ class PoseNetwork(Network):
         self.lstm2 = nn.LSTM(width, shape.hidden, batch_first=True, bidirectional=both)
         self.mean = nn.Linear(width, outputs)
         self.deviation = nn.Linear(width, outputs)
+        if shape.place:
+            self.place = nn.Linear(width, PLACE)
 
-    def forward(self, x: Tensor, future: int = 0) -> tuple[Tensor, Tensor]:
+    def forward(self, x: Tensor, future: int = 0) -> tuple[Tensor, ...]:
         """Return normalised means and standard deviations for z-scored inputs.
 
         Args:
@@ -99,7 +105,8 @@ class PoseNetwork(Network):
                 for whole sequences.
 
         Returns:
-            Both (B, T, outputs); in a stream (B, T - future, outputs), for the frames whose future is known.
+            Both (B, T, outputs), and with a head for the place its outputs (B, T, 10), logits and m/s. In a
+            stream T - future frames, those whose future is known.
         """
         x = torch.relu(self.dense(x))
         if future == 0:
@@ -107,7 +114,8 @@ class PoseNetwork(Network):
             x, _ = self.lstm2(x)
         else:
             x = self._streamed(x, future)
-        return self.mean(x), nn.functional.softplus(self.deviation(x)) + SIGMA_FLOOR
+        pose = self.mean(x), nn.functional.softplus(self.deviation(x)) + SIGMA_FLOOR
+        return (*pose, self.place(x)) if self.shape.place else pose
 
     def _streamed(self, x: Tensor, future: int) -> Tensor:
         """Return the outputs (B, T - future, 2 hidden) of the recurrent layers in a stream.

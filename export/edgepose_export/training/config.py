@@ -41,6 +41,7 @@ class TrainConfig:
         input_dropout: share of the inputs set to zero (DIP: 0.2).
         smoothness: jitter penalty: weight of the squared second differences in time of the pose error, in
             normalised units.
+        place_loss: weight of the loss of contacts and velocity, if the network has a head for them.
         learning_rate: learning rate of Adam.
         warm_up: steps over which the learning rate rises to its initial value.
         schedule: "exponential" (DIP: times 0.96 every 2000 steps) or "cosine" down to zero at the last step.
@@ -65,6 +66,7 @@ class TrainConfig:
     rests_share: float = 0.0
     input_dropout: float = 0.2
     smoothness: float = 0.0
+    place_loss: float = 0.0
     learning_rate: float = 1e-3
     warm_up: int = 200
     schedule: str = "exponential"
@@ -147,6 +149,12 @@ def config_from(values: dict[str, Any]) -> TrainConfig:
         raise ValueError(f"smoothing needs {_kinds('smoothed')}")
     if config.network.smoothing and config.network.targets != "global-6d":
         raise ValueError('smoothing needs targets = "global-6d"')
+    if config.network.place and not kind.placed:
+        raise ValueError(f"place needs {_kinds('placed')}")
+    if config.network.place and config.network.normalisation == "sequence":
+        raise ValueError('place needs another normalisation than "sequence"')
+    if config.network.place and not config.place_loss:
+        raise ValueError("place needs place_loss: without it, nothing trains the head")
     if config.streamed >= config.window:
         raise ValueError(
             f"streamed is {config.streamed}; it must be less than window, which is {config.window}"

@@ -34,6 +34,7 @@ from edgepose_export.training.config import TrainConfig, config_values
 from edgepose_export.training.dataset import RESTS, SEATED, Batch, PackedTakes, describe
 from edgepose_export.training.distributed import ALONE, Processes
 from edgepose_export.training.losses import likelihood_loss, smoothness_loss
+from edgepose_export.training.place import contact_weights, place_accuracy, place_counts, place_loss
 from edgepose_export.training.windows import sample_windows, window_starts, windows, windows_with_sitting
 
 __all__ = ["CHECKPOINT", "Trainer", "fit", "mean_of", "read_checkpoint", "save_checkpoint"]
@@ -134,6 +135,7 @@ class Trainer:
         if not any(processes.gathered(len(self._validation_starts()))):
             raise EdgeposeError(f"no validation take is as long as the window of {config.window} frames")
         self.statistics = self._placed(compute_statistics(train, config.network, processes))
+        self.contact_weights = contact_weights(train, processes).to(processes.device)
         self.network = new_network(config.network).to(processes.device)
         self.averaged = new_network(config.network).to(processes.device)
         self.averaged.load_state_dict(self.network.state_dict())
@@ -161,15 +163,22 @@ class Trainer:
         dropout: float = 0.0,
         smoothness: float = 0.0,
     ) -> Tensor:
+        pose, place = self._losses(network, batch, dropout, smoothness)
+        return pose + self.config.place_loss * place_loss(*place, self.contact_weights) if place else pose
+
+    def _losses(
+        self, network: nn.Module, batch: Batch, dropout: float = 0.0, smoothness: float = 0.0
+    ) -> tuple[Tensor, tuple[Tensor, Tensor] | None]:
+        """Return the loss of the pose; and outputs and targets of the head for the place, if there is one."""
         config, s = self.config, self.statistics
-        orientation, acceleration, relative, _ = (part.to(self.processes.device) for part in batch)
+        orientation, acceleration, relative, place = (part.to(self.processes.device) for part in batch)
         x = (network_inputs_of(orientation, acceleration, config.network) - s.input_mean) / s.input_std
         target = (pose_targets(relative, config.network) - s.target_mean) / s.target_std
         if config.acceleration_loss:
             target = torch.cat([target, x[..., -ACCELERATIONS:]], dim=-1)
         with torch.autocast(x.device.type, torch.bfloat16, enabled=config.bf16):
             seen = nn.functional.dropout(x, dropout, training=dropout > 0)
-            mean, deviation = network(seen, config.streamed) if config.streamed else network(seen)
+            mean, deviation, *head = network(seen, config.streamed) if config.streamed else network(seen)
         target = target[:, : mean.shape[1]]  # when streamed, the last frames have no pose yet
         numbers, pose = target.shape[-1], config.network.pose_outputs
         mean = mean[..., :numbers].float()
@@ -180,7 +189,7 @@ class Trainer:
         loss = likelihood_loss(mean, deviation[..., :numbers].float(), target, config.beta)
         if smoothness:
             loss = loss + smoothness * smoothness_loss(mean[..., :pose], target[..., :pose])
-        return loss
+        return loss, (head[0].float(), place[:, : mean.shape[1]]) if head else None
 
     def train_step(self) -> float:
         """Do one optimiser step and return its loss."""
@@ -247,14 +256,20 @@ class Trainer:
         return torch.cat(window_starts(self.validation_tape, window, False))[:: max(1, window // 2)]
 
     @torch.no_grad()
-    def validate(self) -> float:
-        """Return the likelihood loss of the averaged weights on undisturbed validation windows."""
-        starts, total = self._validation_starts(), torch.zeros(2)
+    def validate(self) -> dict[str, float]:
+        """Return measures of the averaged weights on undisturbed validation windows.
+
+        They are the likelihood loss of the pose, "validation", and if possible those of `place_accuracy`.
+        """
+        starts, total, counts = self._validation_starts(), torch.zeros(2), torch.zeros(6).double()
         for part in starts.split(128) if len(starts) else ():
             batch = windows(self.validation_tape, part, self.config.window)
-            total += torch.stack([self._loss(self.averaged, batch).cpu(), torch.tensor(1.0)]) * len(part)
+            loss, place = self._losses(self.averaged, batch)
+            total += torch.stack([loss.cpu(), torch.tensor(1.0)]) * len(part)
+            if place:
+                counts += place_counts(*place).cpu()
         loss, count = self.processes.total(total)
-        return float(loss / count)
+        return {"validation": float(loss / count), **place_accuracy(self.processes.total(counts))}
 
     def state(self) -> dict[str, Any]:
         """Return all that `load` needs, as tensors and plain values; all processes must call it together."""
@@ -302,12 +317,15 @@ class Trainer:
         Its training data and licences are added to the description of this run's takes.
 
         Raises:
-            EdgeposeError: the checkpoint is of another network; only `smoothing` may differ.
+            EdgeposeError: the checkpoint is of another network; only `smoothing` and `place` may differ. A
+                head that it lacks keeps its random weights.
         """
-        self._check_shape(state, smoothing=self.config.network.smoothing)
+        shape = self.config.network
+        self._check_shape(state, smoothing=shape.smoothing, place=shape.place)
         self.statistics = self._placed(Statistics(**state["statistics"]))
-        self.network.load_state_dict(state["averaged"])
-        self.averaged.load_state_dict(state["averaged"])
+        weights = {name: state["averaged"].get(name, own) for name, own in self.network.state_dict().items()}
+        self.network.load_state_dict(weights)
+        self.averaged.load_state_dict(weights)
         before = state["data"]
         self.data = {
             "summary": f"{before['summary']}, then {self.data['summary']}",
@@ -327,7 +345,7 @@ def fit(
     trainer: Trainer,
     folder: Path,
     on_step: Callable[[int, float], None],
-    on_validation: Callable[[int, float, float], None],
+    on_validation: Callable[[dict[str, float]], None],
 ) -> None:
     """Train until the config's last step, or until early stopping.
 
@@ -337,7 +355,7 @@ def fit(
         trainer: the run.
         folder: folder of these files.
         on_step: called with the step and its loss after each step.
-        on_validation: called with the step, the mean training loss and the validation loss.
+        on_validation: called with the line of the log: step, mean training loss, measures of `validate`.
 
     Raises:
         EdgeposeError: a loss is not finite, or a file cannot be written.
@@ -353,7 +371,8 @@ def fit(
         total, count = total + loss, count + 1
         on_step(trainer.step, loss)
         if trainer.step % config.validate_every == 0 or trainer.step == config.steps:
-            validation = trainer.validate()
+            measures = trainer.validate()
+            validation = measures["validation"]
             if not math.isfinite(validation):
                 raise EdgeposeError(
                     f"the validation loss is {validation} at step {trainer.step}; "
@@ -362,10 +381,10 @@ def fit(
             better = validation < trainer.best
             trainer.best, trainer.worse = (validation, 0) if better else (trainer.best, trainer.worse + 1)
             state = trainer.state()
+            line = {"step": trainer.step, "train": total / count, **measures}
             if trainer.processes.rank == 0:
-                line = {"step": trainer.step, "train": total / count, "validation": validation}
                 _write(state, better, line, folder)
-            on_validation(trainer.step, total / count, validation)
+            on_validation(line)
             total, count = 0.0, 0
             if config.patience and trainer.worse >= config.patience:
                 return
