@@ -24,7 +24,9 @@ class Motion(NamedTuple):
     rate: float
     """Frames per second."""
     source: str
-    """Origin: "cmu", "bandai-namco" or "amass"."""
+    """Origin: "cmu", "bandai-namco", "bvh" for other BVH files, or "amass"."""
+    leg_length: float = 0.0
+    """Length of thigh and shank of the source's body, mean of both sides, metres; 0 if unknown."""
 
 
 def resample(motion: Motion, rate: float = 60.0) -> Motion:
@@ -42,7 +44,7 @@ def resample(motion: Motion, rate: float = 60.0) -> Motion:
     quats = CubicSpline(times, quat_continuous(matrix_to_quat(motion.rotations)))(wanted)
     quats /= np.linalg.norm(quats, axis=-1, keepdims=True)
     translation = CubicSpline(times, motion.translation)(wanted)
-    return Motion(quat_to_matrix(quats), translation, float(rate), motion.source)
+    return motion._replace(rotations=quat_to_matrix(quats), translation=translation, rate=float(rate))
 
 
 FASTEST_TURN = 60.0
