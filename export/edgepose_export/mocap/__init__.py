@@ -7,12 +7,13 @@ from pathlib import Path
 from edgepose.errors import EdgeposeError
 
 from .amass import read_amass
-from .any_bvh import read_motion_bvh
-from .cmu_amc import read_motion_amc
+from .any_bvh import read_any_bvh
+from .cmu_amc import read_cmu_amc
 from .mapping import Mapping
-from .motion import Motion, pieces, resample
+from .motion import Motion, fault, pieces, resample, scaled_to
+from .retargeting import Source, retarget
 
-__all__ = ["Mapping", "Motion", "pieces", "read_motion", "resample"]
+__all__ = ["Mapping", "Motion", "fault", "pieces", "read_motion", "read_source", "resample", "scaled_to"]
 
 
 def read_motion(path: str | Path, t_pose: str | Path | None = None, mapping: Mapping | None = None) -> Motion:
@@ -27,11 +28,17 @@ def read_motion(path: str | Path, t_pose: str | Path | None = None, mapping: Map
         EdgeposeError: the file is of another kind, has a skeleton that is not understood, or is broken.
     """
     path = Path(path)
-    kind = path.suffix.lower()
-    if kind == ".npz":
+    if path.suffix.lower() == ".npz":
         return read_amass(path)
+    return retarget(read_source(path, t_pose, mapping))
+
+
+def read_source(path: str | Path, t_pose: str | Path | None = None, mapping: Mapping | None = None) -> Source:
+    """Read the motion in a BVH or AMC file on its own skeleton; see `read_motion`."""
+    path = Path(path)
+    kind = path.suffix.lower()
     if kind == ".amc":
-        return read_motion_amc(path)
+        return read_cmu_amc(path)
     if kind == ".bvh":
-        return read_motion_bvh(path, None if t_pose is None else Path(t_pose), mapping)
+        return read_any_bvh(path, None if t_pose is None else Path(t_pose), mapping)
     raise EdgeposeError(f"{path}: motion is read from .npz, .amc and .bvh files")

@@ -13,10 +13,9 @@ from edgepose.formats.joint_tree import JointTree, forward
 
 from .known_t_poses import is_bandai, is_cmu
 from .mapping import Mapping
-from .motion import Motion
 from .rest_pose import RestPose, body_up, nearest_axis, to_y_up
 from .rest_search import find_rest
-from .retargeting import retarget
+from .retargeting import Source
 from .skeleton_roles import Roles, find_roles
 from .skeleton_size import metres
 
@@ -33,8 +32,8 @@ _UPRIGHT = 0.9
 _TRAVEL_LEGS, _FLOOR_LEGS = 0.7, 0.35
 
 
-def read_motion_bvh(path: Path, t_pose: Path | None = None, mapping: Mapping | None = None) -> Motion:
-    """Read the motion in a BVH file of a person, retargeted to SMPL.
+def read_any_bvh(path: Path, t_pose: Path | None = None, mapping: Mapping | None = None) -> Source:
+    """Read the motion in a BVH file of a person.
 
     Args:
         path: the file.
@@ -46,12 +45,12 @@ def read_motion_bvh(path: Path, t_pose: Path | None = None, mapping: Mapping | N
     """
     tree = read_bvh(path)
     try:
-        return _motion(path, tree, t_pose, mapping or Mapping())
+        return _source(path, tree, t_pose, mapping or Mapping())
     except EdgeposeError as error:
         raise EdgeposeError(f"{path}: {error}") from None
 
 
-def _motion(path: Path, tree: JointTree, t_pose: Path | None, mapping: Mapping) -> Motion:
+def _source(path: Path, tree: JointTree, t_pose: Path | None, mapping: Mapping) -> Source:
     if not RATES_HZ[0] <= tree.rate <= RATES_HZ[1]:
         raise EdgeposeError(
             f"a frame rate of {tree.rate:.3g} Hz is not that of motion capture; correct 'Frame Time'"
@@ -64,10 +63,10 @@ def _motion(path: Path, tree: JointTree, t_pose: Path | None, mapping: Mapping) 
     tree = tree._replace(rotations=tree.rotations[start:], positions=tree.positions[start:])
     metre = metres(rest, roles, mapping.unit)
     up = _motion_up(tree, roles, rest) if mapping.up is None else mapping.up
-    return retarget(tree, roles, rest, metre, _source(tree.names), up)
+    return Source(tree, roles, rest, up, metre, _origin(tree.names))
 
 
-def _source(names: tuple[str, ...]) -> str:
+def _origin(names: tuple[str, ...]) -> str:
     if is_cmu(names):
         return "cmu"
     return "bandai-namco" if is_bandai(names) else "bvh"
@@ -123,6 +122,8 @@ def _motion_up(tree: JointTree, roles: Roles, rest: RestPose) -> Array:
     every = max(1, len(tree.rotations) // 200)
     sample = tree._replace(rotations=tree.rotations[::every], positions=tree.positions[::every])
     positions = forward(sample)[1]
+    if np.ptp(positions, axis=0).max() == 0.0:
+        return rest.up  # no motion
     mean = body_up(positions, roles).mean(axis=0)
     axis = nearest_axis(mean)
     if axis @ rest.up > 0.5 or mean @ axis < _UPRIGHT:

@@ -8,13 +8,12 @@ from edgepose.errors import EdgeposeError
 
 from .amc import read_amc
 from .known_t_poses import cmu_t_pose, is_cmu
-from .motion import Motion
 from .rest_pose import limb_directions, near_rest, standing
-from .retargeting import retarget
+from .retargeting import Source
 from .skeleton_roles import find_roles
 
 
-def read_motion_amc(path: Path) -> Motion:
+def read_cmu_amc(path: Path) -> Source:
     """Read the motion in an AMC file of CMU's; it agrees with that of the same take in BVH.
 
     Raises:
@@ -30,4 +29,4 @@ def read_motion_amc(path: Path) -> Motion:
         raise EdgeposeError(f"{path}: {error}") from None
     if not near_rest(limb_directions(rest, roles)):
         raise EdgeposeError(f"{path}: the limbs of the skeleton do not lie as in CMU's skeletons")
-    return retarget(tree, roles, rest, 1.0, "cmu")
+    return Source(tree, roles, rest, rest.up, 1.0, "cmu")

@@ -18,6 +18,7 @@ some the hand. So the rotation of the hand about the forearm's axis is added to 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,21 +45,27 @@ _SPINE_SHARES = (0.37, 0.55)
 """Middles of SMPL's two lower spine bones, as shares of the way from pelvis to neck."""
 
 
-def retarget(
-    tree: JointTree, roles: Roles, rest: RestPose, metre: float, source: str, up: Array | None = None
-) -> Motion:
-    """Transfer a motion to SMPL's joints.
+class Source(NamedTuple):
+    """Motion of a skeleton that is understood."""
 
-    Args:
-        tree: the motion.
-        roles: joints of its skeleton.
-        rest: its T-pose.
-        metre: metres in one unit of length.
-        source: origin of the motion, see `Motion`.
-        up: (3,) axis of the motion's world that points up; None takes that of the T-pose.
-    """
+    tree: JointTree
+    """The motion."""
+    roles: Roles
+    rest: RestPose
+    """The T-pose."""
+    up: Array
+    """(3,) axis of the motion's world that points up."""
+    metre: float
+    """Metres in one unit of length."""
+    name: str
+    """Origin, see `Motion`."""
+
+
+def retarget(source: Source) -> Motion:
+    """Transfer a motion to SMPL's joints."""
+    tree, roles, rest, up, metre, name = source
     rotations, positions = forward(tree)
-    axes = to_y_up(rest.up if up is None else up)
+    axes = to_y_up(up)
 
     def since_rest(joint: int) -> Array:
         return np.asarray(axes @ rotations[:, joint] @ transpose(rest.rotations[joint]))
@@ -79,7 +86,7 @@ def retarget(
         to_smpl(picked, np.tile(np.eye(3), (24, 1, 1)), ends),
         metre * positions[:, roles.pelvis] @ axes.T,
         tree.rate,
-        source,
+        name,
         metre * leg_length(rest, roles),
     )
 
