@@ -104,6 +104,14 @@ class Body(NamedTuple):
     height_m: float
     """Stature, crown to sole, metres."""
 
+    @property
+    def leg_length_m(self) -> float:
+        """Length of thigh and shank, mean of both sides, metres."""
+        knees_and_ankles = [
+            JOINTS.index(f"{side}_{j}") for side in ("left", "right") for j in ("knee", "ankle")
+        ]
+        return float(np.linalg.norm(self.offsets[knees_and_ankles], axis=1).sum() / 2.0)
+
 
 @cache
 def _table() -> dict[str, Any]:

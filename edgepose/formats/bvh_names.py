@@ -93,5 +93,10 @@ def missing_joints(names: Iterable[str]) -> list[str]:
     return [name for name in JOINTS[:_BODY] if name not in there]
 
 
+def without_namespace(name: str) -> str:
+    """Return a joint's name without a namespace such as `mixamorig:`."""
+    return _PREFIX.sub("", name)
+
+
 def _plain(name: str) -> str:
-    return _PREFIX.sub("", name).lower()
+    return without_namespace(name).lower()

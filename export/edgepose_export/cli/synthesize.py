@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
@@ -17,6 +17,9 @@ from edgepose.errors import EdgeposeError
 from edgepose.skeleton import Body
 from edgepose.utils.durable_files import replace_file
 from edgepose.utils.output_targets import check_free
+
+if TYPE_CHECKING:
+    from edgepose_export.mocap import Mapping, Motion
 
 KINDS = (".bvh", ".amc", ".npz")
 
@@ -28,6 +31,7 @@ LICENSES = {
     "bandai-namco": "Bandai-Namco Research Motiondataset, CC BY-NC 4.0",
     "amass": "the licence of the AMASS subset",
 }
+UNKNOWN_LICENSE = "unknown"
 
 
 class Job(NamedTuple):
@@ -42,15 +46,16 @@ class Job(NamedTuple):
     seated_seed: int | None
     rests_seed: int | None
     overwrite: bool
+    t_pose: Path | None = None
+    mapping: Mapping | None = None
 
 
 @click.command(short_help="Make recordings from motion capture.")
 @click.argument("inputs", nargs=-1, required=True, type=click.Path(path_type=Path, exists=True))
 @click.option(
     "--out",
-    required=True,
     type=click.Path(path_type=Path, file_okay=False),
-    help="Folder for the recordings (.npz).",
+    help="Folder for the recordings (.npz); needed unless there is --check.",
 )
 @click.option(
     "--rate", type=click.FloatRange(1, 1000), default=60.0, show_default=True, help="Samples per second."
@@ -96,13 +101,33 @@ class Job(NamedTuple):
     help="Let the wearer slow down, rest and go on, forwards or backwards, at random, drawn with this seed; "
     "mostly where the body is low; about half a minute per take.",
 )
+@click.option(
+    "--t-pose",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="BVH file of the same skeleton with a T-pose in it, for files whose zero pose is none.  [default: "
+    "t_pose*.bvh beside, frame 0 or the zero pose]",
+)
+@click.option(
+    "--mapping",
+    "mapping_path",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="TOML file that says which joint is which where a skeleton is not understood: lines such as "
+    'left_thigh = "Bone12"; also unit = "cm", up = "z".',
+)
+@click.option(
+    "--check",
+    "picture",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="PICTURE",
+    help="Draw a take of each skeleton beside the body that follows it (.png, .pdf, .svg), to look at.",
+)
 @overwrite_option
 @click.option(
     "--jobs", type=click.IntRange(1), default=1, show_default=True, help="Files to process in parallel."
 )
 def synthesize(
     inputs: tuple[Path, ...],
-    out: Path,
+    out: Path | None,
     rate: float,
     height: float | None,
     body_path: Path | None,
@@ -110,6 +135,9 @@ def synthesize(
     mounting_seed: int | None,
     seated_seed: int | None,
     rests_seed: int | None,
+    t_pose: Path | None,
+    mapping_path: Path | None,
+    picture: Path | None,
     overwrite: bool,
     jobs: int,
 ) -> None:
@@ -124,11 +152,14 @@ def synthesize(
       edgepose synthesize walk.bvh --out . --hold 6 --mounting 1 --rate 100
       edgepose synthesize mocap/ --out recordings/seated --seated 1
       edgepose synthesize mocap/ --out recordings/rests --rests 1
+      edgepose synthesize mocap/ --check skeletons.png
     """
     from edgepose.formats.smpl_model import read_smpl
     from edgepose.skeleton import default_body
-    from edgepose_export.cli.progress import progress
+    from edgepose_export.mocap.mapping import read_mapping
 
+    if out is None and picture is None:
+        raise click.UsageError("Missing option '--out', the folder for the recordings.")
     if hold * rate > MOST_HOLD_FRAMES:
         raise click.UsageError(
             f"--hold {hold:g} at --rate {rate:g} takes too much memory: at most {MOST_HOLD_FRAMES} samples"
@@ -141,10 +172,28 @@ def synthesize(
     files = [(root, path) for root in inputs for path in motion_files(root)]
     if not files:
         raise EdgeposeError(f"no motion files ({', '.join(KINDS)}) in {', '.join(map(str, inputs))}")
-    flags = (rate, body, hold, mounting_seed, seated_seed, rests_seed, overwrite)
+    mapping = read_mapping(mapping_path) if mapping_path else None
+    if picture:
+        from edgepose_export.cli.skeleton_check import draw_skeletons
+
+        draw_skeletons(files, picture, body, t_pose=t_pose, mapping=mapping, overwrite=overwrite)
+    if out is None:
+        return
+    flags = (rate, body, hold, mounting_seed, seated_seed, rests_seed, overwrite, t_pose, mapping)
     tasks = [(path, Job(out, root if root.is_dir() else root.parent, *flags)) for root, path in files]
     _check_targets(tasks, overwrite)
-    failed = []
+    _convert_all(tasks, jobs)
+
+
+def _convert_all(tasks: list[tuple[Path, Job]], jobs: int) -> None:
+    """Convert files in parallel, and report those that cannot be converted.
+
+    Raises:
+        EdgeposeError: a file could not be converted.
+    """
+    from edgepose_export.cli.progress import progress
+
+    failed = 0
     with ExitStack() as stack:
         if jobs == 1:
             results = [partial(convert, *task) for task in tasks]
@@ -152,16 +201,14 @@ def synthesize(
             # Spawned, because a forked copy of a process with threads may hang.
             pool = stack.enter_context(ProcessPoolExecutor(jobs, mp_context=get_context("spawn")))
             results = [pool.submit(convert, *task).result for task in tasks]
-        for result, (_, path) in progress(list(zip(results, files, strict=True)), "synthesizing"):
+        for result in progress(results, "synthesizing"):
             problem = result()
             if problem:
-                failed.append(path)
+                failed += 1
                 say(f"skipped: {problem}")
-    say(f"{len(files) - len(failed)} of {len(files)} recordings written to {out}")
+    say(f"{len(tasks) - failed} of {len(tasks)} recordings written to {tasks[0][1].out}")
     if failed:
-        raise EdgeposeError(
-            f"{len(failed)} of {len(files)} files could not be converted; see the messages above"
-        )
+        raise EdgeposeError(f"{failed} of {len(tasks)} files could not be converted; see the messages above")
 
 
 def _check_targets(tasks: list[tuple[Path, Job]], overwrite: bool) -> None:
@@ -195,20 +242,21 @@ def _target(path: Path, job: Job, part: str) -> Path:
 
 
 def motion_files(root: Path) -> list[Path]:
-    """Return the motion files below a folder, or the file itself."""
+    """Return the motion files below a folder, or the file itself; T-poses of others are no motion."""
+    from edgepose_export.mocap.rest_search import is_t_pose_file
+
     if root.is_file():
         return [root]
-    return sorted(path for path in root.rglob("*") if path.suffix.lower() in KINDS)
+    return sorted(
+        path for path in root.rglob("*") if path.suffix.lower() in KINDS and not is_t_pose_file(path)
+    )
 
 
 def convert(path: Path, job: Job) -> str | None:
     """Convert one file, cut into parts where the source jumps; return what was wrong with it, or None."""
     import numpy as np
 
-    from edgepose_export.mocap import pieces, read_motion, resample
-    from edgepose_export.synthesis.floor import SHARE, on_the_floor
-    from edgepose_export.synthesis.rests import with_rests
-    from edgepose_export.synthesis.sitting import seated
+    from edgepose_export.mocap import fault, pieces, read_motion, resample, scaled_to
     from edgepose_export.synthesis.virtual_imus import (
         random_mounting,
         recording_arrays,
@@ -218,26 +266,23 @@ def convert(path: Path, job: Job) -> str | None:
 
     try:
         mounting = None if job.mounting_seed is None else random_mounting(job.mounting_seed)
-        takes = pieces(read_motion(path))
+        whole = read_motion(path, job.t_pose, job.mapping)
+        problem = fault(whole, job.rate)
+        if problem:
+            return f"{path}: {problem}"
+        takes = pieces(whole)
         if not takes:
             return f"{path}: no part between two jumps is as long as a second"
         for i, take in enumerate(takes):
-            motion = resample(take, job.rate)
-            if job.seated_seed is not None:
-                # Seeded by name, so that a take does not depend on the others in the call.
-                seed = [job.seated_seed, i, *path.stem.encode()]
-                make = on_the_floor if np.random.default_rng([1, *seed]).random() < SHARE else seated
-                motion = make(motion, job.body, np.random.default_rng(seed))
-            if job.rests_seed is not None:
-                rng = np.random.default_rng([job.rests_seed, i, *path.stem.encode()])
-                motion = with_rests(motion, job.body, rng)
+            motion = resample(scaled_to(take, job.body.leg_length_m), job.rate)
+            motion = _with_made_parts(motion, job, [i, *path.stem.encode()])
             if job.hold_s:
                 motion = with_hold(motion, job.hold_s)
             imus = virtual_imus(motion, job.body, mounting)
             part = f".part{i + 1}" if len(takes) > 1 else ""
             target = _target(path, job, part)
             target.parent.mkdir(parents=True, exist_ok=True)
-            arrays = recording_arrays(motion, imus, LICENSES[motion.source])
+            arrays = recording_arrays(motion, imus, LICENSES.get(motion.source, UNKNOWN_LICENSE))
             replace_file(
                 target,
                 lambda file, arrays=arrays: np.savez(file, **arrays),
@@ -249,3 +294,24 @@ def convert(path: Path, job: Job) -> str | None:
     except OSError as error:
         return f"{path}: {error}"
     return None
+
+
+def _with_made_parts(motion: Motion, job: Job, key: list[int]) -> Motion:
+    """Return a motion with synthetic sitting or rests if the job asks for them.
+
+    The key, numbers made of the take's name, is part of the seed, so that a take does not depend on the
+    others in the call.
+    """
+    import numpy as np
+
+    from edgepose_export.synthesis.floor import SHARE, on_the_floor
+    from edgepose_export.synthesis.rests import with_rests
+    from edgepose_export.synthesis.sitting import seated
+
+    if job.seated_seed is not None:
+        seed = [job.seated_seed, *key]
+        make = on_the_floor if np.random.default_rng([1, *seed]).random() < SHARE else seated
+        return make(motion, job.body, np.random.default_rng(seed))
+    if job.rests_seed is not None:
+        return with_rests(motion, job.body, np.random.default_rng([job.rests_seed, *key]))
+    return motion

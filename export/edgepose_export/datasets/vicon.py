@@ -28,7 +28,8 @@ from numpy.typing import NDArray
 from edgepose import rotations as rot
 from edgepose.errors import EdgeposeError
 from edgepose.formats.joint_tree import fail, numbers
-from edgepose_export.mocap.retargeting import near_rest, to_smpl
+from edgepose_export.mocap.rest_pose import near_rest
+from edgepose_export.mocap.retargeting import to_smpl
 
 Array = NDArray[np.float64]
 

@@ -5,39 +5,40 @@ from __future__ import annotations
 from pathlib import Path
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.bvh import read_bvh
 
 from .amass import read_amass
-from .amc import read_amc
-from .motion import Motion, pieces, resample
-from .retargeting import BANDAI, CMU_AMC, CMU_BVH, from_bandai, from_cmu_amc, from_cmu_bvh, has_names
+from .any_bvh import read_any_bvh
+from .cmu_amc import read_cmu_amc
+from .mapping import Mapping
+from .motion import Motion, fault, pieces, resample, scaled_to
+from .retargeting import Source, retarget
 
-__all__ = ["Motion", "pieces", "read_motion", "resample"]
+__all__ = ["Mapping", "Motion", "fault", "pieces", "read_motion", "read_source", "resample", "scaled_to"]
 
 
-def read_motion(path: str | Path) -> Motion:
+def read_motion(path: str | Path, t_pose: str | Path | None = None, mapping: Mapping | None = None) -> Motion:
     """Read the motion in a file, retargeted to SMPL.
 
-    .npz is AMASS, .amc is CMU (with its .asf beside it), .bvh is CMU in cgspeed's conversion or Bandai-Namco.
+    Args:
+        path: .npz is AMASS, .amc is CMU (with its .asf beside it), .bvh is of anyone.
+        t_pose: for BVH: a file of the same skeleton with a T-pose in it; None searches, see `find_rest`.
+        mapping: for BVH: joints, unit and up axis where they are not understood.
 
     Raises:
-        EdgeposeError: the file is of another kind, has an unknown skeleton, or is broken.
+        EdgeposeError: the file is of another kind, has a skeleton that is not understood, or is broken.
     """
     path = Path(path)
-    kind = path.suffix.lower()
-    if kind == ".npz":
+    if path.suffix.lower() == ".npz":
         return read_amass(path)
+    return retarget(read_source(path, t_pose, mapping))
+
+
+def read_source(path: str | Path, t_pose: str | Path | None = None, mapping: Mapping | None = None) -> Source:
+    """Read the motion in a BVH or AMC file on its own skeleton; see `read_motion`."""
+    path = Path(path)
+    kind = path.suffix.lower()
     if kind == ".amc":
-        recording = read_amc(path)
-        if has_names(CMU_AMC, recording):
-            return from_cmu_amc(recording, path)
-    elif kind == ".bvh":
-        recording = read_bvh(path)
-        if has_names(CMU_BVH, recording):
-            return from_cmu_bvh(recording, path)
-        if has_names(BANDAI, recording):
-            # Both datasets share one skeleton; the zero of the collars differs, which only the name reveals.
-            return from_bandai(recording, path, collars_back=not path.name.startswith("dataset-1_"))
-    else:
-        raise EdgeposeError(f"{path}: motion is read from .npz, .amc and .bvh files")
-    raise EdgeposeError(f"{path}: unknown skeleton; only those of CMU and Bandai-Namco are supported")
+        return read_cmu_amc(path)
+    if kind == ".bvh":
+        return read_any_bvh(path, None if t_pose is None else Path(t_pose), mapping)
+    raise EdgeposeError(f"{path}: motion is read from .npz, .amc and .bvh files")

@@ -24,7 +24,9 @@ class Motion(NamedTuple):
     rate: float
     """Frames per second."""
     source: str
-    """Origin: "cmu", "bandai-namco" or "amass"."""
+    """Origin: "cmu", "bandai-namco", "bvh" for other BVH files, or "amass"."""
+    leg_length: float = 0.0
+    """Length of thigh and shank of the source's body, mean of both sides, metres; 0 if unknown."""
 
 
 def resample(motion: Motion, rate: float = 60.0) -> Motion:
@@ -37,12 +39,50 @@ def resample(motion: Motion, rate: float = 60.0) -> Motion:
     if rate == motion.rate or frames < 2:
         return motion._replace(rate=float(rate))
     times = np.arange(frames) / motion.rate
-    wanted = np.arange(int((frames - 1) * rate / motion.rate + 1e-6) + 1) / rate
+    wanted = np.arange(_frames_at(rate, motion)) / rate
     wanted = np.minimum(wanted, times[-1])
     quats = CubicSpline(times, quat_continuous(matrix_to_quat(motion.rotations)))(wanted)
     quats /= np.linalg.norm(quats, axis=-1, keepdims=True)
     translation = CubicSpline(times, motion.translation)(wanted)
-    return Motion(quat_to_matrix(quats), translation, float(rate), motion.source)
+    return motion._replace(rotations=quat_to_matrix(quats), translation=translation, rate=float(rate))
+
+
+def _frames_at(rate: float, motion: Motion) -> int:
+    return int((len(motion.rotations) - 1) * rate / motion.rate + 1e-6) + 1
+
+
+_STILL_RAD, _STILL_M = 2e-3, 1e-3
+_MOST_FOLDED_RAD = 2.4
+"""A spine does not bend by more; joints of a take that is more folded have been mixed up."""
+_FEWEST_FRAMES = 3
+"""Accelerations are second differences."""
+
+
+def fault(motion: Motion, rate: float = 60.0) -> str | None:
+    """Return why a motion is of no use at a rate, Hz; None if it is of use."""
+    frames = len(motion.rotations)
+    if frames < 2 or _frames_at(rate, motion) < _FEWEST_FRAMES:
+        return f"too short: {frames} frame{'s' * (frames != 1)} at {motion.rate:g} Hz"
+    folded = np.median(geodesic_angle(motion.rotations[:, 0], motion.rotations[:, 9]))
+    if folded > _MOST_FOLDED_RAD:
+        return f"no posture of a body: pelvis and chest are {np.degrees(folded):.0f} deg apart"
+    turned = geodesic_angle(motion.rotations, motion.rotations[0]).max()
+    if turned < _STILL_RAD and np.ptp(motion.translation, axis=0).max() < _STILL_M:
+        return f"no motion: all {frames} frames are the same"
+    return None
+
+
+def scaled_to(motion: Motion, leg_length: float) -> Motion:
+    """Return a motion for a body with other legs, so that its feet do not slide.
+
+    Args:
+        motion: the motion; unchanged if the length of its own legs is unknown.
+        leg_length: length of thigh and shank, metres.
+    """
+    if not motion.leg_length:
+        return motion
+    scale = leg_length / motion.leg_length
+    return motion._replace(translation=scale * motion.translation, leg_length=leg_length)
 
 
 FASTEST_TURN = 60.0

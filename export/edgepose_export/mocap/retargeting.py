@@ -9,235 +9,136 @@ bone thus points in the source's direction instead of its rest direction (the ar
 8 deg), and both point the same way in every pose. All other bones (trunk, neck, head, collars, feet) are the
 identity in the source's T-pose, because a wearer's trunk is calibrated to the identity when they stand
 straight, whatever the slope of the line between two vertebrae.
+
+A sensor near the wrist measures the rotation of a forearm about its own axis, wherever a source has it: CMU's
+forearms do not rotate about their axis, the next joint does; some of Bandai-Namco's takes rotate the forearm,
+some the hand. So the rotation of the hand about the forearm's axis is added to the forearm's.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edgepose.errors import EdgeposeError
 from edgepose.formats.joint_tree import JointTree, forward
 from edgepose.rotations import (
     matrix_to_quat,
     minimal_rotation,
     quat_to_matrix,
-    rotation_about_axis,
+    slerp,
     transpose,
 )
 
 from .motion import Motion
+from .rest_pose import REST_DIRECTIONS, RestPose, limb_directions, to_y_up
+from .skeleton_roles import Roles, Side
+from .skeleton_size import leg_length
 
 Array = NDArray[np.float64]
 
-LIMBS = {1: "-y", 2: "-y", 4: "-y", 5: "-y", 16: "+x", 17: "-x", 18: "+x", 19: "-x"}
-"""Direction of each limb bone in SMPL's zero pose, without the slight tilts of the template."""
-
-_DIRECTIONS = {"+x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0), "-y": (0.0, -1.0, 0.0)}
 _FOREARM_OF = {20: 18, 21: 19, 22: 18, 23: 19}  # wrists and hands stay at rest against the forearms
 
-CMU_METRES = 0.0254 / 0.45
-"""CMU lengths are inches times 0.45, and the BVH conversion kept them."""
-BANDAI_METRES = 0.01
+_SPINE_SHARES = (0.37, 0.55)
+"""Middles of SMPL's two lower spine bones, as shares of the way from pelvis to neck."""
 
 
-class Names(NamedTuple):
-    """Names of a source's joints by their role."""
+class Source(NamedTuple):
+    """Motion of a skeleton that is understood."""
 
-    joints: tuple[str, ...]
-    """(24) the source joint that gives each SMPL joint its rotation."""
-    bones: dict[int, tuple[str, str]]
-    """Source joints at both ends of each limb (key of `LIMBS`)."""
-
-
-def _names(trunk: str, left: str, right: str) -> Names:
-    """Build `Names` from the trunk (pelvis, three spines, neck, head) and both sides.
-
-    A side lists thigh, shank, foot, toes, collar, upper arm, the joint that rotates with the forearm's far
-    end, forearm, hand.
-    """
-    pelvis, spine1, spine2, spine3, neck, head = trunk.split()
-    sides = (left.split(), right.split())
-    joints = [""] * 24
-    for joint, name in zip((0, 3, 6, 9, 12, 15), (pelvis, spine1, spine2, spine3, neck, head), strict=True):
-        joints[joint] = name
-    bones: dict[int, tuple[str, str]] = {}
-    for side, (thigh, shank, foot, toes, collar, arm, twisting, forearm, hand) in enumerate(sides):
-        for joint, name in zip(
-            (1, 4, 7, 10, 13, 16, 18), (thigh, shank, foot, toes, collar, arm, twisting), strict=True
-        ):
-            joints[joint + side] = name
-        bones |= {
-            1 + side: (thigh, shank),
-            4 + side: (shank, foot),
-            16 + side: (arm, forearm),
-            18 + side: (forearm, hand),
-        }
-    for joint, forearm_joint in _FOREARM_OF.items():
-        joints[joint] = joints[forearm_joint]
-    return Names(tuple(joints), bones)
+    tree: JointTree
+    """The motion."""
+    roles: Roles
+    rest: RestPose
+    """The T-pose."""
+    up: Array
+    """(3,) axis of the motion's world that points up."""
+    metre: float
+    """Metres in one unit of length."""
+    name: str
+    """Origin, see `Motion`."""
 
 
-# CMU's forearms do not rotate about their axis: the next joint (wrist) does, and does nothing else. A sensor
-# near the wrist measures that rotation.
-CMU_BVH = _names(
-    "Hips LowerBack Spine Spine1 Neck Head",
-    "LeftUpLeg LeftLeg LeftFoot LeftToeBase LeftShoulder LeftArm LeftHand LeftForeArm LeftHand",
-    "RightUpLeg RightLeg RightFoot RightToeBase RightShoulder RightArm RightHand RightForeArm RightHand",
-)
-CMU_AMC = _names(
-    "root lowerback upperback thorax lowerneck head",
-    "lfemur ltibia lfoot ltoes lclavicle lhumerus lwrist lradius lwrist",
-    "rfemur rtibia rfoot rtoes rclavicle rhumerus rwrist rradius rwrist",
-)
-BANDAI = _names(
-    "Hips Spine Chest Chest Neck Head",
-    "UpperLeg_L LowerLeg_L Foot_L Toes_L Shoulder_L UpperArm_L LowerArm_L LowerArm_L Hand_L",
-    "UpperLeg_R LowerLeg_R Foot_R Toes_R Shoulder_R UpperArm_R LowerArm_R LowerArm_R Hand_R",
-)
+def retarget(source: Source) -> Motion:
+    """Transfer a motion to SMPL's joints."""
+    tree, roles, rest, up, metre, name = source
+    rotations, positions = forward(tree)
+    axes = to_y_up(up)
 
-# Angles of the T-pose in frame 0 of the BVH conversion, degrees; the AMC files have no T-pose.
-_CMU_T_POSE = {
-    "lfemur": ("z", -21.0),
-    "rfemur": ("z", 21.0),
-    "lowerneck": ("x", -16.0),
-    "upperneck": ("x", 21.0),
-    "head": ("x", 11.0),
-    "lhumerus": ("z", -8.0),
-    "rhumerus": ("z", 8.0),
-}
+    def since_rest(joint: int) -> Array:
+        return np.asarray(axes @ rotations[:, joint] @ transpose(rest.rotations[joint]))
 
-
-def from_cmu_bvh(recording: JointTree, path: object) -> Motion:
-    """Retarget a CMU file in cgspeed's conversion: frame 0 is the T-pose, the motion starts after it.
-
-    In two takes (07_12, 09_10) frames that are all zero follow the T-pose; these are left out, too.
-
-    Raises:
-        EdgeposeError: frame 0 is no T-pose, or no frame follows it; the message names `path`.
-    """
-    filled = (recording.rotations != np.eye(3)).any(axis=(1, 2, 3)) | recording.positions[:, 0].any(axis=1)
-    filled[0] = False
-    if not filled.any():
-        raise EdgeposeError(f"{path}: contains only the T-pose of frame 0, no motion")
-    start = int(np.argmax(filled))
-    rotations, positions = forward(recording)
-    ends = _bone_directions(CMU_BVH, recording.names, positions[0])
-    if not near_rest(ends):
-        raise EdgeposeError(f"{path}: frame 0 is not the T-pose, with which CMU's BVH files start")
-    picked = rotations[:, _indices(CMU_BVH, recording.names)]
+    ends = limb_directions(rest, roles)
+    picked = np.empty((len(rotations), 24, 3, 3))
+    picked[:, 0] = since_rest(roles.pelvis)
+    spine = [since_rest(joint) for joint in roles.spine]
+    picked[:, 9] = spine[-1]
+    picked[:, 3], picked[:, 6] = _lower_spine(spine, _spine_middles(rest, roles))
+    picked[:, 15] = since_rest(roles.head)
+    picked[:, 12] = _between(spine[-1], picked[:, 15], 0.5) if roles.neck is None else since_rest(roles.neck)
+    for side, joints in enumerate((roles.left, roles.right)):
+        _fill_side(picked, side, joints, since_rest, ends[18 + side])
+    for joint, forearm in _FOREARM_OF.items():
+        picked[:, joint] = picked[:, forearm]
     return Motion(
-        to_smpl(picked[start:], picked[0], ends),
-        positions[start:, recording.names.index(CMU_BVH.joints[0])] * CMU_METRES,
-        recording.rate,
-        "cmu",
+        to_smpl(picked, np.tile(np.eye(3), (24, 1, 1)), ends),
+        metre * positions[:, roles.pelvis] @ axes.T,
+        tree.rate,
+        name,
+        metre * leg_length(rest, roles),
     )
 
 
-def from_cmu_amc(recording: JointTree, path: object) -> Motion:
-    """Retarget a CMU file in ASF/AMC; the result agrees with `from_cmu_bvh` of the same take.
-
-    Raises:
-        EdgeposeError: the skeleton is not like CMU's; the message names `path`.
-    """
-    local = np.broadcast_to(np.eye(3), (1, len(recording.names), 3, 3)).copy()
-    for name, (axis, angle) in _CMU_T_POSE.items():
-        if name not in recording.names:
-            raise EdgeposeError(f"{path}: the skeleton has no {name}, so it is not one of CMU's")
-        local[0, recording.names.index(name)] = rotation_about_axis(axis, np.radians(angle))
-    pose = recording._replace(rotations=local, positions=recording.offsets[None])
-    t_pose, t_positions = forward(pose)
-    indices = _indices(CMU_AMC, recording.names)
-    rotations, positions = forward(recording)
-    ends = _bone_directions(CMU_AMC, recording.names, t_positions[0])
-    if not near_rest(ends):
-        raise EdgeposeError(f"{path}: the limbs of the skeleton do not lie as in CMU's skeletons")
-    return Motion(
-        to_smpl(rotations[:, indices], t_pose[0, indices], ends), positions[:, 0], recording.rate, "cmu"
-    )
+def _fill_side(
+    picked: Array, side: int, joints: Side, since_rest: Callable[[int], Array], forearm_axis: Array
+) -> None:
+    """Fill the joints of one side, 0 left, 1 right, of rotations (T, 24, 3, 3) since the T-pose."""
+    picked[:, 1 + side] = since_rest(joints.thigh)
+    picked[:, 4 + side] = since_rest(joints.shank)
+    picked[:, 7 + side] = since_rest(joints.foot)
+    picked[:, 10 + side] = picked[:, 7 + side] if joints.toes is None else since_rest(joints.toes)
+    picked[:, 13 + side] = picked[:, 9] if joints.collar is None else since_rest(joints.collar)
+    picked[:, 16 + side] = since_rest(joints.upper_arm)
+    forearm = since_rest(joints.forearm)
+    in_forearm = transpose(forearm) @ since_rest(joints.hand)
+    picked[:, 18 + side] = forearm @ _twist(in_forearm, forearm_axis)
 
 
-# Angles of people who stand straight, in Bandai-Namco's axes, degrees: means over the 284 takes of dataset 2
-# in normal style that contain standing with hanging arms (4450 frames, standard deviation up to 2.3). A
-# wearer's calibration makes these angles zero, so they belong to G0.
-_BANDAI_HEAD = 8.5  # pitch forward
-_BANDAI_NECK = 4.1
-_BANDAI_COLLAR = (
-    17.5  # yaw backwards, relative to the chest; only in dataset 2, collars are straight in dataset 1
-)
-_BANDAI_FOOT = 39.0  # pitch of the line from ankle to toe joint when the sole is flat on the floor
-_BANDAI_TOES = 23.0
+def _twist(rotations: Array, axis: Array) -> Array:
+    """Return the part about an axis (3,) of rotations (T, 3, 3)."""
+    quats = matrix_to_quat(rotations)
+    quats[:, 1:] = (quats[:, 1:] @ axis)[:, None] * axis
+    norms = np.linalg.norm(quats, axis=-1, keepdims=True)
+    return quat_to_matrix(np.where(norms > 1e-9, quats / np.maximum(norms, 1e-9), np.eye(4)[0]))
 
 
-def from_bandai(recording: JointTree, path: object, collars_back: bool = True) -> Motion:
-    """Retarget a Bandai-Namco file.
-
-    Its zero pose is no T-pose, so G0 follows from the directions of its bone axes.
-
-    Args:
-        recording: content of the file.
-        path: the file, for error messages.
-        collars_back: collars point 17.5 deg backwards in straight standing (dataset 2; not so in dataset 1).
-
-    Raises:
-        EdgeposeError: the skeleton is not like Bandai-Namco's.
-    """
-    rotations, positions = forward(recording)
-    picked = rotations[:, _indices(BANDAI, recording.names)].copy()
-    for elbow, hand in ((18, "Hand_L"), (19, "Hand_R")):
-        # Some takes rotate the forearm in its own joint, some in the hand's. A sensor near the wrist measures
-        # both.
-        quats = matrix_to_quat(recording.rotations[:, recording.names.index(hand)])
-        quats[:, 2:] = 0.0  # leaves the rotation about x, the forearm's axis
-        quats /= np.maximum(np.linalg.norm(quats, axis=-1, keepdims=True), 1e-9)
-        picked[:, elbow] @= quat_to_matrix(quats)
-    t_pose = bandai_t_pose(_BANDAI_COLLAR if collars_back else 0.0)
-    ends = {}
-    for limb, (start, end) in BANDAI.bones.items():
-        joint, child = recording.names.index(start), recording.names.index(end)
-        if recording.parents[child] != joint:
-            raise EdgeposeError(f"{path}: {end} is not a child of {start}")
-        ends[limb] = t_pose[limb] @ _unit(recording.offsets[child])
-    if not near_rest(ends):
-        raise EdgeposeError(f"{path}: the limbs of the skeleton do not lie as in Bandai-Namco's skeleton")
-    translation = positions[:, recording.names.index(BANDAI.joints[0])] * BANDAI_METRES
-    return Motion(to_smpl(picked, t_pose, ends), translation, recording.rate, "bandai-namco")
+def _spine_middles(rest: RestPose, roles: Roles) -> Array:
+    """Return the middle of each spine bone as share of the way along the spine from pelvis to neck."""
+    above = roles.head if roles.neck is None else roles.neck
+    points = rest.positions[[roles.pelvis, *roles.spine, above]]
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    along /= along[-1]
+    return np.asarray((along[1:-1] + along[2:]) / 2)
 
 
-def bandai_t_pose(collar: float) -> Array:
-    """Return rotations (24, 3, 3) of Bandai-Namco's bones in a straight T-pose; `collar`: yaw, degrees."""
-    left, up, forward_ = np.eye(3)
-    axes = {  # directions of a bone's x, y, z
-        "pelvis": (up, -left, forward_),
-        "trunk": (up, forward_, left),
-        "left_arm": (left, up, forward_),
-        "right_arm": (left, -up, -forward_),
-        "left_leg": (-up, left, forward_),
-        "right_leg": (up, left, -forward_),
-        "left_foot": (forward_, left, up),
-        "right_foot": (-forward_, left, -up),
-    }
-    kinds = {0: "pelvis", **dict.fromkeys((3, 6, 9, 12, 15), "trunk")}
-    for side, name in enumerate(("left", "right")):
-        kinds |= {joint + side: f"{name}_arm" for joint in (13, 16, 18, 20, 22)}
-        kinds |= {joint + side: f"{name}_leg" for joint in (1, 4)}
-        kinds |= {joint + side: f"{name}_foot" for joint in (7, 10)}
-    t_pose = np.stack([np.stack(axes[kinds[joint]], axis=1) for joint in range(24)])
-    lean = {
-        15: _BANDAI_HEAD,
-        12: _BANDAI_NECK,
-        7: _BANDAI_FOOT,
-        8: _BANDAI_FOOT,
-        10: _BANDAI_TOES,
-        11: _BANDAI_TOES,
-    }
-    for joint, angle in lean.items():
-        t_pose[joint] = rotation_about_axis("x", np.radians(angle)) @ t_pose[joint]
-    for joint, angle in ((13, collar), (14, -collar)):
-        t_pose[joint] = rotation_about_axis("y", np.radians(angle)) @ t_pose[joint]
-    return t_pose
+def _lower_spine(spine: Sequence[Array], middles: Array) -> tuple[Array, Array]:
+    """Return rotations (T, 3, 3) of SMPL's two lower spine bones from those of a spine, the chest last."""
+    if len(spine) <= 3:
+        return spine[0], spine[-2] if len(spine) == 3 else spine[-1]
+    pair = []
+    for share in _SPINE_SHARES:
+        upper = int(np.clip(np.searchsorted(middles, share), 1, len(spine) - 1))
+        low, high = middles[upper - 1], middles[upper]
+        part = float(np.clip((share - low) / max(high - low, 1e-9), 0.0, 1.0))
+        pair.append(_between(spine[upper - 1], spine[upper], part))
+    return pair[0], pair[1]
+
+
+def _between(start: Array, end: Array, share: float) -> Array:
+    """Return rotations (T, 3, 3) on the shortest way from `start` (share 0) to `end` (share 1)."""
+    return quat_to_matrix(slerp(matrix_to_quat(start), matrix_to_quat(end), np.full(len(start), share)))
 
 
 def to_smpl(rotations: Array, t_pose: Array, ends: dict[int, Array]) -> Array:
@@ -246,42 +147,15 @@ def to_smpl(rotations: Array, t_pose: Array, ends: dict[int, Array]) -> Array:
     Args:
         rotations: (T, 24, 3, 3) global rotation of each SMPL joint's source joint.
         t_pose: (24, 3, 3) the same in the source's T-pose.
-        ends: unit direction (3,) of each limb bone (`LIMBS`) in the source's T-pose.
+        ends: unit direction (3,) of each limb bone (`REST_DIRECTIONS`) in the source's T-pose.
 
     Returns:
         (T, 24, 3, 3) rotations that take the SMPL rest direction of each limb to its direction in the source.
     """
     correction = transpose(t_pose)
-    for limb, direction in LIMBS.items():
-        correction[limb] = correction[limb] @ minimal_rotation(_DIRECTIONS[direction], ends[limb])
+    for limb, direction in REST_DIRECTIONS.items():
+        correction[limb] = correction[limb] @ minimal_rotation(direction, ends[limb])
     result = rotations @ correction
     for joint, forearm in _FOREARM_OF.items():
         result[:, joint] = result[:, forearm]
     return result
-
-
-def has_names(names: Names, recording: JointTree) -> bool:
-    """Return whether a recording has the joints of a source."""
-    return {*names.joints, *(end for bone in names.bones.values() for end in bone)} <= set(recording.names)
-
-
-def _indices(names: Names, joints: tuple[str, ...]) -> list[int]:
-    return [joints.index(name) for name in names.joints]
-
-
-def _bone_directions(names: Names, joints: tuple[str, ...], positions: Array) -> dict[int, Array]:
-    """Return the unit direction of each limb bone for joint positions (J, 3)."""
-    return {
-        limb: _unit(positions[joints.index(end)] - positions[joints.index(start)])
-        for limb, (start, end) in names.bones.items()
-    }
-
-
-def near_rest(ends: dict[int, Array]) -> bool:
-    """Return whether all limbs lie within 20 deg of their directions in SMPL's zero pose."""
-    least = np.cos(np.radians(20.0))
-    return all(ends[limb] @ _DIRECTIONS[direction] > least for limb, direction in LIMBS.items())
-
-
-def _unit(v: Array) -> Array:
-    return v / max(float(np.linalg.norm(v)), 1e-12)
