@@ -24,7 +24,7 @@ LENGTH_S = (20.0, 50.0)
 REST_S = (2.0, 12.0)
 """Least and greatest length of a rest, seconds."""
 
-TRAVEL_S = (0.7, 12.0)
+TRAVEL_S = (0.7, 15.0)
 """Least and greatest length of captured motion between two rests, seconds."""
 
 RAMP_S = (0.4, 1.0)
@@ -39,6 +39,9 @@ SLOW = 0.4
 LOW = 8.0
 """How much likelier a rest is where the pelvis is down than in a standing body."""
 
+RISING = 0.5
+"""Share of the rests of a low body after which it rises, if it has risen in the captured motion."""
+
 BACKWARDS = 0.5
 """How likely it is to go back to a rest, compared with going on to one."""
 
@@ -52,6 +55,19 @@ _BODY_SWAY = 0.4
 """The same of the whole body, about the ground below the pelvis."""
 
 _BREATHS_HZ, _BREATH_DEG = (0.2, 0.33), (0.2, 0.8)
+
+
+class _Places(NamedTuple):
+    """Where rests may be, for each captured frame (T,), from 0 to 1: slow and low frames."""
+
+    slowness: Array
+    lowness: Array
+
+    def likelihood(self, rising: bool) -> Array:
+        """Return how likely a rest is (T,), not normalised: where the body is low, or where it is not."""
+        wanted = 1.001 - self.lowness if rising else 1.0 + (LOW - 1.0) * self.lowness
+        likelihood: Array = self.slowness * wanted
+        return likelihood
 
 
 class Course(NamedTuple):
@@ -80,12 +96,12 @@ def with_rests(motion: Motion, body: Body, rng: np.random.Generator) -> Motion:
             translation=np.repeat(motion.translation, 2, axis=0),
         )
     frames = round(rng.uniform(*LENGTH_S) * motion.rate)
-    course = _course(_likelihood(motion, body), frames, motion.rate, rng)
+    course = _course(_places(motion, body), frames, motion.rate, rng)
     return _swaying(_played(motion, course.position), 1.0 - course.speed.clip(0.0, 1.0), body, rng)
 
 
-def _likelihood(motion: Motion, body: Body) -> Array:
-    """Return how likely a rest is at each captured frame (T,); not normalised."""
+def _places(motion: Motion, body: Body) -> _Places:
+    """Return where rests may be in a captured motion."""
     joints = forward_kinematics(local_from_global(motion.rotations), body.offsets, motion.translation)[1]
     velocity = np.gradient(joints, 1.0 / motion.rate, axis=0)
     speed = np.sqrt(np.square(velocity).sum(-1).mean(-1))
@@ -93,14 +109,13 @@ def _likelihood(motion: Motion, body: Body) -> Array:
     lowness = np.clip((0.85 - height) / 0.3, 0.0, 1.0)
     # Without any slow frame the slowest ones still have weight.
     slowness = np.exp(-np.square((speed - speed.min()) / SLOW))
-    likelihood: Array = (1.0 + (LOW - 1.0) * lowness) * (slowness + 1e-3)
-    return likelihood
+    return _Places(slowness + 1e-3, lowness)
 
 
-def _course(likelihood: Array, frames: int, rate: float, rng: np.random.Generator) -> Course:
+def _course(places: _Places, frames: int, rate: float, rng: np.random.Generator) -> Course:
     """Draw rests and the ways between them."""
-    at = np.arange(len(likelihood))
-    place = rng.choice(at, p=likelihood / likelihood.sum())
+    likelihood = places.likelihood(rising=False)
+    place = int(rng.choice(len(likelihood), p=likelihood / likelihood.sum()))
     position, speed = [], []
     length = 0
     while length < frames:
@@ -108,7 +123,8 @@ def _course(likelihood: Array, frames: int, rate: float, rng: np.random.Generato
         rest = round((REST_S[0] + (REST_S[1] - REST_S[0]) * rng.random() ** 2) * rate)
         position.append(np.full(rest, float(place)))
         speed.append(np.zeros(rest))
-        following = _next_place(likelihood, place, rate, rng)
+        rising = bool(places.lowness[place] > 0.5 and rng.random() < RISING)
+        following = _next_place(places.likelihood(rising), place, rate, rng)
         share, fast = _way(abs(following - place) / rate, rate, rng)
         position.append(place + np.sign(following - place) * share * rate)
         speed.append(fast)
