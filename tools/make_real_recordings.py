@@ -24,6 +24,9 @@ OUT = Path(__file__).parents[1] / "tests" / "data" / "real"
 RATE = 60.0
 """Of the walker's sensors, Hz."""
 
+END_S = 125.0
+"""End of what is kept of the sitter's recording, which goes on in the same way, seconds."""
+
 SEGMENTS = {
     "27": "left_forearm", "30": "right_forearm", "33": "left_lower_leg", "2e": "right_lower_leg",
     "29": "head", "2d": "pelvis", "2a": "chest", "25": "left_shoulder", "2f": "right_shoulder",
@@ -32,8 +35,8 @@ SEGMENTS = {
 }  # fmt: skip
 """Segments of the walker's sensors, by the last two digits of their device ids."""
 
-QUAT_STEP, ACC_STEP, GYR_STEP = 2.0**-13, 2.0**-7, 2.0**-10
-"""Steps to which numbers are rounded: 0.01 deg, 0.008 m/s^2, 0.001 rad/s."""
+QUAT_STEP, ACC_STEP, GYR_STEP = 2.0**-15, 2.0**-7, 2.0**-10
+"""Steps to which numbers are rounded: 0.003 deg, 0.008 m/s^2, 0.001 rad/s."""
 
 
 def read_walker(folder: Path) -> dict[str, SensorData]:
@@ -66,7 +69,10 @@ def main(walker: Path, sitter: Path, out: Path) -> None:
     """Write the recordings."""
     out.mkdir(parents=True, exist_ok=True)
     walk = read_walker(walker)
-    sitting = read_recording(sitter).sensors
+    sitting = {
+        site: SensorData(*(None if column is None else column[data.time_s < END_S] for column in data))
+        for site, data in read_recording(sitter).sensors.items()
+    }
     units = {"frame": "Z up", "units": "s, m/s^2, rad/s"}
     for name, sensors, placements, with_gyr in (
         ("mtw-walk", walk, PLACEMENTS, True),
