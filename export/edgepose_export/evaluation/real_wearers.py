@@ -204,6 +204,11 @@ def measure_models(
     return tables
 
 
+def has_recordings(folder: Path = FOLDER) -> bool:
+    """Return whether all recordings are in a folder."""
+    return all((folder / name).is_file() for name in FILES)
+
+
 def check_folder(folder: Path) -> None:
     """Raise EdgeposeError unless all recordings are in a folder."""
     missing = [name for name in FILES if not (folder / name).is_file()]
@@ -298,16 +303,29 @@ def _strides(axis: Array) -> Array:
 
 def format_table(title: str, table: Table) -> str:
     """Format a table with "mean ± deviation" in each cell and the numbers of values in the last row."""
-    first = next(iter(table.values()))
-    rows = [["", *first]]
-    for name, columns in table.items():
-        digits = [2 if column == "jitter" or "Hz" in title else 1 for column in columns]
-        cells = (f"{m.mean:.{d}f} ± {m.std:.{d}f}" for m, d in zip(columns.values(), digits, strict=True))
-        rows.append([name, *cells])
-    rows.append(["count", *(str(metric.frames) for metric in first.values())])
+    rows = cells(title, table)
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [title]
-    for name, *cells in rows:
-        padded = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
+    for name, *row in rows:
+        padded = (cell.rjust(width) for cell, width in zip(row, widths[1:], strict=True))
         lines.append("  ".join([name.ljust(widths[0]), *padded]).rstrip())
     return "\n".join(lines)
+
+
+def cells(title: str, table: Mapping[str, Mapping[str, Sequence[float]]]) -> list[list[str]]:
+    """Return the cells of a table of this title: a head, a row for each method, and the numbers of values.
+
+    Args:
+        title: as `measure_models` names it.
+        table: mean, deviation and number of values by row and column.
+    """
+    head = list(next(iter(table.values())))
+    digits = [2 if name == "jitter" or "Hz" in title else 1 for name in head]
+    return [
+        ["", *head],
+        *(
+            [name, *(f"{v[0]:.{d}f} ± {v[1]:.{d}f}" for v, d in zip(row.values(), digits, strict=True))]
+            for name, row in table.items()
+        ),
+        ["count", *(str(int(values[2])) for values in next(iter(table.values())).values())],
+    ]
