@@ -16,9 +16,6 @@ from functools import cache
 from pathlib import Path
 
 from edgepose.analysis.metrics import Metric
-from edgepose.inference.archive import bundled_archives
-from edgepose.inference.model import Model
-from edgepose_export.evaluation.real_wearers import measure_models
 from firmware_protocols.base import Protocol
 from firmware_protocols.registry import BUILT_IN, PROTOCOLS
 
@@ -62,9 +59,13 @@ def _table(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([lines[0], "|" + "---|" * len(rows[0]), *lines[1:]]) + "\n"
 
 
-@cache
+@cache  # both tables need all of it
 def _measured() -> dict[str, dict[str, dict[str, Metric]]]:
     """Return the tables of `edgepose evaluate --real` for all shipped models."""
+    from edgepose.inference.archive import bundled_archives
+    from edgepose.inference.model import Model
+    from edgepose_export.evaluation.real_wearers import measure_models
+
     models = {f"`{path.stem}`": Model(path.stem) for path in bundled_archives()}
     return measure_models(models)
 
