@@ -81,7 +81,7 @@ class _Trained(NamedTuple):
     type=click.Path(path_type=Path, exists=True, file_okay=False),
     help="Folder written by `edgepose synthesize`: fit the standard deviations to the errors on its "
     "validation takes, measure the archive on its held-out takes, or on those for validation if it has none, "
-    "and add the results to the card.",
+    "and on the source tree's recordings of real wearers, and add the results to the card.",
 )
 @click.option(
     "--beside",
