@@ -193,12 +193,12 @@ def _distinct(times: Array, values: Array) -> tuple[Array, Array]:
 def _track(name: str, data: SensorData, mount: SensorMount) -> _Track:
     times, quats = _oriented(name, data)
     acc_times, acc = _distinct(data.time_s, np.empty((0, 3)) if data.acc is None else data.acc)
-    inertial = rot.quat_rotate(_orientation_at(times, quats, acc_times), acc) - [0.0, 0.0, GRAVITY]
+    inertial = rot.quat_rotate(orientation_at(times, quats, acc_times), acc) - [0.0, 0.0, GRAVITY]
     r_tb = mount.body_from_inertial @ rot.quat_to_matrix(quats) @ rot.transpose(mount.bone_from_sensor)
     return _Track(times, rot.matrix_to_quat(r_tb), acc_times, inertial @ mount.body_from_inertial.T)
 
 
-def _orientation_at(times: Array, quats: Array, wanted: Array) -> Array:
+def orientation_at(times: Array, quats: Array, wanted: Array) -> Array:
     """Interpolate quaternions (T, 4) along the shorter arc; beyond the samples take the nearest."""
     if len(times) == 1:
         return np.repeat(quats, len(wanted), axis=0)
@@ -211,7 +211,7 @@ def _frames(
     track: _Track, ticks: Array, rate: float
 ) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
     """Return R_TB (T, 3, 3), accelerations (T, 3), their validity (T,), and whether R_TB is held (T,)."""
-    r_tb = rot.quat_to_matrix(_orientation_at(track.times, track.quats, ticks))
+    r_tb = rot.quat_to_matrix(orientation_at(track.times, track.quats, ticks))
     held = _silence(track.times, ticks, rate) > 0.0
     edges = (ticks[0] - 1.0 / rate, *ticks, ticks[-1] + 1.0 / rate)
     silence = np.diff(_silence_before(track.acc_times, np.array(edges), rate))

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Any
 
+from edgepose_export.evaluation.real_wearers import cells
 from edgepose_export.evaluation.uncertainty import EXPECTED
 from edgepose_export.networks.registry import NETWORKS
 from edgepose_export.training.config import CONFIGS, config_values, read_config
@@ -28,6 +30,8 @@ _PARTS = {
 def card(metadata: dict[str, Any]) -> str:
     """Return an archive's card as Markdown, made from its metadata alone."""
     lines = [f"# {metadata['name']}", "", *_summary(metadata), ""]
+    if metadata.get("real"):
+        lines += _real_wearers(metadata)
     if metadata["measures"]:
         lines += _accuracy(metadata)
     return "\n".join([*lines, *_reproduction(metadata), ""])
@@ -57,6 +61,26 @@ def _summary(metadata: dict[str, Any]) -> list[str]:
         "- Weights: for non-commercial use wherever a licence above says NC. The code of edgepose is MIT.",
         f"- Exported by edgepose {metadata['edgepose']}, revision {metadata['revision'] or 'unknown'}.",
     ]
+
+
+def _real_wearers(metadata: dict[str, Any]) -> list[str]:
+    """Return the section with the measures on real wearers."""
+    lines = [
+        "## Accuracy on real wearers",
+        "",
+        "Mean ± standard deviation on recordings of real sensors. The walker's errors are those against "
+        "further sensors on the same bones. The count is that of frames, or of strides where the unit is Hz. "
+        "The last rows need no network. `edgepose evaluate --real` explains them and measures again.",
+        "",
+    ]
+    for title, table in metadata["real"].items():
+        head, *rows = cells(title, table)
+        lines += [f"### {title}", "", _row(head), "|" + "---|" * len(head), *map(_row, rows), ""]
+    return lines
+
+
+def _row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
 
 
 def _accuracy(metadata: dict[str, Any]) -> list[str]:

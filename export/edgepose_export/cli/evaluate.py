@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
+from click.core import ParameterSource
 
 from edgepose.cli.options.outputs import overwrite_option
 from edgepose.cli.terminal.messages import say, show
@@ -45,9 +46,14 @@ class _Model(NamedTuple):
 )
 @click.option(
     "--data",
-    required=True,
     type=click.Path(path_type=Path, exists=True, file_okay=False),
-    help="Folder written by `edgepose synthesize`, or of DIP-IMU or TotalCapture with --part published.",
+    help="Folder written by `edgepose synthesize`, or of DIP-IMU or TotalCapture with --part published; with "
+    "--real, of the recordings  [default with --real: those in edgepose's source]",
+)
+@click.option(
+    "--real",
+    is_flag=True,
+    help="Measure on recordings of two real wearers instead, beside methods that need no network.",
 )
 @click.option(
     "--part",
@@ -101,7 +107,8 @@ class _Model(NamedTuple):
 def evaluate(
     names: tuple[str, ...],
     trust: bool,
-    data: Path,
+    data: Path | None,
+    real: bool,
     parts: tuple[str, ...],
     modes: tuple[str, ...],
     past: int | None,
@@ -118,6 +125,7 @@ def evaluate(
 
     \b
     Examples:
+      edgepose evaluate --real --model birnn --model my-rnn.pt --trust
       edgepose evaluate --data recordings/ --baselines
       edgepose evaluate --data recordings/ --model birnn --model rnn --part cmu-walk-run
       edgepose evaluate --data recordings/ --online window --past 50 --future 5
@@ -125,6 +133,11 @@ def evaluate(
       edgepose evaluate --data DIP_IMU/s_09 --part published --table 3 --model birnn --model dip-birnn.pt
       edgepose evaluate --data recordings/ --part cmu-walk-run --heat-map window.png --every 10
     """
+    if real:
+        _real(names, trust, data)
+        return
+    if data is None:
+        raise click.UsageError("give --data FOLDER, or --real")
     if table and (modes or past is not None or future is not None):
         raise click.UsageError("--table decides how models run: omit --online, --past and --future")
     if heat_map and (table or histogram or baselines):
@@ -146,6 +159,31 @@ def evaluate(
         _tables(models, data, chosen, baselines, table, histogram, overwrite)
     if reliability:
         _reliability(models, data, chosen, reliability, overwrite)
+
+
+_REAL = {"names", "trust", "data", "real"}
+"""Parameters that apply to --real."""
+
+
+def _real(names: tuple[str, ...], trust: bool, folder: Path | None) -> None:
+    """Measure models on real wearers."""
+    context = click.get_current_context()
+    for parameter in context.command.params:
+        name = parameter.name or ""
+        if name not in _REAL and context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+            raise click.UsageError(f"--real runs models as `edgepose run` does: omit {parameter.opts[0]}")
+    from edgepose.inference.model import Model
+    from edgepose_export.cli.progress import labelled
+    from edgepose_export.evaluation import real_wearers
+
+    real_wearers.check_folder(folder or real_wearers.FOLDER)
+    models = {name: Model(name, trust=trust) for name in names}
+    stems = [Path(name).stem for name in names]
+    if len(set(stems)) == len(names):
+        models = dict(zip(stems, models.values(), strict=True))
+    for title, rows in real_wearers.measure_models(models, folder, labelled("measuring")).items():
+        show(f"\n{real_wearers.format_table(title, rows)}")
+    show(f"\n{real_wearers.LEGEND}")
 
 
 def default_parts(data: Path) -> tuple[str, ...]:

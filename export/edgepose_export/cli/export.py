@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -81,7 +81,7 @@ class _Trained(NamedTuple):
     type=click.Path(path_type=Path, exists=True, file_okay=False),
     help="Folder written by `edgepose synthesize`: fit the standard deviations to the errors on its "
     "validation takes, measure the archive on its held-out takes, or on those for validation if it has none, "
-    "and add the results to the card.",
+    "and on the source tree's recordings of real wearers, and add the results to the card.",
 )
 @click.option(
     "--beside",
@@ -135,11 +135,11 @@ def export(
 
 
 def _load_other(name: str) -> dict[str, Archive]:
-    """Load the model to compare with; return it by its name as it stands in the card."""
+    """Load the model to compare with; return it by its name."""
     from edgepose.inference.archive import find_archive, load, read_info
 
     info = read_info(find_archive(name))
-    return {f"`{name}`": (load(info), info.metadata)}
+    return {name: (load(info), info.metadata)}
 
 
 def _read(checkpoints: tuple[Path, ...], name: str, past: int, future: int, rounded: bool) -> _Trained:
@@ -189,6 +189,7 @@ def _measured_module(
             path = Path(folder) / file_name
             archive.save(module, path, metadata)
             metadata |= _measures(path, data, others)
+            metadata["real"] = _on_real_wearers(path, others)
         metadata["precisions"] = _precisions(script, metadata, data)
     return module
 
@@ -240,7 +241,7 @@ def _measures(path: Path, data: Path, others: Mapping[str, Archive]) -> dict[str
     for name, (other, about) in others.items():
         streamed = [mode for mode in evaluation.modes_of(about) if mode.name == "stream"]
         for row, method in evaluation.archive_methods(other, streamed).items():
-            methods[f"{name}, {row}"] = method
+            methods[f"`{name}`, {row}"] = method
     columns = evaluation.columns_of_parts(methods, data, parts, labelled("measuring"))
     (mode,) = (mode for mode in modes if mode.name == "stream")
     deviations = {}
@@ -257,4 +258,23 @@ def _measures(path: Path, data: Path, others: Mapping[str, Archive]) -> dict[str
             for part, rows in columns.items()
         },
         "deviations": deviations,
+    }
+
+
+def _on_real_wearers(path: Path, others: Iterable[str]) -> dict[str, Any]:
+    """Return measures of the archive and of other models on real wearers; empty without their recordings."""
+    from edgepose.inference.model import Model
+    from edgepose_export.cli.progress import labelled
+    from edgepose_export.evaluation import real_wearers
+
+    if not real_wearers.has_recordings():
+        return {}
+    models = {path.stem: Model(path, trust=True)} | {f"`{name}`": Model(name) for name in others}
+    tables = real_wearers.measure_models(models, progress=labelled("measuring on real wearers"))
+    return {
+        title: {
+            row: {column: list(metric) for column, metric in columns.items()}
+            for row, columns in table.items()
+        }
+        for title, table in tables.items()
     }

@@ -33,6 +33,10 @@ _BETWEEN = {
 """Thighs are halfway between pelvis and shank, trunk and neck in equal steps from pelvis to head, collars
 like the chest, upper arms halfway between chest and forearm."""
 
+_FOLLOWED = {1: 4, 2: 5, 3: 0, 6: 0, 9: 0, 12: 15, 13: 0, 14: 0, 16: 18, 17: 19}
+"""Bone with a sensor that each joint without one follows: thighs the shanks, upper arms the forearms, the
+back and the collars the pelvis, the neck the head."""
+
 
 def _measured(take: Take) -> Array:
     """Return global rotations (T, 24, 3, 3) in T: those of the measured bones; the others are NaN."""
@@ -63,6 +67,25 @@ def interpolated(take: Take, offsets: Array | None = None) -> Array:
     if offsets is not None:
         poses[:, list(UNOBSERVED)] = poses[:, list(UNOBSERVED)] @ offsets[list(UNOBSERVED)]
     return _local(poses)
+
+
+def following(take: Take) -> Array:
+    """Return local poses (T, 24, 3, 3): measured bones, and the others oriented like the bone they follow."""
+    poses = _measured(take)
+    poses[:, list(_FOLLOWED)] = poses[:, list(_FOLLOWED.values())]
+    return _local(poses)
+
+
+def straight(take: Take) -> Array:
+    """Return local poses (T, 24, 3, 3): the straight pose, oriented as the pelvis sensor is."""
+    return _constant(local_from_global(straight_pose()), take)
+
+
+def interpolated_from_straight(take: Take) -> Array:
+    """Return local poses (T, 24, 3, 3) as `interpolated`, with the offsets that fit the straight pose."""
+    pose = straight_pose()
+    held = take._replace(orientation=pose[None, list(BONES)])
+    return interpolated(take, rot.transpose(_globals(interpolated(held))[0]) @ pose)
 
 
 class Baselines(NamedTuple):
@@ -143,7 +166,7 @@ def nearest(take: Take, trained: Baselines) -> Array:
 
 METHODS: dict[str, Callable[[Take, Baselines], Array]] = {
     "mean pose": lambda take, trained: _constant(trained.mean_pose, take),
-    "frozen calibration pose": lambda take, _: _constant(local_from_global(straight_pose()), take),
+    "frozen calibration pose": lambda take, _: straight(take),
     "measured bones, others' mean local pose": lambda take, trained: with_measured_bones(
         take, trained.mean_pose
     ),
