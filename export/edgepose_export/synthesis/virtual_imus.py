@@ -11,6 +11,7 @@ from edgepose import rotations as rot
 from edgepose.calibration import GRAVITY
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import Body, forward_kinematics, local_from_global
+from edgepose_export.mocap.straight_pose import straight_pose
 from edgepose_export.mocap import Motion
 
 Array = NDArray[np.float64]
@@ -20,14 +21,6 @@ INERTIAL_FROM_BODY = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
 
 BLEND_S = 1.0
 """Duration of the transition from a held pose to the first pose of the take, seconds."""
-
-
-def straight_pose() -> Array:
-    """Return global rotations (24, 3, 3) of the straight pose (N-pose): the zero pose with hanging arms."""
-    pose = np.tile(np.eye(3), (24, 1, 1))
-    pose[[16, 18, 20, 22]] = rot.rotation_about_axis("z", -np.pi / 2)
-    pose[[17, 19, 21, 23]] = rot.rotation_about_axis("z", np.pi / 2)
-    return pose
 
 
 def with_hold(motion: Motion, seconds: float) -> Motion:
@@ -70,7 +63,9 @@ class VirtualImus(NamedTuple):
     rate_of_turn: Array
 
 
-def virtual_imus(motion: Motion, body: Body, mounting: Array | None = None) -> VirtualImus:
+def virtual_imus(
+    motion: Motion, body: Body, mounting: Array | None = None, frames: Array | None = None
+) -> VirtualImus:
     """Simulate sensors at the six sensor points on the body's skin.
 
     Accelerations are central differences over neighbouring frames, DIP eq. 3 with n = 1. The first and the
@@ -80,6 +75,8 @@ def virtual_imus(motion: Motion, body: Body, mounting: Array | None = None) -> V
         motion: motion at the sample rate of the sensors.
         body: body with the joints and sensor points to move.
         mounting: (6, 3, 3) R_BS, sensor frames in bone frames; None for sensors aligned with the bones.
+        frames: (24, 3, 3) right factors to the bones' frames that a calibration would define, which the sensors
+            are then aligned with; None for those of the motion.
 
     Raises:
         ValueError: the motion has fewer than 3 frames.
@@ -93,7 +90,7 @@ def virtual_imus(motion: Motion, body: Body, mounting: Array | None = None) -> V
     points = joints[:, list(BONES)] + np.einsum("tsij,sj->tsi", bones, body.sensors)
     acceleration = (points[:-2] + points[2:] - 2.0 * points[1:-1]) * motion.rate**2
     acceleration = np.concatenate([acceleration[:1], acceleration, acceleration[-1:]])
-    sensors = INERTIAL_FROM_BODY @ bones
+    sensors = INERTIAL_FROM_BODY @ (bones if frames is None else bones @ frames[list(BONES)])
     if mounting is not None:
         sensors = sensors @ mounting
     force_inertial = acceleration @ INERTIAL_FROM_BODY.T + [0.0, 0.0, GRAVITY]
