@@ -1,8 +1,8 @@
 """Hinges of elbows and knees, by which all skeletons get SMPL's frames for upper arms and thighs.
 
-In SMPL's zero pose an elbow bends about the vertical axis and a knee about the lateral one. Skeletons of other
-sources differ from this by a constant rotation about the length of the upper bone (CMU's elbows by 30 deg),
-which the motion itself reveals: it is the axis about which the joint bends.
+In SMPL's zero pose an elbow bends about the vertical axis and a knee about the lateral one. Skeletons of
+other sources differ from this by a constant rotation about the length of the upper bone (CMU's elbows by
+30 deg). The motion itself reveals it: the hinge is the axis about which the joint bends.
 """
 
 from __future__ import annotations

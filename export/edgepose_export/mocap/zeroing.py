@@ -1,10 +1,9 @@
 """The zero of an actor: bones' frames as a wearer's calibration in the straight pose would define them.
 
-A wearer stands straight, and every bone has the orientation R_TB0 from then on, whatever the body. Skeletons
-of motion capture define their zero in their own ways: by a T-pose that nobody took, by markers, by the axes of
-an editor. Here the straight pose of each actor is estimated from the actor's own takes, and one constant right
-factor for each bone brings it to R_TB0. Limbs keep their true directions in the source; the estimate says how
-these directions, the trunk's rotations and the limbs' twists are when the actor stands.
+A wearer is calibrated in the straight pose: there every bone has the orientation R_TB0, whatever the body.
+Skeletons of motion capture define their zero in their own ways: by a T-pose that nobody took, by markers, by
+the axes of an editor. Here the straight pose of each actor is estimated from the actor's own takes, and one
+constant right factor for each bone brings it to R_TB0.
 
 Evidence is combined as a mean weighted by precision, bone by bone and axis by axis:
 
@@ -39,12 +38,11 @@ class Zero(NamedTuple):
     """An actor's zero.
 
     Attributes:
-        directions: (24, 3, 3) right factors that leave the directions of the limbs as they are: hinges for limbs,
-            `straight` for the trunk. With them a body moves as the actor did; the links that are measured and
-            predicted are then off by constants.
+        directions: (24, 3, 3) right factors that keep the directions of the limbs: `hinges` for limbs,
+            `straight` for the trunk. With them a body moves as the actor did, and feet do not slide.
         straight: (24, 3, 3) right factors to frames that have R_TB0 in the straight pose.
-        evidence: "standing" or "walking", by what weighed most, or "none": only limbs are zeroed, as people
-            stand on average, and the trunk keeps the zero of the source.
+        evidence: "standing", "walking", or "none": only limbs are zeroed, as people stand on average, and the
+            trunk keeps the zero of the source.
     """
 
     directions: Array
@@ -62,41 +60,37 @@ def find_zero(motions: Sequence[Motion]) -> Zero:
     parts = [_postures(motion._replace(rotations=motion.rotations @ hinges)) for motion in motions]
     evidence = {name: np.concatenate([part[name] for part in parts]) for name in _EVIDENCE}
     total, weight = _STANDING / _SPREAD**2, 1.0 / _SPREAD**2
-    weights = {}
+    found = "none"
     for name, (offset, deviation) in _EVIDENCE.items():
         frames = len(evidence[name])
         if frames < LEAST_FRAMES:
             continue
         # A posture is not better known from a long hold than from two or three short ones.
         precision = frames / (frames + 60.0) / deviation**2
+        found = name.partition(",")[0] if found == "none" else found
         total = total + precision * (_deviation(evidence[name]) + offset)
         weight = weight + precision
-        weights[name] = frames / (frames + 60.0)
     angles = np.radians(total / weight)
     rest = straight_pose()
     straight = hinges @ np.swapaxes(rest, -1, -2) @ rot.rotvec_to_matrix(-angles) @ rest
     directions = straight.copy()
     directions[_LIMBS] = hinges[_LIMBS]
-    return Zero(directions, straight, _summary(weights))
-
-
-def _summary(weights: dict[str, float]) -> str:
-    if max(weights.get("standing", 0.0), weights.get("standing, arms raised", 0.0)) > 0.5:
-        return "standing"
-    return "walking" if weights.get("walking", 0.0) > 0.5 else "none"
+    return Zero(directions, straight, found)
 
 
 # --- postures ----------------------------------------------------------------------------------------------
 
 
 def _postures(motion: Motion) -> dict[str, Array]:
-    """Return the rotations (N, 24, 3, 3), seen from the pelvis' heading, of each kind of evidence in a take."""
+    """Return a take's rotations (N, 24, 3, 3), seen from the pelvis' heading, by kind of evidence."""
     step = max(1, round(motion.rate / 20.0))
     reach = max(1, round(0.1 * motion.rate))
     frames = np.arange(reach, len(motion.rotations) - reach, step)
     here = motion.rotations[frames]
     before, after = motion.rotations[frames - reach], motion.rotations[frames + reach]
-    turning = rot.geodesic_angle(before[:, _MOVING], after[:, _MOVING]).max(axis=1) * motion.rate / (2 * reach)
+    turning = (
+        rot.geodesic_angle(before[:, _MOVING], after[:, _MOVING]).max(axis=1) * motion.rate / (2 * reach)
+    )
     span = max(1, round(0.15 * motion.rate))
     first = np.maximum(frames - span, 0)
     last = np.minimum(frames + span, len(motion.rotations) - 1)
@@ -141,17 +135,17 @@ def _hanging(rotations: Array) -> Array:
 
 
 def _deviation(postures: Array) -> Array:
-    """Return the mean rotation vectors (24, 3), degrees, from R_TB0 to postures (N, 24, 3, 3), left = right."""
+    """Return mean rotation vectors (24, 3), degrees, from R_TB0 to postures (N, 24, 3, 3), left = right."""
     mean = rot.nearest_rotation(postures.mean(axis=0))
     angles = np.degrees(rot.matrix_to_rotvec(mean @ np.swapaxes(straight_pose(), -1, -2)))
     symmetric: Array = 0.5 * (angles + angles[_MIRROR] * [1.0, -1.0, -1.0])
     return symmetric
 
 
-# --- what is known of people ----------------------------------------------------------------------------------
+# --- what is known of people -----------------------------------------------------------------------------
 
 UPRIGHT_DEG = 30.0
-"""Greatest tilt of pelvis and chest in upright postures; sources define the zero of both in their own ways."""
+"""Greatest tilt of pelvis and chest in upright postures; their zero differs between sources."""
 QUIET = 0.6
 """rad/s; greatest rate of any bone in a hold."""
 WALKING = (0.6, 2.0)
@@ -169,14 +163,14 @@ _MIRROR = [
 _NOTHING = (0.0, 0.0, 0.0)
 _FREE = (60.0, 60.0, 60.0)
 
-# Angles about T's X, Y, Z, degrees, of joints on the left and in the middle: found in the 11 actors (as takes are
-# grouped here) of CMU and of Seoul National University's motion that both stand with hanging arms and walk, after
-# the hinges: mean and standard deviation between actors. Joints above the pelvis have no common zero.
+# Angles about T's X, Y, Z, degrees, of joints on the left and in the middle, with hinges: mean and standard
+# deviation (for standing, doubled: eleven are few) between the 11 actors of CMU and of Seoul National
+# University's motion who both stand with hanging arms and walk. Trunks have no common zero.
 _STANDING_PEOPLE = {
-    "hip": ((-4.8, 5.8, 2.1), (3.1, 4.6, 3.5)),
-    "knee": ((11.9, 11.3, 1.4), (2.0, 5.7, 2.5)),
-    "shoulder": ((1.3, -1.5, 11.1), (6.9, 9.0, 4.9)),
-    "elbow": ((-14.9, -38.5, 11.4), (4.2, 12.0, 5.1)),
+    "hip": ((-4.8, 5.8, 2.1), (6.2, 9.2, 7.0)),
+    "knee": ((11.9, 11.3, 1.4), (4.0, 11.4, 5.0)),
+    "shoulder": ((1.3, -1.5, 11.1), (13.8, 18.0, 9.8)),
+    "elbow": ((-14.9, -38.5, 11.4), (8.4, 24.0, 10.2)),
 }
 _WALKING_TO_STANDING = {
     "pelvis": ((0.5, 0.0, 0.0), (2.8, 2.8, 2.8)),
@@ -193,8 +187,14 @@ _WALKING_TO_STANDING = {
     "shoulder": ((-2.8, 3.3, -2.3), (3.0, 11.7, 3.0)),
     "elbow": ((9.5, -0.4, 0.4), (15.8, 7.3, 8.3)),
 }
-_HOLD_SPREAD = {"head": (8.0, 6.0, 6.0), "shoulder": (5.0, 8.0, 5.0), "elbow": (5.0, 8.0, 5.0)}
-"""How far a quiet, upright posture of an actor is from the same actor's straight pose; 4 deg for other joints."""
+_HOLD_SPREAD = {
+    "head": (8.0, 6.0, 6.0),
+    "hip": (2.5, 4.0, 2.5),
+    "knee": (2.5, 4.0, 2.5),
+    "shoulder": (5.0, 8.0, 5.0),
+    "elbow": (5.0, 8.0, 5.0),
+}
+"""How far quiet, upright postures of actors are from their straight pose; 4 deg for other joints."""
 _ARMS = ("collar", "shoulder", "elbow", "wrist", "hand")
 
 
@@ -206,7 +206,8 @@ def _kind(joint: str) -> str:
 
 def _rows(table: dict[str, tuple[tuple[float, ...], tuple[float, ...]]]) -> tuple[Array, Array]:
     """Return mean and standard deviation (24, 3) of all joints from those of the left ones."""
-    mean, spread = (np.array([table.get(_kind(name), (_NOTHING, _FREE))[i] for name in JOINTS]) for i in (0, 1))
+    rows = [table.get(_kind(name), (_NOTHING, _FREE)) for name in JOINTS]
+    mean, spread = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
     right = [name.startswith("right") for name in JOINTS]
     mean[right] *= [1.0, -1.0, -1.0]
     return mean, spread
@@ -222,4 +223,4 @@ _EVIDENCE = {
     "standing, arms raised": (_ZEROS, _ARMS_RAISED),
     "walking": _rows(_WALKING_TO_STANDING),
 }
-"""Kind of evidence -> what is added to its rotation vectors, and how far off the straight pose they then are."""
+"""Kind of evidence -> what is added to its rotation vectors, and how far they then are from the pose."""

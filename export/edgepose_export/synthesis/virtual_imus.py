@@ -11,8 +11,8 @@ from edgepose import rotations as rot
 from edgepose.calibration import GRAVITY
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import Body, forward_kinematics, local_from_global
-from edgepose_export.mocap.straight_pose import straight_pose
 from edgepose_export.mocap import Motion
+from edgepose_export.mocap.straight_pose import straight_pose
 
 Array = NDArray[np.float64]
 
@@ -75,8 +75,8 @@ def virtual_imus(
         motion: motion at the sample rate of the sensors.
         body: body with the joints and sensor points to move.
         mounting: (6, 3, 3) R_BS, sensor frames in bone frames; None for sensors aligned with the bones.
-        frames: (24, 3, 3) right factors to the bones' frames that a calibration would define, which the sensors
-            are then aligned with; None for those of the motion.
+        frames: (24, 3, 3) right factors to the bones' frames that sensors are aligned with after a
+            calibration; None for those of the motion.
 
     Raises:
         ValueError: the motion has fewer than 3 frames.
