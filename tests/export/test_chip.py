@@ -9,9 +9,9 @@ from edgepose import rotations as rot
 from edgepose.calibration import EXERCISE_S, GRAVITY, ROUTINE
 from edgepose.imu import SensorData
 from edgepose.placements import BONES, PLACEMENTS
+from edgepose_export.mocap.straight_pose import straight_pose
 from edgepose_export.synthesis.heading_routine import exercises
 from edgepose_export.synthesis.imu_errors import BMI270, FIELD_UT, raw
-from edgepose_export.synthesis.virtual_imus import straight_pose
 
 RATE, N = 100.0, 20_000
 REST = SensorData(

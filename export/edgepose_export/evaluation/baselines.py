@@ -13,7 +13,7 @@ from edgepose import rotations as rot
 from edgepose.inference.features import network_input
 from edgepose.placements import BONES, ROOT
 from edgepose.skeleton import JOINTS, PARENTS, UNOBSERVED, forward_kinematics, local_from_global
-from edgepose_export.synthesis.virtual_imus import straight_pose
+from edgepose_export.mocap.straight_pose import straight_pose
 from edgepose_export.training.dataset import Take
 
 Array = NDArray[np.float64]

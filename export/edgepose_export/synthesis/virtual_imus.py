@@ -13,6 +13,7 @@ from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import Body, forward_kinematics, local_from_global
 from edgepose_export.mocap import Motion
 from edgepose_export.synthesis.contacts import contacts, level_velocity
+from edgepose_export.mocap.straight_pose import straight_pose
 
 Array = NDArray[np.float64]
 
@@ -21,14 +22,6 @@ INERTIAL_FROM_BODY = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
 
 BLEND_S = 1.0
 """Duration of the transition from a held pose to the first pose of the take, seconds."""
-
-
-def straight_pose() -> Array:
-    """Return global rotations (24, 3, 3) of the straight pose (N-pose): the zero pose with hanging arms."""
-    pose = np.tile(np.eye(3), (24, 1, 1))
-    pose[[16, 18, 20, 22]] = rot.rotation_about_axis("z", -np.pi / 2)
-    pose[[17, 19, 21, 23]] = rot.rotation_about_axis("z", np.pi / 2)
-    return pose
 
 
 def with_hold(motion: Motion, seconds: float) -> Motion:
@@ -73,7 +66,9 @@ class VirtualImus(NamedTuple):
     joints: Array
 
 
-def virtual_imus(motion: Motion, body: Body, mounting: Array | None = None) -> VirtualImus:
+def virtual_imus(
+    motion: Motion, body: Body, mounting: Array | None = None, directions: Array | None = None
+) -> VirtualImus:
     """Simulate sensors at the six sensor points on the body's skin.
 
     Accelerations are central differences over neighbouring frames, DIP eq. 3 with n = 1. The first and the
@@ -83,20 +78,20 @@ def virtual_imus(motion: Motion, body: Body, mounting: Array | None = None) -> V
         motion: motion at the sample rate of the sensors.
         body: body with the joints and sensor points to move.
         mounting: (6, 3, 3) R_BS, sensor frames in bone frames; None for sensors aligned with the bones.
+        directions: (24, 3, 3) right factors to the frames by which the body moves, if these are not the
+            frames that sensors are aligned with, see `mocap.zeroing.Zero`.
 
     Raises:
         ValueError: the motion has fewer than 3 frames.
     """
     if len(motion.rotations) < 3:
         raise ValueError("a take needs at least 3 frames for accelerations")
-    rotations, joints = forward_kinematics(
-        local_from_global(motion.rotations), body.offsets, motion.translation
-    )
-    bones = rotations[:, list(BONES)]
-    points = joints[:, list(BONES)] + np.einsum("tsij,sj->tsi", bones, body.sensors)
+    moving = motion.rotations if directions is None else motion.rotations @ directions
+    _, joints = forward_kinematics(local_from_global(moving), body.offsets, motion.translation)
+    points = joints[:, list(BONES)] + np.einsum("tsij,sj->tsi", moving[:, list(BONES)], body.sensors)
     acceleration = (points[:-2] + points[2:] - 2.0 * points[1:-1]) * motion.rate**2
     acceleration = np.concatenate([acceleration[:1], acceleration, acceleration[-1:]])
-    sensors = INERTIAL_FROM_BODY @ bones
+    sensors = INERTIAL_FROM_BODY @ motion.rotations[:, list(BONES)]
     if mounting is not None:
         sensors = sensors @ mounting
     force_inertial = acceleration @ INERTIAL_FROM_BODY.T + [0.0, 0.0, GRAVITY]
