@@ -17,21 +17,19 @@ from edgepose.errors import EdgeposeError
 from edgepose.skeleton import Body
 from edgepose.utils.durable_files import replace_file
 from edgepose.utils.output_targets import check_free
+from edgepose_export.training.sources import OWN, UNKNOWN, TakeInfo, take_info
 
 KINDS = (".bvh", ".amc", ".npz")
 
 MOST_HOLD_FRAMES = 100_000
 """Longest time of standing before a motion, samples of a sensor."""
 
-LICENSES = {
-    "cmu": "CMU Graphics Lab Motion Capture Database (mocap.cs.cmu.edu, NSF EIA-0196217), free for all use",
-    "bandai-namco": "Bandai-Namco Research Motiondataset, CC BY-NC 4.0",
-    "amass": "the licence of the AMASS subset",
-}
-
 
 class Job(NamedTuple):
-    """Settings of a conversion: the command's flags, and the folder that paths are relative to."""
+    """Settings of a conversion: the command's flags, and the folder that paths are relative to.
+
+    `license_note` is the licence of motion that no rule knows.
+    """
 
     out: Path
     root: Path
@@ -40,6 +38,7 @@ class Job(NamedTuple):
     hold_s: float
     mounting_seed: int | None
     seated_seed: int | None
+    license_note: str
     overwrite: bool
 
 
@@ -87,6 +86,15 @@ class Job(NamedTuple):
     help="Keep only the motion of the upper body, play it to and fro, and let the wearer sit down, squat and "
     "rise at random, drawn with this seed; about half a minute per take.",
 )
+@click.option(
+    "--license",
+    "license_note",
+    metavar="TEXT",
+    default=UNKNOWN,
+    show_default=True,
+    help="Licence of your own motion, for the cards of models trained on it; the licences of published "
+    "motion are known by the names of its files.",
+)
 @overwrite_option
 @click.option(
     "--jobs", type=click.IntRange(1), default=1, show_default=True, help="Files to process in parallel."
@@ -100,6 +108,7 @@ def synthesize(
     hold: float,
     mounting_seed: int | None,
     seated_seed: int | None,
+    license_note: str,
     overwrite: bool,
     jobs: int,
 ) -> None:
@@ -128,9 +137,11 @@ def synthesize(
     files = [(root, path) for root in inputs for path in motion_files(root)]
     if not files:
         raise EdgeposeError(f"no motion files ({', '.join(KINDS)}) in {', '.join(map(str, inputs))}")
-    flags = (rate, body, hold, mounting_seed, seated_seed, overwrite)
+    flags = (rate, body, hold, mounting_seed, seated_seed, license_note, overwrite)
     tasks = [(path, Job(out, root if root.is_dir() else root.parent, *flags)) for root, path in files]
     _check_targets(tasks, overwrite)
+    # Actor by actor, because takes of one actor share one zero pose.
+    tasks = [task for of_actor in by_actor(tasks).values() for task in of_actor]
     failed = []
     with ExitStack() as stack:
         if jobs == 1:
@@ -139,7 +150,7 @@ def synthesize(
             # Spawned, because a forked copy of a process with threads may hang.
             pool = stack.enter_context(ProcessPoolExecutor(jobs, mp_context=get_context("spawn")))
             results = [pool.submit(convert, *task).result for task in tasks]
-        for result, (_, path) in progress(list(zip(results, files, strict=True)), "synthesizing"):
+        for result, (path, _) in progress(list(zip(results, tasks, strict=True)), "synthesizing"):
             problem = result()
             if problem:
                 failed.append(path)
@@ -149,6 +160,22 @@ def synthesize(
         raise EdgeposeError(
             f"{len(failed)} of {len(files)} files could not be converted; see the messages above"
         )
+
+
+def by_actor(tasks: list[tuple[Path, Job]]) -> dict[str, list[tuple[Path, Job]]]:
+    """Return the motion files of each actor."""
+    groups: dict[str, list[tuple[Path, Job]]] = {}
+    for path, job in tasks:
+        groups.setdefault(about_take(path, job).actor, []).append((path, job))
+    return groups
+
+
+def about_take(path: Path, job: Job) -> TakeInfo:
+    """Return source, licence, actor and part of a motion file, by its path from the motion's folder on."""
+    info = take_info((job.root.absolute().name / path.relative_to(job.root)).with_suffix(""))
+    if info.source.name != OWN:
+        return info
+    return info._replace(source=info.source._replace(license=job.license_note))
 
 
 def _check_targets(tasks: list[tuple[Path, Job]], overwrite: bool) -> None:
@@ -201,6 +228,7 @@ def convert(path: Path, job: Job) -> str | None:
         with_hold,
     )
 
+    info = about_take(path, job)
     try:
         mounting = None if job.mounting_seed is None else random_mounting(job.mounting_seed)
         takes = pieces(read_motion(path))
@@ -218,7 +246,7 @@ def convert(path: Path, job: Job) -> str | None:
             part = f".part{i + 1}" if len(takes) > 1 else ""
             target = _target(path, job, part)
             target.parent.mkdir(parents=True, exist_ok=True)
-            arrays = recording_arrays(motion, imus, LICENSES[motion.source])
+            arrays = recording_arrays(motion, imus, info.source.license, info.source.name, info.actor)
             replace_file(
                 target,
                 lambda file, arrays=arrays: np.savez(file, **arrays),

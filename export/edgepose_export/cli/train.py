@@ -108,7 +108,7 @@ def _train(  # type: ignore[no-untyped-def]
     from edgepose_export.training.dataset import training_paths
 
     parts = [
-        _tape(processes.share(paths), processes, cache and cache / part)
+        _tape(processes.share(paths), data, processes, cache and cache / part)
         for part, paths in zip(("train", "validation"), training_paths(data), strict=True)
     ]
     about = training.describe_tape(parts[0], processes)
@@ -124,7 +124,7 @@ def _train(  # type: ignore[no-untyped-def]
     _fit(trainer, out, report)
 
 
-def _tape(paths: list[Path], processes, cache: Path | None):  # type: ignore[no-untyped-def]
+def _tape(paths: list[Path], data: Path, processes, cache: Path | None):  # type: ignore[no-untyped-def]
     """Return the takes of this process, in memory or packed into a folder of its own."""
     from edgepose_export.cli.progress import labelled
     from edgepose_export.training.dataset import read_take, tape
@@ -132,9 +132,9 @@ def _tape(paths: list[Path], processes, cache: Path | None):  # type: ignore[no-
 
     if cache is None:
         show = labelled("reading takes") if processes.rank == 0 else iter
-        return tape([read_take(path) for path in show(paths)])
+        return tape([read_take(path, data) for path in show(paths)])
     show = labelled("packing takes") if processes.rank == 0 else iter
-    return packed_tape(paths, cache / f"{processes.rank + 1}-of-{processes.size}", show)
+    return packed_tape(paths, cache / f"{processes.rank + 1}-of-{processes.size}", show, data)
 
 
 def _fit(trainer, out: Path, report: Callable[[str], None]) -> None:  # type: ignore[no-untyped-def]

@@ -107,10 +107,19 @@ def virtual_imus(motion: Motion, body: Body, mounting: Array | None = None) -> V
     )
 
 
-def recording_arrays(motion: Motion, imus: VirtualImus, license_note: str) -> dict[str, NDArray]:
+def recording_arrays(
+    motion: Motion, imus: VirtualImus, license_note: str, source: str = "own", actor: str = "own"
+) -> dict[str, NDArray]:
     """Return the arrays of an .npz file that is both an IMU recording and an AMASS-like motion file.
 
     It holds the sensors and the poses that they were made from.
+
+    Args:
+        motion: the motion.
+        imus: what the sensors measure of it.
+        license_note: licence of the motion.
+        source: name of its source, see `training.sources`.
+        actor: key of its actor.
     """
     arrays: dict[str, NDArray] = {"t": np.arange(len(motion.rotations)) / motion.rate}
     for i, name in enumerate(PLACEMENTS):
@@ -121,6 +130,7 @@ def recording_arrays(motion: Motion, imus: VirtualImus, license_note: str) -> di
     arrays["poses"] = poses.reshape(len(poses), 72).astype(np.float32)
     arrays["trans"] = motion.translation.astype(np.float32)
     arrays["mocap_framerate"] = np.array(motion.rate)
-    arrays["source"] = np.array(motion.source)
+    arrays["source"] = np.array(source)
+    arrays["actor"] = np.array(actor)
     arrays["license"] = np.array(license_note)
     return arrays

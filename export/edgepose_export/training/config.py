@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from edgepose.errors import EdgeposeError
+from edgepose.utils.similar_names import choices
 from edgepose.utils.text_files import read_toml
 from edgepose_export.networks.normalisation import SCHEMES
 from edgepose_export.networks.registry import NETWORKS
 from edgepose_export.networks.shape import NetworkShape
 from edgepose_export.synthesis.augmentation import Augmentation
+from edgepose_export.training.sources import OWN, SOURCES
 
 CONFIGS = Path(__file__).parent / "configs"
 """Folder with the configs of the shipped models."""
@@ -34,7 +36,8 @@ class TrainConfig:
             which is three times as fast.
         joined: whether sequences may cross the ends of takes, so that a network that is never reset learns to
             recover from a jump.
-        free_share: share of the sequences taken from CMU's takes.
+        shares: share of the sequences taken from each of some sources, by name (`sources.toml`) or by its
+            part before a dash (`snu`); sequences of other sources are taken in proportion to their frames.
         seated_share: share of the sequences taken from takes with synthetic sitting, if there are any; the
             other shares refer to the rest.
         input_dropout: share of the inputs set to zero (DIP: 0.2).
@@ -59,7 +62,7 @@ class TrainConfig:
     window: int = 120
     streamed: int = 0
     joined: bool = False
-    free_share: float = 0.0
+    shares: dict[str, float] = field(default_factory=dict)
     seated_share: float = 0.0
     input_dropout: float = 0.2
     smoothness: float = 0.0
@@ -116,16 +119,18 @@ def config_from(values: dict[str, Any]) -> TrainConfig:
         ValueError: a field is unknown, or its value has the wrong type or is out of range; names the field.
     """
     values = dict(values)
+    shares = _shares(values.pop("shares", {}), values.pop("free_share", 0.0))
     tables: dict[str, Any] = {"network": NetworkShape, "augmentation": Augmentation}
     for name, kind in tables.items():
         table = values.pop(name, {})
         if not isinstance(table, dict):
             raise ValueError(f"{name} is {table!r}; it must be a table [{name}]")
         values[name] = kind(**_checked(table, kind()._asdict(), f" in [{name}]"))
-    defaults = {f.name: getattr(TrainConfig, f.name) for f in fields(TrainConfig) if f.name not in tables}
+    defaults = {f.name: f.default for f in fields(TrainConfig) if f.default is not MISSING}
     config = TrainConfig(
         **_checked({k: v for k, v in values.items() if k not in tables}, defaults),
         **{name: values[name] for name in tables},
+        shares=shares,
     )
     if config.network.measured == "passed" and config.network.targets != "global-6d":
         raise ValueError('measured = "passed" needs targets = "global-6d"')
@@ -145,6 +150,21 @@ def config_from(values: dict[str, Any]) -> TrainConfig:
             f"streamed is {config.streamed}; it must be less than window, which is {config.window}"
         )
     return config
+
+
+def _shares(table: Any, free_share: Any) -> dict[str, float]:
+    """Return the checked table `[shares]`; `free_share` is what CMU's share was called in older configs."""
+    if not isinstance(table, dict):
+        raise ValueError(f"shares is {table!r}; it must be a table [shares]")
+    table = table or ({"cmu": free_share} if free_share else {})
+    names = {*SOURCES, *(name.split("-")[0] for name in SOURCES), OWN}
+    for name in table:
+        if name not in names:
+            raise ValueError(f"unknown source {name!r} in [shares]; {choices(name, sorted(names))}")
+    shares = _checked(table, dict.fromkeys(table, 0.0), high=1.0)
+    if sum(shares.values()) > 1.0 + 1e-9:
+        raise ValueError(f"the shares in [shares] sum up to {sum(shares.values()):g}; at most 1 is possible")
+    return {name: float(share) for name, share in shares.items()}
 
 
 def _kinds(ability: str) -> str:
@@ -173,7 +193,6 @@ _RANGES: dict[str, tuple[float, float]] = {
     "warm_up": (0, 10**9),
     "averaging": (0.0, 1.0),
     "input_dropout": (0.0, 0.99),
-    "free_share": (0.0, 1.0),
     "seated_share": (0.0, 1.0),
     "aligned": (0.0, 1.0),
     "mirror": (0.0, 1.0),
@@ -183,7 +202,9 @@ _RANGES: dict[str, tuple[float, float]] = {
 """Least and greatest values of numbers; those of all other fields are 0 and 1000."""
 
 
-def _checked(values: dict[str, Any], defaults: dict[str, Any], where: str = "") -> dict[str, Any]:
+def _checked(
+    values: dict[str, Any], defaults: dict[str, Any], where: str = "", high: float = 1000
+) -> dict[str, Any]:
     """Return the values if each is in range and has the type of its default (or is whole, for a float)."""
     for name, value in values.items():
         if name not in defaults:
@@ -195,9 +216,9 @@ def _checked(values: dict[str, Any], defaults: dict[str, Any], where: str = "") 
         if kind is str and value not in _CHOICES[name]:
             raise ValueError(f"{name} is {value!r}; it must be {' or '.join(map(repr, _CHOICES[name]))}")
         if kind in (int, float):
-            low, high = _RANGES.get(name, (0, 1000))
-            if not low <= value <= high:
-                raise ValueError(f"{name} is {value!r}; it must be from {low:g} to {high:g}")
+            least, most = _RANGES.get(name, (0, high))
+            if not least <= value <= most:
+                raise ValueError(f"{name} is {value!r}; it must be from {least:g} to {most:g}")
     return values
 
 

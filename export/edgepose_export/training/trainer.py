@@ -118,10 +118,12 @@ class Trainer:
         self.config, self.train_tape, self.validation_tape = config, train, validation
         self.data, self.processes = data, processes
         seated = train.seated if config.seated_share else [False] * len(train.names)
-        self.starts = window_starts(train, config.window, config.joined, lambda take: not seated[take])
+        self.starts = window_starts(
+            train, config.window, config.joined, lambda take: not seated[take], config.shares
+        )
         self.seated_starts = window_starts(train, config.window, config.joined, seated.__getitem__)
         self.has_sitting = windows_with_sitting(train, config.window)
-        counts = processes.gathered(len(torch.cat(self.starts)))
+        counts = processes.gathered(sum(map(len, self.starts.values())))
         if not all(counts):
             where = f"process {counts.index(0)} has " if processes.size > 1 else ""
             raise EdgeposeError(f"{where}no training take is as long as the window of {config.window} frames")
@@ -187,10 +189,10 @@ class Trainer:
         for group in self.optimiser.param_groups:
             group["lr"] = rate * min(1.0, (self.step + 1) / (config.warm_up + 1))
         count = config.sequences // self.processes.size
-        seated = round(count * config.seated_share) if len(torch.cat(self.seated_starts)) else 0
-        starts = sample_windows(self.starts, count - seated, config.free_share, self.generator)
+        seated = round(count * config.seated_share) if len(self.seated_starts[""]) else 0
+        starts = sample_windows(self.starts, count - seated, config.shares, self.generator)
         if seated:
-            starts = torch.cat([starts, sample_windows(self.seated_starts, seated, 0.0, self.generator)])
+            starts = torch.cat([starts, sample_windows(self.seated_starts, seated, {}, self.generator)])
         batch = self._batch(starts)
         loss = self._loss(self.parallel, batch, config.input_dropout, config.smoothness)
         self.optimiser.zero_grad(set_to_none=True)
@@ -231,7 +233,7 @@ class Trainer:
 
     def _validation_starts(self) -> Tensor:
         window = self.config.window
-        return torch.cat(window_starts(self.validation_tape, window, False))[:: max(1, window // 2)]
+        return window_starts(self.validation_tape, window, False)[""][:: max(1, window // 2)]
 
     @torch.no_grad()
     def validate(self) -> float:
