@@ -16,7 +16,8 @@ from edgepose_export.evaluation.evaluate import Mode, run_archive
 from edgepose_export.mocap import read_motion, resample
 from edgepose_export.networks.shape import NetworkShape
 from edgepose_export.synthesis.virtual_imus import recording_arrays, virtual_imus
-from edgepose_export.training.dataset import Take, describe, read_take
+from edgepose_export.training.dataset import Take, read_take
+from edgepose_export.training.description import describe
 
 WALK = Path(__file__).parents[1] / "data" / "mocap" / "dataset-2_walk_normal_001.bvh"
 BIRNN = NetworkShape("birnn", 8, "global-6d", "passed")
@@ -235,7 +236,9 @@ def test_description_of_takes(walk):
         "CMU Graphics Lab Motion Capture Database (mocap.cs.cmu.edu), free for all use",
         "Bandai-Namco Research Motiondataset, CC BY-NC 4.0",
     )
-    about = describe((*licenses, licenses[0]), 3, 3 * len(walk.pose))
+    takes = [(f"{i}", len(walk.pose)) for i in range(3)]
+    about = describe((*licenses, licenses[0]), ("cmu", "bandai-namco", "cmu"), takes)
+    assert about["free"] == {"cmu": True, "bandai-namco": False}
     assert about["summary"] == (
         "Bandai-Namco Research Motiondataset and CMU Graphics Lab Motion Capture Database"
     )

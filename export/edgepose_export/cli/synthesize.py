@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import click
 
@@ -17,6 +17,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.skeleton import Body
 from edgepose.utils.durable_files import replace_file
 from edgepose.utils.output_targets import check_free
+from edgepose_export.cli.journal import Journal
 from edgepose_export.training.sources import OWN, UNKNOWN, TakeInfo, take_info
 
 KINDS = (".bvh", ".amc", ".npz")
@@ -97,6 +98,12 @@ class Job(NamedTuple):
 )
 @overwrite_option
 @click.option(
+    "--resume",
+    is_flag=True,
+    help="Go on with an interrupted call that had --resume and the same flags: files that it completed are "
+    "left as they are.",
+)
+@click.option(
     "--jobs", type=click.IntRange(1), default=1, show_default=True, help="Files to process in parallel."
 )
 def synthesize(
@@ -110,6 +117,7 @@ def synthesize(
     seated_seed: int | None,
     license_note: str,
     overwrite: bool,
+    resume: bool,
     jobs: int,
 ) -> None:
     """Make IMU recordings with true poses from motion capture (.bvh, .amc, AMASS .npz; folders are searched).
@@ -125,7 +133,6 @@ def synthesize(
     """
     from edgepose.formats.smpl_model import read_smpl
     from edgepose.skeleton import default_body
-    from edgepose_export.cli.progress import progress
 
     if hold * rate > MOST_HOLD_FRAMES:
         raise click.UsageError(
@@ -135,14 +142,33 @@ def synthesize(
         raise click.UsageError("--body sets the height: omit --height")
     body = read_smpl(body_path) if body_path else default_body(height or 1.75)
     files = [(root, path) for root in inputs for path in motion_files(root)]
+    # A recipe of `edgepose train` hands over the files that it wants.
+    chosen = click.get_current_context().obj
+    if chosen is not None:
+        files = [(root, path) for root, path in files if path in chosen]
     if not files:
         raise EdgeposeError(f"no motion files ({', '.join(KINDS)}) in {', '.join(map(str, inputs))}")
+    journal = Journal(out, _settings(click.get_current_context())) if resume else None
+    overwrite |= journal is not None and journal.begun  # pieces of the file at which it was interrupted
     flags = (rate, body, hold, mounting_seed, seated_seed, license_note, overwrite)
     tasks = [(path, Job(out, root if root.is_dir() else root.parent, *flags)) for root, path in files]
     _check_targets(tasks, overwrite)
     # Actor by actor, because takes of one actor share one zero pose.
     tasks = [task for of_actor in by_actor(tasks).values() for task in of_actor]
-    failed = []
+    if journal:
+        journal.begin()
+        tasks = [task for task in tasks if _name(*task) not in journal]
+    failed = _convert_all(tasks, jobs, journal)
+    say(f"{len(files) - failed} of {len(files)} recordings written to {out}")
+    if failed:
+        raise NotAllConvertedError(failed, len(files))
+
+
+def _convert_all(tasks: list[tuple[Path, Job]], jobs: int, journal: Journal | None) -> int:
+    """Convert files, in several processes if `jobs` is more than 1; return how many cannot be converted."""
+    from edgepose_export.cli.progress import progress
+
+    failed = 0
     with ExitStack() as stack:
         if jobs == 1:
             results = [partial(convert, *task) for task in tasks]
@@ -150,16 +176,41 @@ def synthesize(
             # Spawned, because a forked copy of a process with threads may hang.
             pool = stack.enter_context(ProcessPoolExecutor(jobs, mp_context=get_context("spawn")))
             results = [pool.submit(convert, *task).result for task in tasks]
-        for result, (path, _) in progress(list(zip(results, tasks, strict=True)), "synthesizing"):
+        for result, task in progress(list(zip(results, tasks, strict=True)), "synthesizing"):
             problem = result()
             if problem:
-                failed.append(path)
+                failed += 1
                 say(f"skipped: {problem}")
-    say(f"{len(files) - len(failed)} of {len(files)} recordings written to {out}")
-    if failed:
-        raise EdgeposeError(
-            f"{len(failed)} of {len(files)} files could not be converted; see the messages above"
-        )
+            elif journal:
+                journal.add(_name(*task))
+    return failed
+
+
+class NotAllConvertedError(EdgeposeError):
+    """Some motion files could not be converted; the recordings of the others are complete.
+
+    Attributes:
+        count: number of these files.
+    """
+
+    def __init__(self, count: int, files: int) -> None:
+        """Create the error; `files` is the number of all files."""
+        super().__init__(f"{count} of {files} files could not be converted; see the messages above")
+        self.count = count
+
+
+def _settings(context: click.Context) -> dict[str, Any]:
+    """Return the inputs and flags that decide what the recordings are."""
+    return {
+        name: value
+        for name, value in context.params.items()
+        if name not in ("out", "overwrite", "resume", "jobs")
+    }
+
+
+def _name(path: Path, job: Job) -> str:
+    """Return the name of a motion file in the journal: its path below the folder of the motion."""
+    return path.relative_to(job.root).as_posix()
 
 
 def by_actor(tasks: list[tuple[Path, Job]]) -> dict[str, list[tuple[Path, Job]]]:

@@ -76,10 +76,11 @@ class TrainConfig:
     seed: int = 0
 
 
-def read_config(path: Path) -> TrainConfig:
-    """Read a TOML file with TrainConfig's fields and the tables `[network]` and `[augmentation]`.
+def read_config(path: Path, settings: dict[str, Any] | None = None) -> TrainConfig:
+    """Read a TOML file with TrainConfig's fields and the tables `[network]`, `[augmentation]` and `[shares]`.
 
-    A file with `base = "NAME"` contains only what differs from NAME.toml in the same folder.
+    A file with `base = "NAME"` contains only what differs from NAME.toml in the same folder. `settings`
+    override values of the file.
 
     Raises:
         EdgeposeError: the file is missing or not TOML, or has an unknown field, a value of a wrong type, or a
@@ -92,7 +93,7 @@ def read_config(path: Path) -> TrainConfig:
             if not isinstance(name, str):
                 raise ValueError(f"base is {name!r}; it must be the name of a config in the same folder")
             values = _merged(_toml(path.with_name(f"{name}.toml")), values)
-        return config_from(values)
+        return config_from(_merged(values, settings or {}))
     except ValueError as error:
         raise EdgeposeError(f"{path}: {error}") from error
 
@@ -104,10 +105,10 @@ def _toml(path: Path) -> dict[str, Any]:
 
 
 def _merged(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
-    """Return the values of a base, overridden by others; tables are merged entry by entry."""
+    """Return the values of a base, overridden by others; tables but `[shares]` are merged entry by entry."""
     result = base | values
     for name, table in values.items():
-        if isinstance(table, dict) and isinstance(base.get(name), dict):
+        if name != "shares" and isinstance(table, dict) and isinstance(base.get(name), dict):
             result[name] = base[name] | table
     return result
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -108,8 +107,8 @@ def read_take(path: Path, root: Path | None = None) -> Take:
         acceleration.astype(np.float32),
         local.astype(np.float32),
         license_note,
-        source,
-        actor,
+        source=source,
+        actor=actor,
     )
 
 
@@ -260,14 +259,3 @@ def root_relative_pose(local: Tensor) -> Tensor:
     for joint in range(1, 24):
         result.append(result[PARENTS[joint]] @ local[..., joint, :, :])
     return torch.stack(result, dim=-3)
-
-
-def describe(licenses: Iterable[str], takes: int, frames: int) -> dict[str, Any]:
-    """Return the description of the training motion for an archive's card."""
-    licenses = sorted(set(licenses))
-    return {
-        "summary": " and ".join(text.split(",")[0].split(" (")[0] for text in licenses),
-        "licenses": licenses,
-        "takes": takes,
-        "hours": frames / RATE / 3600.0,
-    }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,8 @@ from edgepose_export.training.checkpoints import (
     shape_of,
 )
 from edgepose_export.training.config import TrainConfig, config_values
-from edgepose_export.training.dataset import PackedTakes, describe
+from edgepose_export.training.dataset import PackedTakes
+from edgepose_export.training.description import describe, further_run
 from edgepose_export.training.distributed import ALONE, Processes
 from edgepose_export.training.losses import likelihood_loss, smoothness_loss
 from edgepose_export.training.windows import sample_windows, window_starts, windows, windows_with_sitting
@@ -79,9 +80,9 @@ def compute_statistics(tape: PackedTakes, shape: NetworkShape, processes: Proces
 
 def describe_tape(tape: PackedTakes, processes: Processes = ALONE) -> dict[str, Any]:
     """Return the description of the takes of all processes for an archive's card."""
-    shares = processes.gathered((tape.licenses, int(tape.starts[-1])))
-    licenses = [text for texts, _ in shares for text in texts]
-    return describe(licenses, len(licenses), sum(frames for _, frames in shares))
+    takes = list(zip(tape.names, tape.starts.diff().tolist(), strict=True))
+    gathered = processes.gathered((tape.licenses, tape.sources, takes))
+    return describe(*(chain.from_iterable(lists) for lists in zip(*gathered, strict=True)))
 
 
 # --- the run ------------------------------------------------------------------------------------------------
@@ -104,7 +105,8 @@ class Trainer:
             config: settings of the run.
             train: this process's share of the takes to train on.
             validation: this process's share of the takes for validation.
-            data: description of the training takes for the archive's card: summary, takes, hours, licenses.
+            data: description for the archive's card: that of the takes, see `description.describe`, and, if
+                they are known, "run" (name of this run) and "recipe".
             processes: processes that train together.
 
         Raises:
@@ -288,7 +290,8 @@ class Trainer:
     def start_from(self, state: dict[str, Any]) -> None:
         """Start fine-tuning (DIP 3.4.4) from a checkpoint's averaged weights and statistics.
 
-        Its training data and licences are added to the description of this run's takes.
+        Its training data and licences are added to the description of this run's takes, and the run itself to
+        the earlier ones.
 
         Raises:
             EdgeposeError: the checkpoint is of another network; only `smoothing` may differ.
@@ -297,13 +300,7 @@ class Trainer:
         self.statistics = self._placed(Statistics(**state["statistics"]))
         self.network.load_state_dict(state["averaged"])
         self.averaged.load_state_dict(state["averaged"])
-        before = state["data"]
-        self.data = {
-            "summary": f"{before['summary']}, then {self.data['summary']}",
-            "licenses": sorted({*before["licenses"], *self.data["licenses"]}),
-            "takes": before["takes"] + self.data["takes"],
-            "hours": before["hours"] + self.data["hours"],
-        }
+        self.data = further_run(state["data"], state["step"], self.data)
 
     def _check_shape(self, state: dict[str, Any], **other: Any) -> None:
         """Check that the checkpoint's network is that of the config, apart from `other` fields."""
