@@ -24,7 +24,7 @@ from edgepose.pipeline.dropout import extrapolate_dropouts
 from edgepose.placements import PLACEMENTS, ROOT
 from edgepose_export.evaluation.evaluate import Mode, groups, modes_of, run_archive, takes_of
 from edgepose_export.training.dataset import RATE, Take
-from edgepose_export.training.splits import HELD_OUT
+from edgepose_export.training.sources import HELD_OUT
 
 Array = NDArray[np.float64]
 

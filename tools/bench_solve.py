@@ -149,10 +149,9 @@ class Sample(NamedTuple):
 
 def takes(data: Path, part: str, every: int, body: Body) -> Iterator[Sample]:
     """Yield every `every`-th take of a part of the split, on the wearer's body."""
-    from edgepose_export.training.splits import part_of
+    from edgepose_export.training.dataset import take_paths
 
-    paths = sorted((p for p in data.rglob("*.npz") if part_of(p.stem) == part), key=lambda p: p.stem)
-    for number, path in enumerate(paths[::every]):
+    for number, path in enumerate(take_paths(data, part)[::every]):
         with np.load(path, allow_pickle=False) as file:
             pose = rot.rotvec_to_matrix(file["poses"].reshape(-1, 24, 3).astype(float))
             translation = file["trans"].astype(float)

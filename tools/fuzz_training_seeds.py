@@ -17,7 +17,6 @@ sequences = 2
 window = 20
 validate_every = 1
 learning_rate = 0.001
-free_share = 0.25
 averaging = 0.9
 
 [network]
@@ -25,6 +24,9 @@ kind = "rnn"
 hidden = 8
 targets = "global-6d"
 measured = "passed"
+
+[shares]
+cmu = 0.25
 
 [augmentation]
 heading_deg = 4.0

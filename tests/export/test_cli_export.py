@@ -19,6 +19,7 @@ from edgepose.skeleton import JOINTS, default_body, forward_kinematics
 from edgepose_export.archive.torchscript import Statistics, new_network, script
 from edgepose_export.training.config import config_from
 from edgepose_export.training.dataset import read_take
+from edgepose_export.training.sources import HELD_OUT
 from edgepose_export.training.trainer import mean_of, read_checkpoint
 from tests.support import processes
 
@@ -103,7 +104,7 @@ def test_train(made):
     state = read_checkpoint(folder / "run" / "checkpoint.pt")
     assert state["step"] == 6
     assert state["data"]["takes"] == 1
-    assert "CC BY-NC" in state["data"]["licenses"][0]
+    assert "CMU" in state["data"]["licenses"][0]
 
 
 def test_figures_of_another_model_stand_beside(made, tmp_path):
@@ -136,8 +137,8 @@ def test_metadata(made):
     assert (about["targets"], about["measured_bones"]) == ("global-6d", "passed")
     training = about["training"]
     assert training["config"]["network"]["hidden"] == 8
-    assert training["summary"] == "Bandai-Namco Research Motiondataset"
-    assert "CC BY-NC" in training["licenses"][0]
+    assert training["summary"] == "CMU Graphics Lab Motion Capture Database"
+    assert "free for all use" in training["licenses"][0]
     assert (training["takes"], training["steps"]) == (1, read_checkpoint(folder / "run" / "best.pt")["step"])
     assert training["hours"] == pytest.approx(119 / 60 / 3600)
     assert about["torch"] == torch.__version__
@@ -165,7 +166,7 @@ def test_a_folder_without_held_out_takes(made, tmp_path):
         (tmp_path / "own" / f"{name}.npz").write_bytes(take.read_bytes())
     to = ("export", folder / "run" / "best.pt", "--out", tmp_path / "a.pt")
     said = edgepose(*to, "--measure", tmp_path / "own")
-    assert "has no recordings of cmu-walk-run, cmu-02, bandai-styles; measuring on validation" in said.stderr
+    assert f"has no recordings of {', '.join(HELD_OUT)}; measuring on validation" in said.stderr
     assert set(archive.read_info(tmp_path / "a.pt").metadata["measures"]) == {"validation"}
     assert "### validation" in (tmp_path / "a.md").read_text()
     said = edgepose("evaluate", "--model", "rnn-cmu", "--data", tmp_path / "own")
@@ -178,7 +179,8 @@ def test_a_held_out_part_that_is_missing_is_named(made, tmp_path):
     take = folder / "recordings" / "07_01.npz"
     (tmp_path / "07_01.npz").write_bytes(take.read_bytes())
     said = edgepose("evaluate", "--model", "rnn-cmu", "--data", tmp_path)
-    assert "has no recordings of cmu-02, bandai-styles; measuring on cmu-walk-run" in said.stderr
+    lacking = ", ".join(part for part in HELD_OUT if part != "cmu-walk-run")
+    assert f"has no recordings of {lacking}; measuring on cmu-walk-run" in said.stderr
     assert said.stdout.startswith("\ncmu-walk-run\n")
 
 
@@ -193,8 +195,7 @@ def test_card(made):
         "8 units",
         "at 60 Hz",
         ", ".join(PLACEMENTS),
-        "CC BY-NC 4.0",
-        "non-commercial",
+        "free for all use",
         "### cmu-walk-run",
         "### bandai-styles",
         "### Precision of the weights",

@@ -16,8 +16,8 @@ from edgepose_export.evaluation.evaluate import Mode, run_archive
 from edgepose_export.mocap import read_motion, resample
 from edgepose_export.networks.shape import NetworkShape
 from edgepose_export.synthesis.virtual_imus import recording_arrays, virtual_imus
-from edgepose_export.training.dataset import Take, describe, read_take, take_paths, training_paths
-from edgepose_export.training.splits import HELD_OUT, part_of
+from edgepose_export.training.dataset import Take, read_take
+from edgepose_export.training.description import describe
 
 WALK = Path(__file__).parents[1] / "data" / "mocap" / "dataset-2_walk_normal_001.bvh"
 BIRNN = NetworkShape("birnn", 8, "global-6d", "passed")
@@ -200,74 +200,7 @@ def test_baselines_need_no_more_memory_for_more_takes(walk, monkeypatch):
     np.testing.assert_allclose(many.offsets, few.offsets, atol=1e-9)
 
 
-# --- the split ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("name", "part"),
-    [
-        ("01_01", "train"),
-        ("05_20.part2", "train"),
-        ("06_15", "train"),
-        ("directing_traffic_1.part6", "train"),
-        ("02_03", "cmu-02"),
-        ("02_03.part1", "cmu-02"),
-        ("03_01", "validation"),
-        ("07_12", "cmu-walk-run"),
-        ("08_01", "cmu-walk-run"),
-        ("09_12", "cmu-walk-run"),
-        ("09_12.part2", "cmu-walk-run"),
-        ("107_12", "train"),
-        ("dataset-1_walk_tired_001", "bandai-styles"),
-        ("dataset-2_run_exhausted_010.part1", "bandai-styles"),
-        ("dataset-1_bow_not-confident_001", "validation"),
-        ("dataset-1_bow_active_001", "train"),
-        ("dataset-2_walk_normal_001", "train"),
-        ("my walk", "train"),
-    ],
-)
-def test_part_of_the_split(name, part):
-    assert part_of(name) == part
-    assert part in (*HELD_OUT, "train", "validation")
-
-
-NAMES = [
-    *(f"{subject:02}_{take:02}" for subject in (1, 2, 3, 5, 6, 7, 8, 9) for take in (1, 12)),
-    *(
-        f"dataset-{part}_{motion}_{style}_{number:03}"
-        for part in (1, 2)
-        for motion in ("walk", "raise-up-both-hands")
-        for style in ("normal", "exhausted", "tired", "not-confident", "active", "masculine")
-        for number in (1, 27)
-    ),
-]
-
-
-def test_no_take_leaks(tmp_path):
-    """Every take has one part, neither its pieces nor copies elsewhere have another, and training sees no
-    held-out subject or style.
-    """
-    for name in NAMES:
-        for piece in (name, f"{name}.part2"):
-            for folder in ("", "standing", "seated"):
-                (tmp_path / folder).mkdir(exist_ok=True)
-                (tmp_path / folder / f"{piece}.npz").touch()
-            assert part_of(piece) == part_of(name)
-    parts = {part: take_paths(tmp_path, part) for part in ("train", "validation", *HELD_OUT)}
-    assert sum(map(len, parts.values())) == 6 * len(NAMES) == len(set().union(*parts.values()))
-    train, validation = training_paths(tmp_path)
-    assert (train, validation) == (parts["train"], parts["validation"])
-
-    def kinds(paths):
-        """Subjects of CMU and styles of Bandai-Namco."""
-        words = (path.stem.split(".")[0].split("_") for path in paths)
-        return {word[2] if len(word) == 4 else word[0] for word in words}
-
-    assert kinds(train) == {"01", "05", "06", "normal", "active", "masculine"}
-    assert kinds(validation) == {"03", "not-confident"}
-    assert kinds(parts["cmu-walk-run"]) == {"07", "08", "09"}
-    assert kinds(parts["cmu-02"]) == {"02"}
-    assert kinds(parts["bandai-styles"]) == {"exhausted", "tired"}
+# --- folders of takes --------------------------------------------------------------------------------------
 
 
 def test_tables_of_a_folder(tmp_path, tiny, walk):
@@ -287,8 +220,15 @@ def test_tables_of_a_folder(tmp_path, tiny, walk):
             assert set(row) == set(metrics.LABELS)
             assert row["sip_error_deg"].frames == frames
             assert np.isfinite([value.mean for value in row.values()]).all()
+    for name in ("s_008_1_1", "tennis_KangTennisF18"):
+        np.savez(tmp_path / f"{name}.npz", **arrays)
+    parts = ("sports", "tennis", "basketball")
+    sports = evaluation.columns_of_parts(methods, tmp_path, parts)
+    for name in methods:
+        errors = [sports[part][name]["sip_error_deg"] for part in ("basketball", "tennis")]
+        np.testing.assert_array_equal(sports["sports"][name]["sip_error_deg"], np.concatenate(errors))
     with pytest.raises(EdgeposeError, match="no recording of the part 'bandai-styles'"):
-        evaluation.columns_of_parts(methods, tmp_path, HELD_OUT)
+        evaluation.columns_of_parts(methods, tmp_path, ["bandai-styles"])
 
 
 def test_description_of_takes(walk):
@@ -296,7 +236,9 @@ def test_description_of_takes(walk):
         "CMU Graphics Lab Motion Capture Database (mocap.cs.cmu.edu), free for all use",
         "Bandai-Namco Research Motiondataset, CC BY-NC 4.0",
     )
-    about = describe((*licenses, licenses[0]), 3, 3 * len(walk.pose))
+    takes = [(f"{i}", len(walk.pose)) for i in range(3)]
+    about = describe((*licenses, licenses[0]), ("cmu", "bandai-namco", "cmu"), takes)
+    assert about["free"] == {"cmu": True, "bandai-namco": False}
     assert about["summary"] == (
         "Bandai-Namco Research Motiondataset and CMU Graphics Lab Motion Capture Database"
     )

@@ -9,11 +9,11 @@ import torch
 
 from edgepose.errors import EdgeposeError
 from edgepose.skeleton import default_body
-from edgepose_export.cli.synthesize import LICENSES
 from edgepose_export.mocap import read_motion, resample
 from edgepose_export.synthesis.virtual_imus import recording_arrays, virtual_imus
 from edgepose_export.training.dataset import read_take, tape
 from edgepose_export.training.memory_map import FRAME, packed_tape
+from edgepose_export.training.sources import SOURCES
 from edgepose_export.training.windows import windows
 
 DATA = Path(__file__).parents[1] / "data" / "mocap"
@@ -24,7 +24,8 @@ def paths(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recordings")
     for source in ("dataset-2_walk_normal_001.bvh", "07_01.bvh"):
         motion = resample(read_motion(DATA / source))
-        arrays = recording_arrays(motion, virtual_imus(motion, default_body()), LICENSES[motion.source])
+        imus, source = virtual_imus(motion, default_body()), SOURCES[motion.source]
+        arrays = recording_arrays(motion, imus, source.license, source.name)
         np.savez(folder / f"{Path(source).stem}.npz", **arrays)
     return sorted(folder.glob("*.npz"))
 
@@ -51,7 +52,7 @@ def test_packed_tape_is_the_tape(paths, tmp_path):
     packed = packed_tape(paths, tmp_path / "tape")
     expected = tape([read_take(path) for path in paths])
     assert alike(packed, expected)
-    assert packed.free == expected.free == [True, False]
+    assert packed.sources == expected.sources == ["cmu", "bandai-namco"]
     starts = torch.tensor([3, 60])
     for got, wanted in zip(windows(packed, starts, 20), windows(expected, starts, 20), strict=True):
         assert torch.equal(got, wanted)

@@ -15,13 +15,13 @@ from click.testing import CliRunner
 from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
 from edgepose.skeleton import default_body
-from edgepose_export.cli.synthesize import LICENSES
 from edgepose_export.mocap import read_motion, resample
 from edgepose_export.networks.shape import NetworkShape
 from edgepose_export.synthesis.virtual_imus import recording_arrays, virtual_imus
 from edgepose_export.training.config import TrainConfig
 from edgepose_export.training.dataset import read_take, tape
 from edgepose_export.training.distributed import ALONE, Processes
+from edgepose_export.training.sources import SOURCES
 from edgepose_export.training.trainer import Trainer, compute_statistics, read_checkpoint
 from tests.support import processes
 from tests.support.datagrams import free_address
@@ -129,7 +129,8 @@ def run(tmp_path_factory):
     (folder / "recordings").mkdir()
     (folder / "tiny.toml").write_text(CONFIG)
     motion = resample(read_motion(DATA / "dataset-2_walk_normal_001.bvh"))
-    arrays = recording_arrays(motion, virtual_imus(motion, default_body()), LICENSES[motion.source])
+    imus, source = virtual_imus(motion, default_body()), SOURCES[motion.source]
+    arrays = recording_arrays(motion, imus, source.license, source.name)
     for i, name in enumerate(("01_01", "01_02", "05_01", "03_01")):
         rows = {key: value[: 119 - 10 * i] if value.ndim else value for key, value in arrays.items()}
         np.savez(folder / "recordings" / f"{name}.npz", **rows)

@@ -140,7 +140,7 @@ def mounted(tmp_path_factory):
     motion = with_hold(resample(read_motion(WALK), 60.0), 3.0)
     imus = virtual_imus(motion, default_body(), MOUNTING)
     path = tmp_path_factory.mktemp("synthesis") / "walk.npz"
-    np.savez(path, **recording_arrays(motion, imus, "free for all use"))
+    np.savez(path, **recording_arrays(motion, imus, "free for all use", "bandai-namco", "two"))
     return path, motion, imus
 
 
@@ -161,6 +161,7 @@ def test_recording_round_trip(mounted):
         assert float(arrays["mocap_framerate"]) == 60.0
         assert str(arrays["license"]) == "free for all use"
         assert str(arrays["source"]) == "bandai-namco"
+        assert str(arrays["actor"]) == "two"
 
 
 def test_calibrating_a_mounted_recording_gives_the_true_bones_back(mounted):

@@ -14,7 +14,6 @@ from edgepose.inference.features import network_input
 from edgepose.placements import BONES, ROOT
 from edgepose.skeleton import PARENTS, PREDICTED, default_body
 from edgepose_export.archive.torchscript import Statistics
-from edgepose_export.cli.synthesize import LICENSES
 from edgepose_export.mocap import read_motion, resample
 from edgepose_export.networks.registry import NETWORKS
 from edgepose_export.networks.shape import NetworkShape, PoseDecoder, smoothed
@@ -23,6 +22,7 @@ from edgepose_export.synthesis.virtual_imus import recording_arrays, virtual_imu
 from edgepose_export.training import trainer as training
 from edgepose_export.training.config import TrainConfig, config_from
 from edgepose_export.training.dataset import read_take, tape, training_paths
+from edgepose_export.training.sources import SOURCES
 from edgepose_export.training.trainer import Trainer, read_checkpoint, save_checkpoint
 from edgepose_export.training.windows import sample_windows, window_starts, windows
 
@@ -34,7 +34,7 @@ SMALL = TrainConfig(
     steps=12,
     sequences=4,
     window=20,
-    free_share=0.25,
+    shares={"cmu": 0.25},
     input_dropout=0.1,
     averaging=0.9,
     validate_every=4,
@@ -53,7 +53,8 @@ def files(tmp_path_factory):
     }
     for name, source in sources.items():
         motion = resample(read_motion(DATA / source))
-        arrays = recording_arrays(motion, virtual_imus(motion, default_body()), LICENSES[motion.source])
+        imus, source = virtual_imus(motion, default_body()), SOURCES[motion.source]
+        arrays = recording_arrays(motion, imus, source.license, source.name)
         np.savez(folder / f"{name}.npz", **arrays)
     return folder
 
@@ -183,34 +184,45 @@ def test_windows_stay_inside_takes(takes):
     together = tape(takes)
     ends = together.starts.tolist()
     for joined in (False, True):
-        others, cmu = window_starts(together, 20, joined)
+        starts = window_starts(together, 20, joined, shares=["cmu"])
+        others, cmu = starts[""], starts["cmu"]
         assert set(cmu.tolist()) <= set(range(ends[0], ends[1]))  # 01_01 comes first
         for start in torch.cat([others, cmu]).tolist():
             inside = any(a <= start and start + 20 <= b for a, b in pairwise(ends))
             assert inside or (joined and start + 20 <= ends[-1])
-    one = sum(len(x) for x in window_starts(together, 20, False))
-    assert one == sum(len(take.pose) - 19 for take in takes)
-    assert sum(len(x) for x in window_starts(together, 20, True)) == ends[-1] - 19
+    assert len(window_starts(together, 20, False)[""]) == sum(len(take.pose) - 19 for take in takes)
+    assert len(window_starts(together, 20, True)[""]) == ends[-1] - 19
 
 
-@pytest.mark.parametrize("share", [0.25, 0.5])
-def test_share_of_cmu(takes, share):
-    starts = window_starts(tape(takes), 20, False)
-    drawn = sample_windows(starts, 40, share, torch.Generator().manual_seed(0))
+@pytest.mark.parametrize(
+    ("shares", "counts"),
+    [
+        ({"cmu": 0.25}, {"": 30, "cmu": 10}),
+        ({"cmu": 0.5, "bandai": 0.5}, {"cmu": 20, "bandai": 20}),
+        ({"cmu": 0.1, "bandai": 0.1, "snu": 0.5}, {"cmu": 20, "bandai": 20}),  # no take of snu
+        ({"snu": 1.0}, {"": 40}),
+        ({"cmu": 0.0, "bandai-namco": 0.0}, {"cmu": 20, "bandai-namco": 20}),
+        ({}, {"": 40}),
+    ],
+)
+def test_shares_of_sources(takes, shares, counts):
+    starts = window_starts(tape(takes), 20, False, shares=shares)
+    drawn = sample_windows(starts, 40, shares, torch.Generator().manual_seed(0)).tolist()
     assert len(drawn) == 40
-    assert sum(int(s) in starts[1].tolist() for s in drawn) == 40 * share
+    found = {name: len([start for start in drawn if start in group]) for name, group in starts.items()}
+    assert {name: count for name, count in found.items() if count} == counts
 
 
 def test_share_of_made_sitting(takes):
     made = [takes[0]._replace(name=f"{takes[0].name}.seated"), *takes[1:]]
-    config = replace(SMALL, sequences=8, seated_share=0.25, free_share=0.0)
+    config = replace(SMALL, sequences=8, seated_share=0.25, shares={})
     one = Trainer(config, tape(made), tape(takes), ABOUT)
     end = len(made[0].pose)
-    assert (torch.cat(one.starts) >= end).all()
-    assert len(torch.cat(one.made_starts[".seated"])) == end - 19
+    assert (one.starts[""] >= end).all()
+    assert len(one.made_starts[".seated"][""]) == end - 19
     # A run that does not ask for them takes them like others.
     plain = Trainer(SMALL, tape(made), tape(takes), ABOUT)
-    assert (torch.cat(plain.starts) < end).any()
+    assert (torch.cat(list(plain.starts.values())) < end).any()
     assert one.train_step() != plain.train_step()
 
 
@@ -236,7 +248,7 @@ def test_windows_with_made_sitting_keep_their_pelvis(takes, monkeypatch, joined)
     """Its pitch is what tells sitting from standing."""
     made = [takes[0], takes[1]._replace(name=f"{takes[1].name}.seated"), *takes[2:]]
     how = Augmentation(mirror=0.0, pelvis_pitch_deg=40.0)
-    config = replace(SMALL, sequences=64, seated_share=0.5, free_share=0.0, joined=joined, augmentation=how)
+    config = replace(SMALL, sequences=64, seated_share=0.5, shares={}, joined=joined, augmentation=how)
     one = Trainer(config, tape(made), tape(takes), ABOUT)
     first, length = len(made[0].pose), len(made[1].pose)
     sitting = [
@@ -279,7 +291,7 @@ def test_windows_in_other_postures(takes):
     """Sensors of the pelvis stay, those of other bones go with them, also where takes and the tape end."""
     how = Augmentation(mirror=0.0, posture=1.0)
     one = Trainer(replace(SMALL, joined=True, augmentation=how), tape(takes), tape(takes), ABOUT)
-    length, starts = one.config.window, torch.cat(one.starts).sort().values
+    length, starts = one.config.window, torch.cat(list(one.starts.values())).sort().values
     assert starts[0] == 0
     assert starts.max() == one.train_tape.starts[-1] - length
     plain = windows(one.train_tape, starts, length)
@@ -319,7 +331,7 @@ def test_recordings_that_are_all_held_out(tmp_path):
     for name in ("07_01", "08_02", "03_01"):
         (tmp_path / f"{name}.npz").touch()
     message = (
-        r"no recording of the part 'train': the names .*splits\.toml.* validation \(1\), cmu-walk-run \(2\)"
+        r"no recording of the part 'train': the names .*sources\.toml.* cmu-03 \(1\), cmu-walk-run \(2\)"
     )
     with pytest.raises(EdgeposeError, match=message):
         training_paths(tmp_path)

@@ -59,10 +59,11 @@ class _Model(NamedTuple):
     "--part",
     "parts",
     multiple=True,
-    type=click.Choice(["cmu-walk-run", "cmu-02", "bandai-styles", "validation", "all", "published"]),
-    help="Part of the split; all: every take below --data; published: files of DIP-IMU or TotalCapture as "
-    "downloaded; may be repeated  [default: the three held-out parts, "
-    "or those of them that --data has; else validation]",
+    metavar="NAME",
+    help="Part of the split, such as cmu-02 or tennis (docs/reference/models.md lists all); sports, "
+    "validation: several parts together; all: every take below --data; published: files of DIP-IMU or "
+    "TotalCapture as downloaded; may be repeated  [default: the held-out parts that --data "
+    "has; else validation]",
 )
 @click.option(
     "--online",
@@ -145,7 +146,11 @@ def evaluate(
     if heat_map and len(names) > 1:
         raise click.UsageError("--heat-map takes one --model")
     from edgepose.analysis.figures import check_picture
+    from edgepose_export.training.dataset import check_part
 
+    for part in parts:
+        if part != "published":
+            check_part(part)
     for picture in (histogram, heat_map, reliability):
         if picture:
             check_picture(picture, "drawing", overwrite)

@@ -201,9 +201,10 @@ def _precisions(
     from edgepose_export.cli.progress import labelled
     from edgepose_export.evaluation.evaluate import modes_of
     from edgepose_export.evaluation.quantisation import compare
+    from edgepose_export.training.sources import single_parts
 
     (mode,) = (mode for mode in modes_of(metadata) if mode.name == "stream")
-    return compare(script, data, metadata["measures"], mode, labelled("measuring precisions"))
+    return compare(script, data, single_parts(metadata["measures"]), mode, labelled("measuring precisions"))
 
 
 def _std_scale(module: torch.jit.ScriptModule, metadata: dict[str, Any], data: Path) -> NDArray[np.float64]:
@@ -232,6 +233,7 @@ def _measures(path: Path, data: Path, others: Mapping[str, Archive]) -> dict[str
     from edgepose_export.evaluation import evaluate as evaluation
     from edgepose_export.evaluation.baselines import learn
     from edgepose_export.evaluation.uncertainty import errors_and_deviations, reliability
+    from edgepose_export.training.sources import single_parts
 
     parts = default_parts(data)
     info = read_info(path)
@@ -245,7 +247,7 @@ def _measures(path: Path, data: Path, others: Mapping[str, Archive]) -> dict[str
     columns = evaluation.columns_of_parts(methods, data, parts, labelled("measuring"))
     (mode,) = (mode for mode in modes if mode.name == "stream")
     deviations = {}
-    for part in parts:
+    for part in single_parts(parts):
         takes = evaluation.takes_of(data, part, labelled("measuring deviations"))
         result = reliability(*errors_and_deviations(module, info.metadata, takes, mode))
         deviations[part] = {"within": list(result.within), "scale": result.scale, "values": result.values}

@@ -46,12 +46,14 @@ def learn_prior(inputs: tuple[Path, ...], out: Path, about: str, overwrite: bool
     from edgepose.sip.prior import save_prior
     from edgepose.skeleton import local_from_global
     from edgepose_export.cli.progress import progress
-    from edgepose_export.cli.synthesize import LICENSES, motion_files
+    from edgepose_export.cli.synthesize import motion_files
     from edgepose_export.mocap import pieces, read_motion
-    from edgepose_export.training.splits import part_of
+    from edgepose_export.training.sources import take_info
 
     check_output(out, "the prior", (".npz",), overwrite)
-    files = [path for root in inputs for path in motion_files(root) if part_of(path.stem) == "train"]
+    found = (path for root in inputs for path in motion_files(root))
+    known = {path: take_info(path.absolute().with_suffix("")) for path in found}
+    files = [path for path, info in known.items() if info.part == "train"]
     poses, sources = [np.empty((0, 24, 3))], set()
     for path in progress(files, "reading"):
         try:
@@ -62,7 +64,7 @@ def learn_prior(inputs: tuple[Path, ...], out: Path, about: str, overwrite: bool
         for take in takes:
             rows = take.rotations[:: max(1, round(take.rate / RATE))]
             poses.append(matrix_to_rotvec(local_from_global(rows)))
-            sources.add(LICENSES[take.source])
+            sources.add(known[path].source.license)
     together = np.concatenate(poses).reshape(-1, 72)
     prior = learn(together, about or " and ".join(sorted(sources)))
     save_prior(out, prior, overwrite)

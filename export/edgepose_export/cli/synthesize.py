@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
@@ -17,6 +17,8 @@ from edgepose.errors import EdgeposeError
 from edgepose.skeleton import Body
 from edgepose.utils.durable_files import replace_file
 from edgepose.utils.output_targets import check_free
+from edgepose_export.cli.journal import Journal
+from edgepose_export.training.sources import OWN, UNKNOWN, TakeInfo, take_info
 
 if TYPE_CHECKING:
     from edgepose_export.mocap import Mapping, Motion
@@ -26,16 +28,12 @@ KINDS = (".bvh", ".amc", ".npz")
 MOST_HOLD_FRAMES = 100_000
 """Longest time of standing before a motion, samples of a sensor."""
 
-LICENSES = {
-    "cmu": "CMU Graphics Lab Motion Capture Database (mocap.cs.cmu.edu, NSF EIA-0196217), free for all use",
-    "bandai-namco": "Bandai-Namco Research Motiondataset, CC BY-NC 4.0",
-    "amass": "the licence of the AMASS subset",
-}
-UNKNOWN_LICENSE = "unknown"
-
 
 class Job(NamedTuple):
-    """Settings of a conversion: the command's flags, and the folder that paths are relative to."""
+    """Settings of a conversion: the command's flags, and the folder that paths are relative to.
+
+    `license_note` is the licence of motion that no rule knows.
+    """
 
     out: Path
     root: Path
@@ -45,6 +43,7 @@ class Job(NamedTuple):
     mounting_seed: int | None
     seated_seed: int | None
     rests_seed: int | None
+    license_note: str
     overwrite: bool
     t_pose: Path | None = None
     mapping: Mapping | None = None
@@ -121,7 +120,22 @@ class Job(NamedTuple):
     metavar="PICTURE",
     help="Draw a take of each skeleton beside the body that follows it (.png, .pdf, .svg), to look at.",
 )
+@click.option(
+    "--license",
+    "license_note",
+    metavar="TEXT",
+    default=UNKNOWN,
+    show_default=True,
+    help="Licence of your own motion, for the cards of models trained on it; the licences of published "
+    "motion are known by the names of its files.",
+)
 @overwrite_option
+@click.option(
+    "--resume",
+    is_flag=True,
+    help="Go on with an interrupted call that had --resume and the same flags: files that it completed are "
+    "left as they are.",
+)
 @click.option(
     "--jobs", type=click.IntRange(1), default=1, show_default=True, help="Files to process in parallel."
 )
@@ -138,7 +152,9 @@ def synthesize(
     t_pose: Path | None,
     mapping_path: Path | None,
     picture: Path | None,
+    license_note: str,
     overwrite: bool,
+    resume: bool,
     jobs: int,
 ) -> None:
     """Make IMU recordings with true poses from motion capture (.bvh, .amc, AMASS .npz; folders are searched).
@@ -170,6 +186,10 @@ def synthesize(
         raise click.UsageError("--body sets the height: omit --height")
     body = read_smpl(body_path) if body_path else default_body(height or 1.75)
     files = [(root, path) for root in inputs for path in motion_files(root)]
+    # A recipe of `edgepose train` hands over the files that it wants.
+    chosen = click.get_current_context().obj
+    if chosen is not None:
+        files = [(root, path) for root, path in files if path in chosen]
     if not files:
         raise EdgeposeError(f"no motion files ({', '.join(KINDS)}) in {', '.join(map(str, inputs))}")
     mapping = read_mapping(mapping_path) if mapping_path else None
@@ -179,18 +199,35 @@ def synthesize(
         draw_skeletons(files, picture, body, t_pose=t_pose, mapping=mapping, overwrite=overwrite)
     if out is None:
         return
-    flags = (rate, body, hold, mounting_seed, seated_seed, rests_seed, overwrite, t_pose, mapping)
+    journal = Journal(out, _settings(click.get_current_context())) if resume else None
+    overwrite |= journal is not None and journal.begun  # pieces of the file at which it was interrupted
+    flags = (
+        rate,
+        body,
+        hold,
+        mounting_seed,
+        seated_seed,
+        rests_seed,
+        license_note,
+        overwrite,
+        t_pose,
+        mapping,
+    )
     tasks = [(path, Job(out, root if root.is_dir() else root.parent, *flags)) for root, path in files]
     _check_targets(tasks, overwrite)
-    _convert_all(tasks, jobs)
+    # Actor by actor, because takes of one actor share one zero pose.
+    tasks = [task for of_actor in by_actor(tasks).values() for task in of_actor]
+    if journal:
+        journal.begin()
+        tasks = [task for task in tasks if _name(*task) not in journal]
+    failed = _convert_all(tasks, jobs, journal)
+    say(f"{len(files) - failed} of {len(files)} recordings written to {out}")
+    if failed:
+        raise NotAllConvertedError(failed, len(files))
 
 
-def _convert_all(tasks: list[tuple[Path, Job]], jobs: int) -> None:
-    """Convert files in parallel, and report those that cannot be converted.
-
-    Raises:
-        EdgeposeError: a file could not be converted.
-    """
+def _convert_all(tasks: list[tuple[Path, Job]], jobs: int, journal: Journal | None) -> int:
+    """Convert files, in several processes if `jobs` is more than 1; return how many cannot be converted."""
     from edgepose_export.cli.progress import progress
 
     failed = 0
@@ -201,14 +238,57 @@ def _convert_all(tasks: list[tuple[Path, Job]], jobs: int) -> None:
             # Spawned, because a forked copy of a process with threads may hang.
             pool = stack.enter_context(ProcessPoolExecutor(jobs, mp_context=get_context("spawn")))
             results = [pool.submit(convert, *task).result for task in tasks]
-        for result in progress(results, "synthesizing"):
+        for result, task in progress(list(zip(results, tasks, strict=True)), "synthesizing"):
             problem = result()
             if problem:
                 failed += 1
                 say(f"skipped: {problem}")
-    say(f"{len(tasks) - failed} of {len(tasks)} recordings written to {tasks[0][1].out}")
-    if failed:
-        raise EdgeposeError(f"{failed} of {len(tasks)} files could not be converted; see the messages above")
+            elif journal:
+                journal.add(_name(*task))
+    return failed
+
+
+class NotAllConvertedError(EdgeposeError):
+    """Some motion files could not be converted; the recordings of the others are complete.
+
+    Attributes:
+        count: number of these files.
+    """
+
+    def __init__(self, count: int, files: int) -> None:
+        """Create the error; `files` is the number of all files."""
+        super().__init__(f"{count} of {files} files could not be converted; see the messages above")
+        self.count = count
+
+
+def _settings(context: click.Context) -> dict[str, Any]:
+    """Return the inputs and flags that decide what the recordings are."""
+    return {
+        name: value
+        for name, value in context.params.items()
+        if name not in ("out", "overwrite", "resume", "jobs")
+    }
+
+
+def _name(path: Path, job: Job) -> str:
+    """Return the name of a motion file in the journal: its path below the folder of the motion."""
+    return path.relative_to(job.root).as_posix()
+
+
+def by_actor(tasks: list[tuple[Path, Job]]) -> dict[str, list[tuple[Path, Job]]]:
+    """Return the motion files of each actor."""
+    groups: dict[str, list[tuple[Path, Job]]] = {}
+    for path, job in tasks:
+        groups.setdefault(about_take(path, job).actor, []).append((path, job))
+    return groups
+
+
+def about_take(path: Path, job: Job) -> TakeInfo:
+    """Return source, licence, actor and part of a motion file, by its path from the motion's folder on."""
+    info = take_info((job.root.absolute().name / path.relative_to(job.root)).with_suffix(""))
+    if info.source.name != OWN:
+        return info
+    return info._replace(source=info.source._replace(license=job.license_note))
 
 
 def _check_targets(tasks: list[tuple[Path, Job]], overwrite: bool) -> None:
@@ -264,6 +344,7 @@ def convert(path: Path, job: Job) -> str | None:
         with_hold,
     )
 
+    info = about_take(path, job)
     try:
         mounting = None if job.mounting_seed is None else random_mounting(job.mounting_seed)
         whole = read_motion(path, job.t_pose, job.mapping)
@@ -282,7 +363,7 @@ def convert(path: Path, job: Job) -> str | None:
             part = f".part{i + 1}" if len(takes) > 1 else ""
             target = _target(path, job, part)
             target.parent.mkdir(parents=True, exist_ok=True)
-            arrays = recording_arrays(motion, imus, LICENSES.get(motion.source, UNKNOWN_LICENSE))
+            arrays = recording_arrays(motion, imus, info.source.license, info.source.name, info.actor)
             replace_file(
                 target,
                 lambda file, arrays=arrays: np.savez(file, **arrays),

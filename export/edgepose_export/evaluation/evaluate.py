@@ -16,7 +16,8 @@ from edgepose.inference.archive import is_windowed
 from edgepose.skeleton import default_body
 from edgepose_export.datasets import read_published
 from edgepose_export.evaluation import baselines
-from edgepose_export.training.dataset import RATE, Take, read_take, take_paths
+from edgepose_export.training.dataset import RATE, Take, parts_of, read_take, take_paths
+from edgepose_export.training.sources import GROUPS
 
 Array = NDArray[np.float64]
 Tensors = tuple[torch.Tensor, torch.Tensor]
@@ -200,7 +201,7 @@ def takes_of(data: Path, part: str, progress: Progress = iter) -> Iterator[Take]
     """Read takes one by one: those of a part of the split, of "all" parts, or "published" recordings."""
     if part == "published":
         return map(_with_mean_acceleration, read_published(data))
-    return (read_take(path) for path in progress(take_paths(data, part)))
+    return (read_take(path, data) for path in progress(take_paths(data, part)))
 
 
 def _with_mean_acceleration(take: Take) -> Take:
@@ -213,8 +214,31 @@ def _with_mean_acceleration(take: Take) -> Take:
 def columns_of_parts(
     methods: Mapping[str, Method], data: Path, parts: Iterable[str], progress: Progress = iter
 ) -> dict[str, Columns]:
-    """Return the results of `collect` for each of some parts of the takes below a folder."""
-    return {part: collect(takes_of(data, part, progress), methods) for part in parts}
+    """Return the results of `collect` for each of some parts of the takes below a folder.
+
+    A group of parts is measured part by part, and each part once.
+    """
+    present, measured = set(parts_of(data).values()), dict[str, Columns]()
+
+    def columns(part: str) -> Columns:
+        if part not in measured:
+            members = [member for member in GROUPS.get(part, ()) if member in present]
+            measured[part] = (
+                _joined([columns(member) for member in members])
+                if members
+                else collect(takes_of(data, part, progress), methods)
+            )
+        return measured[part]
+
+    return {part: columns(part) for part in parts}
+
+
+def _joined(tables: list[Columns]) -> Columns:
+    """Return the measures of all frames of several tables with the same rows."""
+    return {
+        name: {key: np.concatenate([table[name][key] for table in tables]) for key in rows}
+        for name, rows in tables[0].items()
+    }
 
 
 def window_errors(

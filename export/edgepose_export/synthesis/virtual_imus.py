@@ -12,8 +12,8 @@ from edgepose.calibration import GRAVITY
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import Body, forward_kinematics, local_from_global
 from edgepose_export.mocap import Motion
-from edgepose_export.synthesis.contacts import contacts, level_velocity
 from edgepose_export.mocap.straight_pose import straight_pose
+from edgepose_export.synthesis.contacts import contacts, level_velocity
 
 Array = NDArray[np.float64]
 
@@ -106,10 +106,19 @@ def virtual_imus(
     )
 
 
-def recording_arrays(motion: Motion, imus: VirtualImus, license_note: str) -> dict[str, NDArray]:
+def recording_arrays(
+    motion: Motion, imus: VirtualImus, license_note: str, source: str = "own", actor: str = "own"
+) -> dict[str, NDArray]:
     """Return the arrays of an .npz file that is both an IMU recording and an AMASS-like motion file.
 
     It holds the sensors and the poses that they were made from, and contacts and velocities, see `contacts`.
+
+    Args:
+        motion: the motion.
+        imus: what the sensors measure of it.
+        license_note: licence of the motion.
+        source: name of its source, see `training.sources`.
+        actor: key of its actor.
     """
     arrays: dict[str, NDArray] = {"t": np.arange(len(motion.rotations)) / motion.rate}
     for i, name in enumerate(PLACEMENTS):
@@ -123,6 +132,7 @@ def recording_arrays(motion: Motion, imus: VirtualImus, license_note: str) -> di
     velocity = level_velocity(imus.joints[:, 0], motion.rotations[:, 0], motion.rate)
     arrays["velocity"] = velocity.astype(np.float32)
     arrays["mocap_framerate"] = np.array(motion.rate)
-    arrays["source"] = np.array(motion.source)
+    arrays["source"] = np.array(source)
+    arrays["actor"] = np.array(actor)
     arrays["license"] = np.array(license_note)
     return arrays

@@ -15,6 +15,7 @@ from edgepose.utils.durable_files import reason, write_whole
 from edgepose_export.archive.torchscript import Statistics, new_network
 from edgepose_export.networks.shape import NetworkShape
 from edgepose_export.training.config import config_from
+from edgepose_export.training.description import averaged_runs
 
 CHECKPOINT = "checkpoint.pt"
 
@@ -69,7 +70,7 @@ their means are useless.
 def mean_of(states: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
     """Return the first of some checkpoints, with the mean of all averaged weights (Wortsman et al. 2022).
 
-    The description of the training data is that of the checkpoint with the most hours, with all licences.
+    The description of the training is that of the first, with the motion of all, see `averaged_runs`.
 
     Args:
         states: the checkpoints by name.
@@ -86,10 +87,7 @@ def mean_of(states: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
             )
     weights = [state["averaged"] for state in states.values()]
     mean = {key: torch.stack([one[key] for one in weights]).mean(dim=0) for key in weights[0]}
-    about = [state["data"] for state in states.values()]
-    licenses = sorted({text for data in about for text in data["licenses"]})
-    data = max(about, key=lambda data: float(data["hours"])) | {"licenses": licenses}
-    return first | {"averaged": mean, "data": data}
+    return first | {"averaged": mean, "data": averaged_runs([state["data"] for state in states.values()])}
 
 
 def _related(one: dict[str, Any], other: dict[str, Any]) -> bool:

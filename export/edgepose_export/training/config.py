@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from edgepose.errors import EdgeposeError
+from edgepose.utils.similar_names import choices
 from edgepose.utils.text_files import read_toml
 from edgepose_export.networks.normalisation import SCHEMES
 from edgepose_export.networks.registry import NETWORKS
 from edgepose_export.networks.shape import NetworkShape
 from edgepose_export.synthesis.augmentation import Augmentation
+from edgepose_export.training.sources import OWN, SOURCES
 
 CONFIGS = Path(__file__).parent / "configs"
 """Folder with the configs of the shipped models."""
@@ -34,10 +36,11 @@ class TrainConfig:
             which is three times as fast.
         joined: whether sequences may cross the ends of takes, so that a network that is never reset learns to
             recover from a jump.
-        free_share: share of the sequences taken from CMU's takes.
+        shares: share of the sequences taken from each of some sources, by name (`sources.toml`) or by its
+            part before a dash (`snu`); sequences of other sources are taken in proportion to their frames.
         seated_share: share of the sequences taken from takes with synthetic sitting, if there are any.
-        rests_share: share of the sequences taken from takes with synthetic rests, if there are any;
-            `free_share` refers to the sequences of neither kind.
+        rests_share: share of the sequences taken from takes with synthetic rests, if there are any; `shares`
+            refers to the sequences of neither kind.
         input_dropout: share of the inputs set to zero (DIP: 0.2).
         smoothness: jitter penalty: weight of the squared second differences in time of the pose error, in
             normalised units.
@@ -61,7 +64,7 @@ class TrainConfig:
     window: int = 120
     streamed: int = 0
     joined: bool = False
-    free_share: float = 0.0
+    shares: dict[str, float] = field(default_factory=dict)
     seated_share: float = 0.0
     rests_share: float = 0.0
     input_dropout: float = 0.2
@@ -77,10 +80,11 @@ class TrainConfig:
     seed: int = 0
 
 
-def read_config(path: Path) -> TrainConfig:
-    """Read a TOML file with TrainConfig's fields and the tables `[network]` and `[augmentation]`.
+def read_config(path: Path, settings: dict[str, Any] | None = None) -> TrainConfig:
+    """Read a TOML file with TrainConfig's fields and the tables `[network]`, `[augmentation]` and `[shares]`.
 
-    A file with `base = "NAME"` contains only what differs from NAME.toml in the same folder.
+    A file with `base = "NAME"` contains only what differs from NAME.toml in the same folder. `settings`
+    override values of the file.
 
     Raises:
         EdgeposeError: the file is missing or not TOML, or has an unknown field, a value of a wrong type, or a
@@ -93,7 +97,7 @@ def read_config(path: Path) -> TrainConfig:
             if not isinstance(name, str):
                 raise ValueError(f"base is {name!r}; it must be the name of a config in the same folder")
             values = _merged(_toml(path.with_name(f"{name}.toml")), values)
-        return config_from(values)
+        return config_from(_merged(values, settings or {}))
     except ValueError as error:
         raise EdgeposeError(f"{path}: {error}") from error
 
@@ -105,10 +109,10 @@ def _toml(path: Path) -> dict[str, Any]:
 
 
 def _merged(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
-    """Return the values of a base, overridden by others; tables are merged entry by entry."""
+    """Return the values of a base, overridden by others; tables but `[shares]` are merged entry by entry."""
     result = base | values
     for name, table in values.items():
-        if isinstance(table, dict) and isinstance(base.get(name), dict):
+        if name != "shares" and isinstance(table, dict) and isinstance(base.get(name), dict):
             result[name] = base[name] | table
     return result
 
@@ -120,16 +124,18 @@ def config_from(values: dict[str, Any]) -> TrainConfig:
         ValueError: a field is unknown, or its value has the wrong type or is out of range; names the field.
     """
     values = dict(values)
+    shares = _shares(values.pop("shares", {}), values.pop("free_share", 0.0))
     tables: dict[str, Any] = {"network": NetworkShape, "augmentation": Augmentation}
     for name, kind in tables.items():
         table = values.pop(name, {})
         if not isinstance(table, dict):
             raise ValueError(f"{name} is {table!r}; it must be a table [{name}]")
         values[name] = kind(**_checked(table, kind()._asdict(), f" in [{name}]"))
-    defaults = {f.name: getattr(TrainConfig, f.name) for f in fields(TrainConfig) if f.name not in tables}
+    defaults = {f.name: f.default for f in fields(TrainConfig) if f.default is not MISSING}
     config = TrainConfig(
         **_checked({k: v for k, v in values.items() if k not in tables}, defaults),
         **{name: values[name] for name in tables},
+        shares=shares,
     )
     if config.network.measured == "passed" and config.network.targets != "global-6d":
         raise ValueError('measured = "passed" needs targets = "global-6d"')
@@ -162,6 +168,21 @@ def config_from(values: dict[str, Any]) -> TrainConfig:
     return config
 
 
+def _shares(table: Any, free_share: Any) -> dict[str, float]:
+    """Return the checked table `[shares]`; `free_share` is what CMU's share was called in older configs."""
+    if not isinstance(table, dict):
+        raise ValueError(f"shares is {table!r}; it must be a table [shares]")
+    table = table or ({"cmu": free_share} if free_share else {})
+    names = {*SOURCES, *(name.split("-")[0] for name in SOURCES), OWN}
+    for name in table:
+        if name not in names:
+            raise ValueError(f"unknown source {name!r} in [shares]; {choices(name, sorted(names))}")
+    shares = _checked(table, dict.fromkeys(table, 0.0), high=1.0)
+    if sum(shares.values()) > 1.0 + 1e-9:
+        raise ValueError(f"the shares in [shares] sum up to {sum(shares.values()):g}; at most 1 is possible")
+    return {name: float(share) for name, share in shares.items()}
+
+
 def _kinds(ability: str) -> str:
     """Return the kinds of networks with an ability, for messages."""
     names = [f'"{name}"' for name, kind in NETWORKS.items() if getattr(kind, ability)]
@@ -188,7 +209,6 @@ _RANGES: dict[str, tuple[float, float]] = {
     "warm_up": (0, 10**9),
     "averaging": (0.0, 1.0),
     "input_dropout": (0.0, 0.99),
-    "free_share": (0.0, 1.0),
     "seated_share": (0.0, 1.0),
     "rests_share": (0.0, 1.0),
     "aligned": (0.0, 1.0),
@@ -201,7 +221,9 @@ _RANGES: dict[str, tuple[float, float]] = {
 """Least and greatest values of numbers; those of all other fields are 0 and 1000."""
 
 
-def _checked(values: dict[str, Any], defaults: dict[str, Any], where: str = "") -> dict[str, Any]:
+def _checked(
+    values: dict[str, Any], defaults: dict[str, Any], where: str = "", high: float = 1000
+) -> dict[str, Any]:
     """Return the values if each is in range and has the type of its default (or is whole, for a float)."""
     for name, value in values.items():
         if name not in defaults:
@@ -213,9 +235,9 @@ def _checked(values: dict[str, Any], defaults: dict[str, Any], where: str = "") 
         if kind is str and value not in _CHOICES[name]:
             raise ValueError(f"{name} is {value!r}; it must be {' or '.join(map(repr, _CHOICES[name]))}")
         if kind in (int, float):
-            low, high = _RANGES.get(name, (0, 1000))
-            if not low <= value <= high:
-                raise ValueError(f"{name} is {value!r}; it must be from {low:g} to {high:g}")
+            least, most = _RANGES.get(name, (0, high))
+            if not least <= value <= most:
+                raise ValueError(f"{name} is {value!r}; it must be from {least:g} to {most:g}")
     return values
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,15 +19,19 @@ from edgepose.formats.recordings.base import MAX_VALUE
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.skeleton import PARENTS, forward_kinematics
 from edgepose.utils.safe_npz import BROKEN, open_npz
+from edgepose.utils.similar_names import choices
 from edgepose_export.synthesis.contacts import CONTACTS, PLACE
 from edgepose_export.synthesis.virtual_imus import INERTIAL_FROM_BODY
-from edgepose_export.training.splits import HELD_OUT, SPLITS, part_of
+from edgepose_export.training.sources import GROUPS, HELD_OUT, OWN, RULES, VALIDATION, part_of
 
 SEATED = ".seated"
 """End of the names of takes with legs made by `edgepose_export.synthesis.sitting` or `floor`."""
 
 RESTS = ".rests"
 """End of the names of takes with rests made by `edgepose_export.synthesis.rests`."""
+
+PARTS = (*HELD_OUT, *VALIDATION, *GROUPS)
+"""Parts, and groups of parts, that models are measured on."""
 
 RATE = 60.0
 """Frames per second of all networks."""
@@ -38,12 +41,14 @@ class Take(NamedTuple):
     """One synthetic recording.
 
     Attributes:
-        name: file name without folder and extension.
+        name: path below the folder of the takes, without suffix.
         orientation: (T, 6, 3, 3) float32 bone orientations R_TB.
         acceleration: (T, 6, 3) float32 accelerations in T without gravity, m/s^2.
         pose: (T, 24, 3, 3) float32 true local rotations.
         license: licence of the motion that the take was made from.
         place: (T, 10) float32 contacts and velocity, see `Batch`; None if they are unknown.
+        source: name of its source, see `sources.SOURCES`.
+        actor: key of its actor, see `sources.TakeInfo`.
     """
 
     name: str
@@ -52,6 +57,8 @@ class Take(NamedTuple):
     pose: NDArray[np.float32]
     license: str
     place: NDArray[np.float32] | None = None
+    source: str = OWN
+    actor: str = OWN
 
     @property
     def place_or_nan(self) -> NDArray[np.float32]:
@@ -61,8 +68,17 @@ class Take(NamedTuple):
         return self.place
 
 
-def read_take(path: Path) -> Take:
+def take_name(path: Path, root: Path | None = None) -> str:
+    """Return the name of a take: its path below a folder without suffix, or else the file's name."""
+    return (path.relative_to(root) if root else Path(path.name)).with_suffix("").as_posix()
+
+
+def read_take(path: Path, root: Path | None = None) -> Take:
     """Read a recording that `edgepose synthesize` wrote, with sensors aligned with the bones.
+
+    Args:
+        path: the file.
+        root: the folder of the takes, below which a take's path is its name.
 
     Raises:
         EdgeposeError: the file is of another kind.
@@ -72,7 +88,9 @@ def read_take(path: Path) -> Take:
             quats = np.stack([data[f"{name}_quat"] for name in PLACEMENTS], axis=1)
             force = np.stack([data[f"{name}_acc"] for name in PLACEMENTS], axis=1)
             poses = data["poses"].reshape(-1, 24, 3)
-            rate, license_note = float(data["mocap_framerate"]), str(data["license"])
+            rate = float(data["mocap_framerate"])
+            license_note, source = str(data["license"]), str(data["source"])
+            actor = str(data["actor"]) if "actor" in data else source
             place = _place(data)
         if not len(poses) == len(quats) == len(force) == (len(poses) if place is None else len(place)):
             raise ValueError("sensors and poses differ in length")
@@ -98,12 +116,14 @@ def read_take(path: Path) -> Take:
     force_inertial[1:] = 0.5 * (force_inertial[1:] + force_inertial[:-1])
     acceleration = (force_inertial - [0.0, 0.0, GRAVITY]) @ INERTIAL_FROM_BODY
     return Take(
-        path.stem,
+        take_name(path, root),
         orientation.astype(np.float32),
         acceleration.astype(np.float32),
         local.astype(np.float32),
         license_note,
         place,
+        source=source,
+        actor=actor,
     )
 
 
@@ -129,29 +149,57 @@ def _check_numbers(quats: NDArray[Any], force: NDArray[Any], poses: NDArray[Any]
 
 
 def take_paths(folder: Path, part: str) -> list[Path]:
-    """Return the files of one part of the split below a folder, sorted by name; the part "all" is every take.
+    """Return the files of a part, or of a group of parts, below a folder, sorted by name.
 
-    If no name belongs to the validation part, as with a user's own recordings, every tenth take for training
-    is used for it.
+    The part "all" is every take. If no name belongs to the validation parts, as with a user's own recordings,
+    every tenth of the motions for training is used for validation.
 
     Raises:
-        EdgeposeError: there is no such file.
+        EdgeposeError: there is no such part or file.
     """
-    takes = sorted(folder.rglob("*.npz"), key=lambda path: path.stem)
-    paths = [path for path in takes if part in ("all", part_of(path.stem))]
-    if part in ("train", "validation") and all(part_of(path.stem) != "validation" for path in takes):
-        own = [path for path in takes if part_of(path.stem) == "train"]
-        if len(own) > 1:
-            paths = [path for i, path in enumerate(own) if bool(i % 10) == (part == "train")]
+    check_part(part)
+    takes = parts_of(folder)
+    wanted = GROUPS.get(part, (part,))
+    paths = [path for path, found in takes.items() if part == "all" or found in wanted]
+    if part in ("train", "validation") and not set(VALIDATION) & set(takes.values()):
+        chosen = _every_tenth([path for path, found in takes.items() if found == "train"])
+        if chosen:
+            paths = [path for path, found in takes.items() if found == "train"]
+            paths = [path for path in paths if (path in chosen) == (part == "validation")]
     if paths:
         return paths
     if not takes:
         raise EdgeposeError(f"{folder}: no recordings; make them with edgepose synthesize --out {folder}")
-    counts = Counter(part_of(path.stem) for path in takes)
+    counts = Counter(takes.values())
     raise EdgeposeError(
         f"{folder}: no recording of the part {part!r}: the names of recordings decide their part (see "
-        f"{SPLITS}), and those here belong to {', '.join(f'{name} ({counts[name]})' for name in counts)}"
+        f"{RULES}), and those here belong to {', '.join(f'{name} ({counts[name]})' for name in counts)}"
     )
+
+
+def check_part(part: str) -> None:
+    """Raise EdgeposeError unless there is a part, or group of parts, of that name."""
+    names = (*PARTS, "train", "all")
+    if part not in names:
+        raise EdgeposeError(f"{part}: no such part; {choices(part, names, 'the parts are')}")
+
+
+def parts_of(folder: Path) -> dict[Path, str]:
+    """Return the part of each recording below a folder, sorted by name."""
+    paths = {take_name(path, folder): path for path in folder.rglob("*.npz")}
+    return {paths[name]: part_of(name) for name in sorted(paths)}
+
+
+def _every_tenth(paths: list[Path]) -> set[Path]:
+    """Return the files of every tenth motion; all pieces and versions of a motion go together.
+
+    If all are of one motion, return every tenth file, and nothing if there is only one.
+    """
+    motions = {path: path.name.split(".")[0] for path in paths}
+    if len(set(motions.values())) < 2:
+        return set(paths[::10]) if len(paths) > 1 else set()
+    chosen = set(sorted(set(motions.values()))[::10])
+    return {path for path in paths if motions[path] in chosen}
 
 
 def training_paths(folder: Path) -> tuple[list[Path], list[Path]]:
@@ -172,17 +220,20 @@ def training_paths(folder: Path) -> tuple[list[Path], list[Path]]:
 def measured_parts(folder: Path) -> tuple[list[str], list[str]]:
     """Return the parts of a folder to measure models on, and those that it lacks.
 
-    They are the held-out parts; if there is none, as with a user's own recordings, the validation part.
+    They are the held-out parts, and the group "sports" if there are several of it; if there is none, as with
+    a user's own recordings, the validation parts together.
 
     Raises:
         EdgeposeError: the folder has neither.
     """
-    found = {part_of(path.stem) for path in folder.rglob("*.npz")}
+    found = set(parts_of(folder).values())
     present = [part for part in HELD_OUT if part in found]
     lacking = [part for part in HELD_OUT if part not in found]
     if not present:
         take_paths(folder, "validation")
         present = ["validation"]
+    if len(set(present) & set(GROUPS["sports"])) > 1:
+        present.append("sports")
     return present, lacking
 
 
@@ -214,6 +265,7 @@ class PackedTakes(NamedTuple):
         names: names of the takes.
         licenses: licence of each take's motion.
         place: (N, 10) contacts and velocity, see `Batch`.
+        sources: name of each take's source.
     """
 
     orientation: Tensor
@@ -223,16 +275,12 @@ class PackedTakes(NamedTuple):
     names: list[str]
     licenses: list[str]
     place: Tensor
+    sources: list[str]
 
     def at(self, index: Tensor) -> Batch:
         """Return the sequences of some frames (B, T)."""
         parts = self.orientation, self.acceleration, self.relative, self.place
         return Batch(*(part[index] for part in parts))
-
-    @property
-    def free(self) -> list[bool]:
-        """Whether each take is CMU's, free for all use."""
-        return [text.startswith("CMU") for text in self.licenses]
 
     @property
     def made(self) -> list[str]:
@@ -253,6 +301,7 @@ def tape(takes: list[Take]) -> PackedTakes:
         [take.name for take in takes],
         [take.license for take in takes],
         torch.cat([torch.zeros(0, PLACE), *(torch.from_numpy(take.place_or_nan) for take in takes)]),
+        [take.source for take in takes],
     )
 
 
@@ -262,14 +311,3 @@ def root_relative_pose(local: Tensor) -> Tensor:
     for joint in range(1, 24):
         result.append(result[PARENTS[joint]] @ local[..., joint, :, :])
     return torch.stack(result, dim=-3)
-
-
-def describe(licenses: Iterable[str], takes: int, frames: int) -> dict[str, Any]:
-    """Return the description of the training motion for an archive's card."""
-    licenses = sorted(set(licenses))
-    return {
-        "summary": " and ".join(text.split(",")[0].split(" (")[0] for text in licenses),
-        "licenses": licenses,
-        "takes": takes,
-        "hours": frames / RATE / 3600.0,
-    }

@@ -32,7 +32,10 @@ _INDEX = "tape.json"
 
 
 def packed_tape(
-    paths: list[Path], folder: Path, progress: Callable[[list[Path]], Iterable[Path]] = iter
+    paths: list[Path],
+    folder: Path,
+    progress: Callable[[list[Path]], Iterable[Path]] = iter,
+    root: Path | None = None,
 ) -> PackedTakes:
     """Return the takes of some files as a tape of memory-mapped tensors.
 
@@ -40,6 +43,7 @@ def packed_tape(
         paths: recordings that `edgepose synthesize` wrote.
         folder: folder of the packed tape. If it is missing or outdated, it is made, one take at a time.
         progress: wraps the list of files to report progress.
+        root: the folder of the takes, see `read_take`.
 
     Raises:
         EdgeposeError: a recording cannot be read, or the folder cannot be written.
@@ -50,7 +54,7 @@ def packed_tape(
         if about is None or about["sources"] != sources:
             folder.mkdir(parents=True, exist_ok=True)
             (folder / _INDEX).unlink(missing_ok=True)
-            about = {"sources": sources, **_pack(paths, folder, progress)}
+            about = {"sources": sources, **_pack(paths, folder, progress, root)}
             (folder / _INDEX).write_text(json.dumps(about), encoding="utf-8")
     except OSError as error:
         raise EdgeposeError(f"{folder}: cannot pack takes there: {error.strerror or error}") from error
@@ -59,6 +63,7 @@ def packed_tape(
         starts=torch.tensor([0, *accumulate(about["lengths"])]),
         names=about["names"],
         licenses=about["licenses"],
+        sources=about["of"],
     )
 
 
@@ -67,21 +72,25 @@ def _file(folder: Path, name: str) -> Path:
 
 
 def _pack(
-    paths: list[Path], folder: Path, progress: Callable[[list[Path]], Iterable[Path]]
+    paths: list[Path],
+    folder: Path,
+    progress: Callable[[list[Path]], Iterable[Path]],
+    root: Path | None,
 ) -> dict[str, Any]:
-    names, licenses, lengths = [], [], []
+    names, licenses, sources, lengths = [], [], [], []
     with ExitStack() as stack:
         files = {name: stack.enter_context(_file(folder, name).open("wb")) for name in FRAME}
         for path in progress(paths):
-            take = read_take(path)
+            take = read_take(path, root)
             relative = root_relative_pose(torch.from_numpy(take.pose)).numpy()
             arrays = (take.orientation, take.acceleration, relative, take.place_or_nan)
             for name, array in zip(FRAME, arrays, strict=True):
                 files[name].write(np.ascontiguousarray(array, "<f4").data)
             names.append(take.name)
             licenses.append(take.license)
+            sources.append(take.source)
             lengths.append(len(take.pose))
-    return {"names": names, "licenses": licenses, "lengths": lengths}
+    return {"names": names, "licenses": licenses, "of": sources, "lengths": lengths}
 
 
 def _read_index(folder: Path) -> dict[str, Any] | None:
@@ -90,7 +99,7 @@ def _read_index(folder: Path) -> dict[str, Any] | None:
         about = json.loads((folder / _INDEX).read_text(encoding="utf-8"))
         frames = sum(about["lengths"])
         sizes = {name: _file(folder, name).stat().st_size for name in FRAME}
-        if not len(about["lengths"]) == len(about["names"]) == len(about["licenses"]):
+        if any(len(about[key]) != len(about["lengths"]) for key in ("names", "licenses", "of")):
             return None
     except (FileNotFoundError, ValueError, TypeError, KeyError):
         return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,8 @@ from edgepose_export.training.checkpoints import (
     shape_of,
 )
 from edgepose_export.training.config import TrainConfig, config_values
-from edgepose_export.training.dataset import RESTS, SEATED, Batch, PackedTakes, describe
+from edgepose_export.training.dataset import RESTS, SEATED, Batch, PackedTakes
+from edgepose_export.training.description import describe, further_run
 from edgepose_export.training.distributed import ALONE, Processes
 from edgepose_export.training.losses import likelihood_loss, smoothness_loss
 from edgepose_export.training.place import contact_weights, place_accuracy, place_counts, place_loss
@@ -81,9 +82,9 @@ def compute_statistics(tape: PackedTakes, shape: NetworkShape, processes: Proces
 
 def describe_tape(tape: PackedTakes, processes: Processes = ALONE) -> dict[str, Any]:
     """Return the description of the takes of all processes for an archive's card."""
-    shares = processes.gathered((tape.licenses, int(tape.starts[-1])))
-    licenses = [text for texts, _ in shares for text in texts]
-    return describe(licenses, len(licenses), sum(frames for _, frames in shares))
+    takes = list(zip(tape.names, tape.starts.diff().tolist(), strict=True))
+    gathered = processes.gathered((tape.licenses, tape.sources, takes))
+    return describe(*(chain.from_iterable(lists) for lists in zip(*gathered, strict=True)))
 
 
 # --- the run ------------------------------------------------------------------------------------------------
@@ -106,7 +107,8 @@ class Trainer:
             config: settings of the run.
             train: this process's share of the takes to train on.
             validation: this process's share of the takes for validation.
-            data: description of the training takes for the archive's card: summary, takes, hours, licenses.
+            data: description for the archive's card: that of the takes, see `description.describe`, and, if
+                they are known, "run" (name of this run) and "recipe".
             processes: processes that train together.
 
         Raises:
@@ -122,13 +124,17 @@ class Trainer:
         self.shares = {SEATED: config.seated_share, RESTS: config.rests_share}
         # Made takes without a share of their own are used like others.
         kinds = [kind if self.shares.get(kind) else "" for kind in train.made]
-        self.starts, *made = (
-            window_starts(train, config.window, config.joined, lambda take, kind=kind: kinds[take] == kind)
-            for kind in ("", *self.shares)
+        self.starts = window_starts(
+            train, config.window, config.joined, lambda take: not kinds[take], config.shares
         )
-        self.made_starts = dict(zip(self.shares, made, strict=True))
+        self.made_starts = {
+            kind: window_starts(
+                train, config.window, config.joined, lambda take, kind=kind: kinds[take] == kind
+            )
+            for kind in self.shares
+        }
         self.has_sitting = windows_with_sitting(train, config.window)
-        counts = processes.gathered(len(torch.cat(self.starts)))
+        counts = processes.gathered(sum(map(len, self.starts.values())))
         if not all(counts):
             where = f"process {counts.index(0)} has " if processes.size > 1 else ""
             raise EdgeposeError(f"{where}no training take is as long as the window of {config.window} frames")
@@ -220,10 +226,10 @@ class Trainer:
         """Return the first frames (count,) of random windows, those of made takes last."""
         made, left = [], count
         for kind, share in self.shares.items():
-            if len(torch.cat(self.made_starts[kind])):
+            if len(self.made_starts[kind][""]):
                 made.append((self.made_starts[kind], min(round(count * share), left)))
                 left -= made[-1][1]
-        groups = [(self.starts, left, self.config.free_share), *((pool, size, 0.0) for pool, size in made)]
+        groups = [(self.starts, left, self.config.shares), *((pool, size, {}) for pool, size in made)]
         return torch.cat([sample_windows(*group, self.generator) for group in groups if group[1]])
 
     def _batch(self, starts: Tensor) -> Batch:
@@ -253,7 +259,7 @@ class Trainer:
 
     def _validation_starts(self) -> Tensor:
         window = self.config.window
-        return torch.cat(window_starts(self.validation_tape, window, False))[:: max(1, window // 2)]
+        return window_starts(self.validation_tape, window, False)[""][:: max(1, window // 2)]
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
@@ -314,7 +320,8 @@ class Trainer:
     def start_from(self, state: dict[str, Any]) -> None:
         """Start fine-tuning (DIP 3.4.4) from a checkpoint's averaged weights and statistics.
 
-        Its training data and licences are added to the description of this run's takes.
+        Its training data and licences are added to the description of this run's takes, and the run itself to
+        the earlier ones.
 
         Raises:
             EdgeposeError: the checkpoint is of another network; only `smoothing` and `place` may differ. A
@@ -326,13 +333,7 @@ class Trainer:
         weights = {name: state["averaged"].get(name, own) for name, own in self.network.state_dict().items()}
         self.network.load_state_dict(weights)
         self.averaged.load_state_dict(weights)
-        before = state["data"]
-        self.data = {
-            "summary": f"{before['summary']}, then {self.data['summary']}",
-            "licenses": sorted({*before["licenses"], *self.data["licenses"]}),
-            "takes": before["takes"] + self.data["takes"],
-            "hours": before["hours"] + self.data["hours"],
-        }
+        self.data = further_run(state["data"], state["step"], self.data)
 
     def _check_shape(self, state: dict[str, Any], **other: Any) -> None:
         """Check that the checkpoint's network is that of the config, apart from `other` fields."""
