@@ -10,9 +10,9 @@ import pytest
 from edgepose import rotations as rot
 from edgepose.placements import BONES
 from edgepose_export.mocap import Motion, read_motion
-from edgepose_export.mocap.hinges import hinge_rotations
+from edgepose_export.mocap.hinges import Bends, hinge_rotations
 from edgepose_export.mocap.straight_pose import straight_pose
-from edgepose_export.mocap.zeroing import find_zero
+from edgepose_export.mocap.zeroing import Evidence, find_zero
 from edgepose_export.synthesis.virtual_imus import with_hold
 
 MOCAP = Path(__file__).parents[1] / "data" / "mocap"
@@ -50,7 +50,7 @@ def test_a_skeleton_whose_upper_bones_are_twisted_gets_the_hinges_of_smpl(
     true = motion.rotations.copy()
     motion.rotations[:, upper] @= rot.rotation_about_axis(length, np.radians(twist_deg))
 
-    mended = motion.rotations @ hinge_rotations([motion])
+    mended = motion.rotations @ hinge_rotations(Bends.of(motion))
 
     assert angles(mended, true).max() < 0.1
 
@@ -60,8 +60,8 @@ def test_a_joint_that_does_not_bend_or_not_as_a_hinge_keeps_its_frame() -> None:
     turning = np.arange(len(loose.rotations)) / RATE
     loose.rotations[:, 16] = rot.rotation_about_axis("x", turning)  # bends about all axes in turn
 
-    assert angles(hinge_rotations([standing(3.0)]), np.eye(3)).max() == 0.0
-    assert angles(hinge_rotations([loose])[16], np.eye(3)) == 0.0
+    assert angles(hinge_rotations(Bends.of(standing(3.0))), np.eye(3)).max() == 0.0
+    assert angles(hinge_rotations(Bends.of(loose))[16], np.eye(3)) == 0.0
 
 
 def test_a_skeleton_with_another_zero_has_its_straight_pose_where_the_actor_stands() -> None:
@@ -73,7 +73,7 @@ def test_a_skeleton_with_another_zero_has_its_straight_pose_where_the_actor_stan
     stands = standing(30.0)
     disturbed = stands._replace(rotations=stands.rotations @ wrong)
 
-    zero = find_zero([disturbed])
+    zero = find_zero(Evidence.of(disturbed))
 
     assert zero.evidence == "standing"
     mended = disturbed.rotations[0] @ zero.straight
@@ -86,7 +86,7 @@ def test_left_and_right_are_zeroed_alike() -> None:
     askew = straight_pose()
     askew[1] = rot.rotation_about_axis("y", np.radians(16.0)) @ askew[1]
 
-    zero = find_zero([standing(30.0, askew)])
+    zero = find_zero(Evidence.of(standing(30.0, askew)))
 
     left, right = rot.matrix_to_rotvec(zero.straight[1]), rot.matrix_to_rotvec(zero.straight[2])
     np.testing.assert_allclose(left, right * [1.0, -1.0, -1.0], atol=1e-9)
@@ -95,8 +95,10 @@ def test_left_and_right_are_zeroed_alike() -> None:
 def test_walking_is_zeroed_like_the_standing_that_it_starts_from() -> None:
     walk = read_motion(MOCAP / "dataset-2_walk_normal_001.bvh")
 
-    walking = find_zero([walk])
-    standing_too = find_zero([with_hold(walk._replace(rotations=walk.rotations @ walking.straight), 20.0)])
+    one = Evidence.of(walk)  # of a short take; an actor walks longer
+    walking = find_zero(one.plus(one).plus(one).plus(one))
+    straight = walk._replace(rotations=walk.rotations @ walking.straight)
+    standing_too = find_zero(Evidence.of(with_hold(straight, 20.0)))
 
     assert walking.evidence == "walking"
     assert standing_too.evidence == "standing"
@@ -110,7 +112,7 @@ def test_walking_is_zeroed_like_the_standing_that_it_starts_from() -> None:
 def test_directions_keep_the_limbs_where_they_were() -> None:
     walk = read_motion(MOCAP / "07_01.bvh")
 
-    zero = find_zero([walk])
+    zero = find_zero(Evidence.of(walk))
 
     moved = walk.rotations @ zero.directions
     for limb, axis in ((1, 1), (4, 1), (16, 0), (18, 0)):
@@ -121,14 +123,27 @@ def test_an_actor_who_never_stands_or_walks_is_marked() -> None:
     bow = standing(10.0)
     bow.rotations[:] = rot.rotation_about_axis("x", np.radians(70.0)) @ bow.rotations
 
-    zero = find_zero([bow])
+    zero = find_zero(Evidence.of(bow))
 
     assert zero.evidence == "none"
     assert angles(zero.straight, np.eye(3))[[0, 3, 6, 9, 12, 15]].max() < 1e-9
+
+
+def test_takes_of_one_actor_share_a_zero() -> None:
+    walk = read_motion(MOCAP / "dataset-2_walk_normal_001.bvh")
+    middle = len(walk.rotations) // 2
+    halves = [
+        walk._replace(rotations=walk.rotations[part], translation=walk.translation[part])
+        for part in (slice(middle), slice(middle, None))
+    ]
+
+    both = find_zero(Evidence.of(halves[0]).plus(Evidence.of(halves[1])))
+
+    assert angles(both.straight, find_zero(Evidence.of(walk)).straight).max() < 1.0
 
 
 def test_one_frame_is_no_evidence() -> None:
     walk = read_motion(MOCAP / "07_01.bvh")
     one = walk._replace(rotations=walk.rotations[:1], translation=walk.translation[:1])
 
-    assert find_zero([one]).evidence == "none"
+    assert find_zero(Evidence.of(one)).evidence == "none"

@@ -22,6 +22,7 @@ from edgepose_export.training.sources import OWN, UNKNOWN, TakeInfo, take_info
 
 if TYPE_CHECKING:
     from edgepose_export.mocap import Mapping, Motion
+    from edgepose_export.mocap.zeroing import Zero
 
 KINDS = (".bvh", ".amc", ".npz")
 
@@ -32,7 +33,8 @@ MOST_HOLD_FRAMES = 100_000
 class Job(NamedTuple):
     """Settings of a conversion: the command's flags, and the folder that paths are relative to.
 
-    `license_note` is the licence of motion that no rule knows.
+    `license_note` is the licence of motion that no rule knows, `zero` that of the file's actor, or None for
+    that of the source.
     """
 
     out: Path
@@ -47,6 +49,7 @@ class Job(NamedTuple):
     overwrite: bool
     t_pose: Path | None = None
     mapping: Mapping | None = None
+    zero: Zero | None = None
 
 
 @click.command(short_help="Make recordings from motion capture.")
@@ -101,6 +104,14 @@ class Job(NamedTuple):
     "mostly where the body is low; about half a minute per take.",
 )
 @click.option(
+    "--zero",
+    type=click.Choice(["wearer", "source"]),
+    default="wearer",
+    show_default=True,
+    help="wearer: each actor is zeroed in the straight pose, which is found in all of the actor's takes, as a "
+    "calibration zeroes a wearer; source: the bones' zero is that of the motion capture.",
+)
+@click.option(
     "--t-pose",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     help="BVH file of the same skeleton with a T-pose in it, for files whose zero pose is none.  [default: "
@@ -149,6 +160,7 @@ def synthesize(
     mounting_seed: int | None,
     seated_seed: int | None,
     rests_seed: int | None,
+    zero: str,
     t_pose: Path | None,
     mapping_path: Path | None,
     picture: Path | None,
@@ -188,6 +200,7 @@ def synthesize(
     files = [(root, path) for root in inputs for path in motion_files(root)]
     # A recipe of `edgepose train` hands over the files that it wants.
     chosen = click.get_current_context().obj
+    everything = files
     if chosen is not None:
         files = [(root, path) for root, path in files if path in chosen]
     if not files:
@@ -201,7 +214,9 @@ def synthesize(
         return
     journal = Journal(out, _settings(click.get_current_context())) if resume else None
     overwrite |= journal is not None and journal.begun  # pieces of the file at which it was interrupted
-    flags = (
+    job = Job(
+        out,
+        out,
         rate,
         body,
         hold,
@@ -213,13 +228,13 @@ def synthesize(
         t_pose,
         mapping,
     )
-    tasks = [(path, Job(out, root if root.is_dir() else root.parent, *flags)) for root, path in files]
+    tasks = [(path, job._replace(root=root if root.is_dir() else root.parent)) for root, path in files]
     _check_targets(tasks, overwrite)
-    # Actor by actor, because takes of one actor share one zero pose.
-    tasks = [task for of_actor in by_actor(tasks).values() for task in of_actor]
     if journal:
         journal.begin()
         tasks = [task for task in tasks if _name(*task) not in journal]
+    if zero == "wearer" and tasks:
+        tasks = _zeroed(tasks, everything, jobs)
     failed = _convert_all(tasks, jobs, journal)
     say(f"{len(files) - failed} of {len(files)} recordings written to {out}")
     if failed:
@@ -275,12 +290,20 @@ def _name(path: Path, job: Job) -> str:
     return path.relative_to(job.root).as_posix()
 
 
-def by_actor(tasks: list[tuple[Path, Job]]) -> dict[str, list[tuple[Path, Job]]]:
-    """Return the motion files of each actor."""
-    groups: dict[str, list[tuple[Path, Job]]] = {}
-    for path, job in tasks:
-        groups.setdefault(about_take(path, job).actor, []).append((path, job))
-    return groups
+def _zeroed(
+    tasks: list[tuple[Path, Job]], files: list[tuple[Path, Path]], jobs: int
+) -> list[tuple[Path, Job]]:
+    """Return the tasks with the zero of each actor, found in all files and not in those of the tasks alone."""
+    from edgepose_export.cli.actor_zeros import find_zeros
+
+    wanted = {about_take(*task).actor for task in tasks}
+    actors: dict[str, list[Path]] = {}
+    for root, path in files:
+        actor = about_take(path, tasks[0][1]._replace(root=root if root.is_dir() else root.parent)).actor
+        if actor in wanted:
+            actors.setdefault(actor, []).append(path)
+    zeros = find_zeros(actors, tasks[0][1].t_pose, tasks[0][1].mapping, jobs)
+    return [(path, job._replace(zero=zeros.get(about_take(path, job).actor))) for path, job in tasks]
 
 
 def about_take(path: Path, job: Job) -> TakeInfo:
@@ -336,6 +359,7 @@ def convert(path: Path, job: Job) -> str | None:
     """Convert one file, cut into parts where the source jumps; return what was wrong with it, or None."""
     import numpy as np
 
+    from edgepose.rotations import transpose
     from edgepose_export.mocap import fault, pieces, read_motion, resample, scaled_to
     from edgepose_export.synthesis.virtual_imus import (
         random_mounting,
@@ -356,14 +380,21 @@ def convert(path: Path, job: Job) -> str | None:
             return f"{path}: no part between two jumps is as long as a second"
         for i, take in enumerate(takes):
             motion = resample(scaled_to(take, job.body.leg_length_m), job.rate)
+            directions = None
+            if job.zero:
+                motion = motion._replace(rotations=motion.rotations @ job.zero.straight)
+                directions = transpose(job.zero.straight) @ job.zero.directions
+            if job.seated_seed is not None:
+                directions = None  # the legs are made on the body as it is zeroed
             motion = _with_made_parts(motion, job, [i, *path.stem.encode()])
             if job.hold_s:
                 motion = with_hold(motion, job.hold_s)
-            imus = virtual_imus(motion, job.body, mounting)
+            imus = virtual_imus(motion, job.body, mounting, directions)
             part = f".part{i + 1}" if len(takes) > 1 else ""
             target = _target(path, job, part)
             target.parent.mkdir(parents=True, exist_ok=True)
             arrays = recording_arrays(motion, imus, info.source.license, info.source.name, info.actor)
+            arrays["zero"] = np.array(job.zero.evidence if job.zero else "source")
             replace_file(
                 target,
                 lambda file, arrays=arrays: np.savez(file, **arrays),

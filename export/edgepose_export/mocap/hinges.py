@@ -7,7 +7,7 @@ other sources differ from this by a constant rotation about the length of the up
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,24 +31,48 @@ _HINGES = {
 """Upper bone -> lower bone, direction of both in SMPL's zero pose, axis about which the lower one bends."""
 
 
-def hinge_rotations(motions: Sequence[Motion]) -> Array:
-    """Return the right factors (24, 3, 3) that bring an actor's elbows and knees to SMPL's hinges.
+class Bends(NamedTuple):
+    """Axes about which joints bend, over any number of frames, by row of `_HINGES`.
+
+    Attributes:
+        sums: (4, 3) sums of unit axes in the upper bones' frames.
+        moments: (4, 3, 3) sums of their outer products.
+        counts: (4,) numbers of frames in which the joints are bent.
+    """
+
+    sums: Array
+    moments: Array
+    counts: Array
+
+    @classmethod
+    def of(cls, motion: Motion) -> Bends:
+        """Return those of a take, 20 frames a second."""
+        axes = [_bend_axes(motion, upper, *rest[:2]) for upper, rest in _HINGES.items()]
+        return cls(
+            np.stack([a.sum(axis=0) for a in axes]),
+            np.stack([a.T @ a for a in axes]),
+            np.array([len(a) for a in axes]),
+        )
+
+    def plus(self, other: Bends) -> Bends:
+        """Return those of both."""
+        return Bends(*(mine + yours for mine, yours in zip(self, other, strict=True)))
+
+
+def hinge_rotations(bends: Bends) -> Array:
+    """Return the right factors (24, 3, 3) that bring a skeleton's elbows and knees to SMPL's hinges.
 
     They rotate upper arms and thighs about their own length. A joint that does not bend, or not as a hinge,
     keeps its frame.
-
-    Args:
-        motions: takes of one skeleton.
     """
     result = np.tile(np.eye(3), (24, 1, 1))
-    for upper, (lower, length, hinge) in _HINGES.items():
-        axes = np.concatenate([np.zeros((0, 3)), *(_bend_axes(m, upper, lower, length) for m in motions)])
-        if len(axes) < LEAST_FRAMES:
+    for row, (upper, (_, length, hinge)) in enumerate(_HINGES.items()):
+        if bends.counts[row] < LEAST_FRAMES:
             continue
-        moments, directions = np.linalg.eigh(axes.T @ axes / len(axes))
+        moments, directions = np.linalg.eigh(bends.moments[row] / bends.counts[row])
         if moments[-1] < LEAST_AGREEMENT:
             continue
-        axis = directions[:, -1] * np.sign(directions[:, -1] @ axes.sum(axis=0))
+        axis = directions[:, -1] * np.sign(directions[:, -1] @ bends.sums[row])
         angle = np.arctan2(np.cross(hinge, axis) @ length, np.dot(hinge, axis))
         result[upper] = rotvec_to_matrix(angle * np.array(length))
     return result

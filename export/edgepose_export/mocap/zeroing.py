@@ -18,7 +18,6 @@ are rotation vectors by which a bone is rotated from R_TB0, as seen from the pel
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +26,7 @@ from edgepose import rotations as rot
 from edgepose.skeleton import JOINTS
 from edgepose_export.mocap.straight_pose import straight_pose
 
-from .hinges import hinge_rotations
+from .hinges import Bends, hinge_rotations
 from .motion import Array, Motion
 
 LEAST_FRAMES = 20
@@ -50,26 +49,47 @@ class Zero(NamedTuple):
     evidence: str
 
 
-def find_zero(motions: Sequence[Motion]) -> Zero:
-    """Return the zero of an actor.
+class Evidence(NamedTuple):
+    """Evidence of an actor's straight pose, over any number of takes of one skeleton.
 
-    Args:
-        motions: all takes of the actor, with one skeleton.
+    Attributes:
+        bends: axes about which elbows and knees bend.
+        sums: (kinds, 24, 3, 3) sums of rotations of postures of each kind, seen from the pelvis' heading.
+        counts: (kinds,) numbers of these postures.
     """
-    hinges = hinge_rotations(motions)
-    parts = [_postures(motion._replace(rotations=motion.rotations @ hinges)) for motion in motions]
-    evidence = {name: np.concatenate([part[name] for part in parts]) for name in _EVIDENCE}
+
+    bends: Bends
+    sums: Array
+    counts: Array
+
+    @classmethod
+    def of(cls, motion: Motion) -> Evidence:
+        """Return that of a take, 20 frames a second."""
+        postures = _postures(motion)
+        return cls(
+            Bends.of(motion),
+            np.stack([part.sum(axis=0) for part in postures]),
+            np.array([len(part) for part in postures]),
+        )
+
+    def plus(self, other: Evidence) -> Evidence:
+        """Return that of both."""
+        return Evidence(self.bends.plus(other.bends), self.sums + other.sums, self.counts + other.counts)
+
+
+def find_zero(evidence: Evidence) -> Zero:
+    """Return the zero of an actor."""
+    hinges = hinge_rotations(evidence.bends)
     total, weight = _STANDING / _SPREAD**2, 1.0 / _SPREAD**2
     found = "none"
-    for name, (offset, deviation) in _EVIDENCE.items():
-        frames = len(evidence[name])
-        if frames < LEAST_FRAMES:
+    for kind, summed, count in zip(_KINDS, evidence.sums, evidence.counts, strict=True):
+        if count < LEAST_FRAMES:
             continue
         # A posture is not better known from a long hold than from two or three short ones.
-        precision = frames / (frames + 60.0) / deviation**2
-        found = name.partition(",")[0] if found == "none" else found
-        total = total + precision * (_deviation(evidence[name]) + offset)
+        precision = count / (count + 60.0) / kind.spread**2
+        total = total + precision * (_deviation(summed @ hinges) + kind.offset)
         weight = weight + precision
+        found = kind.name if found == "none" else found
     angles = np.radians(total / weight)
     rest = straight_pose()
     straight = hinges @ np.swapaxes(rest, -1, -2) @ rot.rotvec_to_matrix(-angles) @ rest
@@ -81,8 +101,8 @@ def find_zero(motions: Sequence[Motion]) -> Zero:
 # --- postures ----------------------------------------------------------------------------------------------
 
 
-def _postures(motion: Motion) -> dict[str, Array]:
-    """Return a take's rotations (N, 24, 3, 3), seen from the pelvis' heading, by kind of evidence."""
+def _postures(motion: Motion) -> list[Array]:
+    """Return a take's rotations (N, 24, 3, 3), seen from the pelvis' heading, for each of `_KINDS`."""
     step = max(1, round(motion.rate / 20.0))
     reach = max(1, round(0.1 * motion.rate))
     frames = np.arange(reach, len(motion.rotations) - reach, step)
@@ -104,11 +124,7 @@ def _postures(motion: Motion) -> dict[str, Array]:
     hanging = (arms[:, :2] < 30.0).all(axis=1) & (arms[:, 2:] < 45.0).all(axis=1)
     walking = upright & (legs < 75.0) & (arms[:, :2] < 45.0).all(axis=1)
     walking &= (speed > WALKING[0]) & (speed < WALKING[1])
-    return {
-        "standing": level[quiet & hanging],
-        "standing, arms raised": level[quiet & ~hanging],
-        "walking": level[walking],
-    }
+    return [level[quiet & hanging], level[quiet & ~hanging], level[walking]]
 
 
 def _without_heading(rotations: Array) -> Array:
@@ -134,9 +150,9 @@ def _hanging(rotations: Array) -> Array:
     return angle
 
 
-def _deviation(postures: Array) -> Array:
-    """Return mean rotation vectors (24, 3), degrees, from R_TB0 to postures (N, 24, 3, 3), left = right."""
-    mean = rot.nearest_rotation(postures.mean(axis=0))
+def _deviation(summed: Array) -> Array:
+    """Return rotation vectors (24, 3), degrees, from R_TB0 to the mean of summed postures, left = right."""
+    mean = rot.nearest_rotation(summed)
     angles = np.degrees(rot.matrix_to_rotvec(mean @ np.swapaxes(straight_pose(), -1, -2)))
     symmetric: Array = 0.5 * (angles + angles[_MIRROR] * [1.0, -1.0, -1.0])
     return symmetric
@@ -218,9 +234,23 @@ _HOLD = np.array([_HOLD_SPREAD.get(_kind(name), (4.0, 4.0, 4.0)) for name in JOI
 _ARMS_RAISED = np.where([[_kind(name) in _ARMS] for name in JOINTS], 1e6, _HOLD + 1.0)
 _ZEROS = np.zeros((len(JOINTS), 3))
 
-_EVIDENCE = {
-    "standing": (_ZEROS, _HOLD),
-    "standing, arms raised": (_ZEROS, _ARMS_RAISED),
-    "walking": _rows(_WALKING_TO_STANDING),
-}
-"""Kind of evidence -> what is added to its rotation vectors, and how far they then are from the pose."""
+
+class _Kind(NamedTuple):
+    """A kind of evidence.
+
+    Attributes:
+        name: see `Zero.evidence`.
+        offset: (24, 3) what is added to its rotation vectors, degrees.
+        spread: (24, 3) how far they then are from the straight pose, degrees.
+    """
+
+    name: str
+    offset: Array
+    spread: Array
+
+
+_KINDS = (
+    _Kind("standing", _ZEROS, _HOLD),
+    _Kind("standing", _ZEROS, _ARMS_RAISED),
+    _Kind("walking", *_rows(_WALKING_TO_STANDING)),
+)
