@@ -108,7 +108,7 @@ class Job(NamedTuple):
     type=click.Choice(["wearer", "source"]),
     default="wearer",
     show_default=True,
-    help="wearer: each actor is zeroed in the straight pose, which is found in all of the actor's takes, as a "
+    help="wearer: each actor is zeroed in the straight pose, found in all of the actor's takes, as a "
     "calibration zeroes a wearer; source: the bones' zero is that of the motion capture.",
 )
 @click.option(
