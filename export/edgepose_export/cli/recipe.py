@@ -13,10 +13,11 @@ from edgepose.cli.terminal.messages import say
 from edgepose.errors import EdgeposeError
 from edgepose.utils.durable_files import write_whole
 from edgepose_export.cli.export import export
-from edgepose_export.cli.synthesize import NotAllConvertedError, motion_files, synthesize
+from edgepose_export.cli.synthesize import NotAllConvertedError, Request, motion_files, synthesize
 from edgepose_export.training.sources import OWN, TakeInfo, take_info
 
 if TYPE_CHECKING:
+    from edgepose_export.mocap.zeroing import Zero
     from edgepose_export.training.recipes import Recipe, Recordings
 
 STATE = "run.json"
@@ -85,8 +86,9 @@ def run_recipe(name: str, mocap: tuple[Path, ...], out: Path, threads: int) -> N
     recordings = [one for one in recipe.recordings if _step(one) not in work.done]
     if recordings:
         takes = wanted_takes(recipe, mocap)
+        zeros: dict[str, Zero] = {}
         for one in recordings:
-            _make_recordings(one, takes, mocap, work, threads)
+            _make_recordings(one, takes, mocap, work, zeros, threads)
     _train_stages(recipe, work, threads)
     if "export" not in work.done or not archive.exists():
         checkpoints = [str(_stage_folder(work, stage) / "checkpoint.pt") for stage in recipe.average]
@@ -166,6 +168,7 @@ def _make_recordings(
     takes: dict[Path, tuple[str, TakeInfo]],
     mocap: tuple[Path, ...],
     work: Work,
+    zeros: dict[str, Zero],
     threads: int,
 ) -> None:
     chosen = frozenset(recordings.chosen(takes))
@@ -175,7 +178,7 @@ def _make_recordings(
         folder = work.folder / "recordings" / recordings.folder
         words = [*map(str, mocap), "--out", str(folder), "--jobs", str(threads), "--resume"]
         try:
-            synthesize.main([*words, *recordings.words()], standalone_mode=False, obj=chosen)
+            synthesize.main([*words, *recordings.words()], standalone_mode=False, obj=Request(chosen, zeros))
         except NotAllConvertedError as error:
             say(f"{error}; going on without them")
             lost = error.count

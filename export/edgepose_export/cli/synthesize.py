@@ -52,6 +52,18 @@ class Job(NamedTuple):
     zero: Zero | None = None
 
 
+class Request(NamedTuple):
+    """What a recipe of `edgepose train` hands over beside the flags.
+
+    Attributes:
+        files: the motion files to convert; None for all below the inputs.
+        zeros: zeros of actors that are known already; those of other actors are added.
+    """
+
+    files: frozenset[Path] | None
+    zeros: dict[str, Zero]
+
+
 @click.command(short_help="Make recordings from motion capture.")
 @click.argument("inputs", nargs=-1, required=True, type=click.Path(path_type=Path, exists=True))
 @click.option(
@@ -198,11 +210,10 @@ def synthesize(
         raise click.UsageError("--body sets the height: omit --height")
     body = read_smpl(body_path) if body_path else default_body(height or 1.75)
     files = [(root, path) for root in inputs for path in motion_files(root)]
-    # A recipe of `edgepose train` hands over the files that it wants.
-    chosen = click.get_current_context().obj
     everything = files
-    if chosen is not None:
-        files = [(root, path) for root, path in files if path in chosen]
+    request = click.get_current_context().obj or Request(None, {})
+    if request.files is not None:
+        files = [(root, path) for root, path in files if path in request.files]
     if not files:
         raise EdgeposeError(f"no motion files ({', '.join(KINDS)}) in {', '.join(map(str, inputs))}")
     mapping = read_mapping(mapping_path) if mapping_path else None
@@ -234,7 +245,7 @@ def synthesize(
         journal.begin()
         tasks = [task for task in tasks if _name(*task) not in journal]
     if zero == "wearer" and tasks:
-        tasks = _zeroed(tasks, everything, jobs)
+        tasks = _zeroed(tasks, everything, request.zeros, jobs)
     failed = _convert_all(tasks, jobs, journal)
     say(f"{len(files) - failed} of {len(files)} recordings written to {out}")
     if failed:
@@ -291,18 +302,19 @@ def _name(path: Path, job: Job) -> str:
 
 
 def _zeroed(
-    tasks: list[tuple[Path, Job]], files: list[tuple[Path, Path]], jobs: int
+    tasks: list[tuple[Path, Job]], files: list[tuple[Path, Path]], zeros: dict[str, Zero], jobs: int
 ) -> list[tuple[Path, Job]]:
-    """Return the tasks with the zero of each actor, found in all files and not in those of the tasks alone."""
+    """Return the tasks with the zero of each actor, which is found in all files, not in the tasks' alone."""
     from edgepose_export.cli.actor_zeros import find_zeros
 
-    wanted = {about_take(*task).actor for task in tasks}
+    job = tasks[0][1]
+    wanted = {about_take(*task).actor for task in tasks} - set(zeros)
     actors: dict[str, list[Path]] = {}
     for root, path in files:
-        actor = about_take(path, tasks[0][1]._replace(root=root if root.is_dir() else root.parent)).actor
+        actor = about_take(path, job._replace(root=root if root.is_dir() else root.parent)).actor
         if actor in wanted:
             actors.setdefault(actor, []).append(path)
-    zeros = find_zeros(actors, tasks[0][1].t_pose, tasks[0][1].mapping, jobs)
+    zeros |= find_zeros(actors, job.t_pose, job.mapping, jobs) if actors else {}
     return [(path, job._replace(zero=zeros.get(about_take(path, job).actor))) for path, job in tasks]
 
 
