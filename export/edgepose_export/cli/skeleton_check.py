@@ -8,8 +8,9 @@ from pathlib import Path
 from edgepose.cli.terminal.messages import say
 from edgepose.errors import EdgeposeError
 from edgepose.skeleton import Body
-from edgepose_export.mocap import Mapping, read_source
+from edgepose_export.mocap import Mapping, fault, read_source
 from edgepose_export.mocap.check_picture import Row, draw_check, figures_of, skeleton_key
+from edgepose_export.mocap.retargeting import retarget
 
 MOST_SKELETONS = 40
 """Skeletons in a picture, which is 2.1 inches high for each."""
@@ -48,7 +49,12 @@ def draw_skeletons(
             if key in rows or len(rows) == MOST_SKELETONS:
                 continue
             title = str(path.relative_to(root) if root != path else path.name)
-            rows[key] = figures_of(title, read_source(path, t_pose, mapping), body)
+            source = read_source(path, t_pose, mapping)
+            motion = retarget(source)
+            problem = fault(motion)
+            if problem:
+                raise EdgeposeError(f"{path}: {problem}")
+            rows[key] = figures_of(title, source, motion, body)
             problems.pop(key, None)
         except EdgeposeError as error:
             problems.setdefault(key, str(error))

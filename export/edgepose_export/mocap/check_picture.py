@@ -19,7 +19,7 @@ from edgepose.skeleton import PARENTS, Body, forward_kinematics, local_from_glob
 from .amc import find_asf
 from .motion import Motion
 from .rest_pose import to_y_up
-from .retargeting import Source, retarget
+from .retargeting import Source
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -72,9 +72,8 @@ def skeleton_key(path: Path) -> str:
     return "\n".join(lines if offset is None else lines[:offset] + lines[offset + 1 :])
 
 
-def figures_of(title: str, source: Source, body: Body) -> Row:
+def figures_of(title: str, source: Source, motion: Motion, body: Body) -> Row:
     """Return the figures of a take in its first, middle and most bent frame."""
-    motion = retarget(source)
     bent = geodesic_angle(local_from_global(motion.rotations)[:, 1:], np.eye(3)).sum(axis=1)
     frames = (0, len(bent) // 2, int(bent.argmax()))
     picked = list(frames)

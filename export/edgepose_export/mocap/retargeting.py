@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 
 _FOREARM_OF = {20: 18, 21: 19, 22: 18, 23: 19}  # wrists and hands stay at rest against the forearms
 
-_SPINE_SHARES = (0.37, 0.55)
+_SPINE_SHARES = (0.3, 0.51)
 """Middles of SMPL's two lower spine bones, as shares of the way from pelvis to neck."""
 
 

@@ -8,11 +8,12 @@ from typing import NamedTuple
 
 from edgepose.errors import EdgeposeError
 
-from .joint_words import LIMB_PARTS, is_helper, meaning
+from .joint_words import LIMB_PARTS, Meaning, is_helper, meaning
 
 SIDES = ("left", "right")
 _LIMB_ROLES = ("thigh", "shank", "foot", "upper_arm", "forearm", "hand")
 _OPTIONAL_ROLES = ("toes", "collar")
+_ABOVE_CHEST = (None, Meaning("spine", ""), Meaning("neck", ""))
 ROLES = (
     "pelvis",
     "chest",
@@ -204,11 +205,28 @@ def _neck_and_head(tree: _Tree, chest: int, given: Mapping[str, int]) -> tuple[i
     """Return the neck, None if there is none, and the head."""
     head = given.get("head", tree.named("head"))
     if head is None:
+        head = _top(tree, chest)
+    if head is None:
         raise EdgeposeError(_unknown(tree.names, ["head"]))
     if head == chest or chest not in tree.above(head):
         raise EdgeposeError(f"joint {tree.names[head]} is not above {tree.names[chest]}, the chest")
     path = [j for j in tree.between(chest, head)[:-1] if not is_helper(tree.names[j])]
     return given.get("neck", path[0] if path else None), head
+
+
+def _top(tree: _Tree, chest: int) -> int | None:
+    """Return the top of the only chain from the chest that is no arm, None if there is no such chain."""
+    joint, path = chest, []
+    while True:
+        children = [
+            child
+            for child, parent in enumerate(tree.parents)
+            if parent == joint and not is_helper(tree.names[child]) and tree.meanings[child] in _ABOVE_CHEST
+        ]
+        if len(children) != 1:
+            return path[-1] if path and not children else None
+        joint = children[0]
+        path.append(joint)
 
 
 def _joint(joint: int | None) -> int:
