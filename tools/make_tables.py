@@ -9,6 +9,8 @@ measures stay as they are without --measure, which runs the shipped models on th
 
 from __future__ import annotations
 
+import inspect
+import json
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -20,7 +22,11 @@ from firmware_protocols.base import Protocol
 from firmware_protocols.registry import BUILT_IN, PROTOCOLS
 
 ROOT = Path(__file__).parents[1]
+<<<<<<< HEAD
 PAGES = ("README.md", "docs/guide/sensors.md", "docs/reference/models.md")
+=======
+PAGES = ("docs/guide/sensors.md", "docs/research/training.md")
+>>>>>>> 86f4d5160e1f1537e4cb6b2bc7a7f62dd836a840
 
 _BLOCK = re.compile(
     r"(<!-- table (\w+): made by tools/make_tables\.py -->\n).*?(<!-- end of table -->)", re.DOTALL
@@ -59,6 +65,7 @@ def _table(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([lines[0], "|" + "---|" * len(rows[0]), *lines[1:]]) + "\n"
 
 
+<<<<<<< HEAD
 @cache  # both tables need all of it
 def _measured() -> dict[str, dict[str, dict[str, Metric]]]:
     """Return the tables of `edgepose evaluate --real` for all shipped models."""
@@ -68,6 +75,47 @@ def _measured() -> dict[str, dict[str, dict[str, Metric]]]:
 
     models = {f"`{path.stem}`": Model(path.stem) for path in bundled_archives()}
     return measure_models(models)
+=======
+def settings() -> str:
+    """Return the table of a training config's keys, from the docstrings and defaults of its classes."""
+    from edgepose_export.networks.shape import NetworkShape
+    from edgepose_export.synthesis.augmentation import Augmentation
+    from edgepose_export.training.config import CHOICES, TrainConfig, config_values
+
+    values = config_values(TrainConfig())
+    rows = [("key", "default", "meaning")]
+    for table, kind in (("", TrainConfig), ("network", NetworkShape), ("augmentation", Augmentation)):
+        if table:
+            rows.append((f"**`[{table}]`**", "", ""))
+        defaults = values[table] if table else values
+        meanings = _attributes(kind)
+        for key in ("kind", "normalisation"):
+            if key in meanings:
+                meanings[key] = f"{meanings[key].split(',')[0]}: {', '.join(map(json.dumps, CHOICES[key]))}"
+        rows += [
+            (f"`{key}`", f"`{json.dumps(default)}`", meanings[key])
+            for key, default in defaults.items()
+            if not isinstance(default, dict)
+        ]
+        rows += [(f"**`[{key}]`**", "", meanings[key]) for key in ("shares",) if key in defaults]
+    return _table(rows)
+
+
+def _attributes(kind: type) -> dict[str, str]:
+    """Return the texts of a docstring's section "Attributes" by name."""
+    texts: dict[str, str] = {}
+    name = ""
+    for line in inspect.getdoc(kind).split("Attributes:\n")[1].splitlines():
+        entry = re.match(r"    (\w+): (.*)", line)
+        if entry:
+            name, texts[entry[1]] = entry[1], entry[2]
+        elif line.startswith(" " * 8):
+            texts[name] += f" {line.strip()}"
+    return texts
+
+
+TABLES = {"protocols": protocols, "settings": settings}
+>>>>>>> 86f4d5160e1f1537e4cb6b2bc7a7f62dd836a840
 
 
 def walker() -> str:

@@ -10,10 +10,12 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import logging
 import os
 import zipfile
 import zlib
 from collections.abc import Mapping
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -29,6 +31,11 @@ if TYPE_CHECKING:
 METADATA_FILE = "edgepose.json"
 FORMAT = 1
 MODELS = Path(str(resources.files("edgepose.inference") / "models"))
+
+ALIASES = {"birnn-cmu": "birnn", "rnn-cmu": "rnn"}
+"""Former names of bundled archives, for names that none has any more."""
+
+_log = logging.getLogger(__name__)
 
 _METADATA_LIMIT = 1 << 20
 _MOST_FRAMES = 1000
@@ -82,18 +89,27 @@ def bundled_archives() -> list[Path]:
 
 
 def find_archive(name: str) -> Path:
-    """Return the path of the bundled archive of that name, or of the file at that path.
+    """Return the path of the bundled archive of that name, present or former, or of the file at that path.
 
     Raises:
         ModelError: there is neither.
     """
-    for path in bundled_archives():
-        if path.stem == name:
-            return path
+    bundled = {path.stem: path for path in bundled_archives()}
+    if name in bundled:
+        return bundled[name]
     if Path(name).is_file():
         return Path(name)
-    hint = choices(name, [path.stem for path in bundled_archives()], "give the path of an archive, or one of")
+    if ALIASES.get(name) in bundled:
+        _note_alias(name)
+        return bundled[ALIASES[name]]
+    hint = choices(name, bundled, "give the path of an archive, or one of")
     raise ModelError(f"{name}: no such model; {hint}")
+
+
+@cache
+def _note_alias(name: str) -> None:
+    """Log once that a name is a former one."""
+    _log.info("model %s is called %s now", name, ALIASES[name])
 
 
 def _read_checksums(path: Path) -> set[str]:

@@ -206,8 +206,12 @@ def test_card(made):
         "edgepose export",
     ):
         assert text in card
-    # The recipe is the one that was followed, not that of the shipped models.
-    assert "edgepose train --config CONFIG --data RECORDINGS --out RUN\n" in card
+    assert "Weights: free for any use" in card
+    # Only what was run, and nothing of the shipped models.
+    assert "edgepose train --config tiny --data RECORDINGS --out RUN\n" in card
+    assert f"Runs: tiny ({about['training']['steps']} steps)." in card
+    assert "--recipe" not in card
+    assert "`cmu-02` is CMU subject 02: bending, punches, sword play, washing" in card
     assert "--out tiny.pt --past 20 --future 5 --measure RECORDINGS\n" in card
     assert "cgspeed" not in card
     mean, deviation, frames = about["measures"]["cmu-02"]["offline, whole take"]["sip_error_deg"]
@@ -262,7 +266,9 @@ def test_training_goes_on_and_fine_tunes(made, tmp_path):
     assert read_checkpoint(run / "checkpoint.pt")["step"] == 9
     tuned = tmp_path / "tuned"
     edgepose(*train, "--out", tuned, "--init", folder / "run" / "best.pt")
-    assert ", then " in read_checkpoint(tuned / "checkpoint.pt")["data"]["summary"]
+    data = read_checkpoint(tuned / "checkpoint.pt")["data"]
+    assert data["earlier"] == [{"run": "tiny", "steps": read_checkpoint(folder / "run" / "best.pt")["step"]}]
+    assert data["takes"] == 1  # the same take
     both = CliRunner().invoke(cli, [*map(str, train), "--out", str(run), "--resume", "--init", "x"])
     assert both.exit_code == 2
     assert "no such" in fails(*train, "--out", tmp_path / "none", "--resume").lower()
@@ -537,8 +543,11 @@ def test_fine_tuning_goes_on_too(made, tmp_path):
     assert "continuing at step 3" in said
     state = read_checkpoint(tuned / "checkpoint.pt")
     assert state["step"] == 6
-    assert ", then " in state["data"]["summary"]
-    assert state["data"]["takes"] == 2
+    assert [run["run"] for run in state["data"]["earlier"]] == ["tiny"]
+    edgepose("export", tuned / "checkpoint.pt", "--out", tmp_path / "tuned.pt")
+    card = (tmp_path / "tuned.md").read_text(encoding="utf-8")
+    assert "edgepose train --config tiny --data RECORDINGS --out RUN --init RUN1/checkpoint.pt\n" in card
+    assert "tiny (6 steps)." in card
 
 
 def test_packed_takes_give_the_same_run(made, tmp_path):

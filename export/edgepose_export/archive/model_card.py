@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from typing import Any
 
+from edgepose.inference.archive import is_windowed
 from edgepose_export.evaluation.real_wearers import cells
 from edgepose_export.evaluation.uncertainty import EXPECTED
 from edgepose_export.networks.registry import NETWORKS
-from edgepose_export.training.config import CONFIGS, config_values, read_config
+from edgepose_export.training.sources import ABOUT, GROUPS
 
 _INPUTS = {
     "root": "in the pelvis frame",
     "tilt": "in the pelvis frame, with the tilt and acceleration of the pelvis itself",
     "heading": "without the heading of the pelvis",
     "sequence": "in the pelvis frame of the first frame",
-}
-
-
-_PARTS = {
-    "cmu-walk-run": "`cmu-walk-run` is CMU subjects 07, 08 and 09",
-    "cmu-02": "`cmu-02` is CMU subject 02 (bending, punching, sword play, washing)",
-    "bandai-styles": "`bandai-styles` is Bandai-Namco's styles exhausted and tired",
-    "validation": "`validation` is the takes by which the end of training was chosen",
 }
 
 
@@ -58,7 +50,7 @@ def _summary(metadata: dict[str, Any]) -> list[str]:
         f"{training['steps']} steps{_mean(training)}.",
         "- Licences of the motion data:",
         *(f"  - {text}" for text in training["licenses"]),
-        "- Weights: for non-commercial use wherever a licence above says NC. The code of edgepose is MIT.",
+        f"- Weights: {_use(training.get('free'))} The code of edgepose is MIT.",
         f"- Exported by edgepose {metadata['edgepose']}, revision {metadata['revision'] or 'unknown'}.",
     ]
 
@@ -83,6 +75,23 @@ def _row(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
+def _use(free: dict[str, bool] | None) -> str:
+    """Return what the weights may be used for, from the sources of their motion."""
+    if not free:
+        return "it is not recorded whether they are free for any use; the licences above decide."
+    bound = [name for name, is_free in free.items() if not is_free]
+    if not bound:
+        return "free for any use, with the acknowledgements that the licences above ask for."
+    return f"not free for any use, because of the motion of {', '.join(bound)}; see the licences above."
+
+
+def _about(part: str) -> str:
+    """Return what the takes of a part of the split are."""
+    if part == "validation":
+        return "the takes by which the end of training was chosen"
+    return ABOUT.get(part) or f"the parts {', '.join(GROUPS[part])} together"
+
+
 def _accuracy(metadata: dict[str, Any]) -> list[str]:
     """Return the section with the measures on held-out takes."""
     lines = [
@@ -98,66 +107,67 @@ def _accuracy(metadata: dict[str, Any]) -> list[str]:
         *lines,
         *_deviations(metadata["deviations"]),
         *_precisions(metadata["precisions"]),
-        f"The parts: {'; '.join(_PARTS[part] for part in metadata['measures'])}. None of these takes or "
-        "styles is in the training set.",
+        f"The parts: {'; '.join(f'`{part}` is {_about(part)}' for part in metadata['measures'])}. "
+        "No training has seen any of these takes.",
         "",
     ]
 
 
 def _reproduction(metadata: dict[str, Any]) -> list[str]:
-    """Return the section with the commands that make the archive."""
-    name = metadata["name"]
-    if metadata["training"]["config"] != _shipped_config(name):
-        return _own_reproduction(metadata)
-    several = metadata["training"].get("checkpoints", 1) > 1
-    with_bandai = "Bandai-Namco" in metadata["training"]["summary"]
-    bandai = ", and both Bandai-Namco Research motion datasets" if with_bandai else ""
-    return [
-        "## Reproduce",
-        "",
-        "```",
-        "edgepose synthesize MOCAP --out recordings --jobs 2",
-        f"edgepose synthesize MOCAP/{'*_normal_*' if with_bandai else '*'}.bvh --hold 3 "
-        "--out recordings/standing",
-        *(f"edgepose synthesize SOME --{kind} 1 --out recordings/{kind}" for kind in _made_motion(metadata)),
-        f"edgepose train --config {name} --data recordings --out runs/{name}",
-        f"edgepose export runs/{name}/checkpoint.pt {'OTHERS ' * several}--out "
-        f"{name}.pt{' --rounded' * metadata.get('rounded', False)} --measure recordings",
-        "```",
-        "",
-        "MOCAP is a folder with the motion data named above. The shipped models use the BVH files of CMU "
-        f"subjects 01, 02, 03, 05 - 09 and a few more takes (cgspeed's conversion){bandai}. The whole "
-        "config is in the archive's metadata."
-        + (" OTHERS are earlier checkpoints, see docs/research/training-history.md." * several),
+    """Return the section with the commands that made the archive, as far as they are recorded."""
+    training = metadata["training"]
+    runs = [*training.get("earlier", ()), {"run": training.get("run"), "steps": training["steps"]}]
+    recipe = training.get("recipe")
+    commands, notes = _by_recipe(recipe, runs) if recipe else _by_configs(runs)
+    if not training.get("exported_by_recipe"):
+        last = f"RUN/stages/{runs[-1]['run']}" if recipe else "RUN"
+        commands.append(_export_command(metadata, last))
+        if training.get("checkpoints", 1) > 1:
+            notes.append("OTHERS are the checkpoints that were averaged with it.")
+    return ["## Reproduce", "", "```", *commands, "```", "", " ".join(notes)]
+
+
+def _by_recipe(recipe: dict[str, Any], runs: list[dict[str, Any]]) -> tuple[list[str], list[str]]:
+    """Return the command and notes for training by a recipe."""
+    notes = [
+        "MOCAP are folders with the motion named above. The recipe, with the configs that it builds on, has "
+        f"the checksum {recipe['sha256'][:16]}. {_list_of(runs)}"
     ]
+    missing = [name for name in recipe["stages"] if name not in [run["run"] for run in runs]]
+    if missing:
+        notes.append(f"Its stages {', '.join(missing)} were not run.")
+    return [f"edgepose train --recipe {recipe['name']} MOCAP... --out RUN"], notes
 
 
-def _shipped_config(name: str) -> dict[str, Any] | None:
-    """Return the config of a shipped model; None if there is none of that name."""
-    path = CONFIGS / f"{name}.toml"
-    # As JSON, like the archive's: tuples become lists.
-    return json.loads(json.dumps(config_values(read_config(path)))) if path.is_file() else None
+def _by_configs(runs: list[dict[str, Any]]) -> tuple[list[str], list[str]]:
+    """Return commands and notes for single runs, each but the first from the weights of the one before."""
+    commands = []
+    for number, run in enumerate(runs, 1):
+        out = "RUN" if number == len(runs) else f"RUN{number}"
+        init = f" --init RUN{number - 1}/checkpoint.pt" if number > 1 else ""
+        commands.append(
+            f"edgepose train --config {run['run'] or 'CONFIG'} --data RECORDINGS --out {out}{init}"
+        )
+    notes = [
+        "RECORDINGS is a folder of the motion data named above, written by `edgepose synthesize`; how is not "
+        f"recorded. The config of the last run is in the archive's metadata. {_list_of(runs)}"
+    ]
+    return commands, notes
 
 
-def _own_reproduction(metadata: dict[str, Any]) -> list[str]:
-    """Return the section with the commands for a network of a user's own, as far as they are known."""
+def _list_of(runs: list[dict[str, Any]]) -> str:
+    listed = [f"{run['run'] or 'CONFIG'} ({run['steps']} steps)" for run in runs]
+    return f"Runs: {', '.join(listed)}."
+
+
+def _export_command(metadata: dict[str, Any], run: str) -> str:
     several = metadata["training"].get("checkpoints", 1) > 1
-    window = f" --past {metadata['past']} --future {metadata['future']}" if metadata["future"] else ""
+    window = f" --past {metadata['past']} --future {metadata['future']}" if is_windowed(metadata) else ""
     flags = "" if metadata["precision"] == "f32" else f" --precision {metadata['precision']}"
     flags += " --rounded" if metadata.get("rounded") else ""
     flags += " --measure RECORDINGS" if metadata["measures"] else ""
-    return [
-        "## Reproduce",
-        "",
-        "```",
-        "edgepose train --config CONFIG --data RECORDINGS --out RUN",
-        f"edgepose export RUN/checkpoint.pt {'OTHERS ' * several}--out {metadata['name']}.pt{window}{flags}",
-        "```",
-        "",
-        "CONFIG is a TOML file with the config in the archive's metadata; RECORDINGS is a folder of the "
-        "motion data named above, written by `edgepose synthesize`."
-        + (" OTHERS are the checkpoints that were averaged with it." * several),
-    ]
+    others = "OTHERS " * several
+    return f"edgepose export {run}/checkpoint.pt {others}--out {metadata['name']}.pt{window}{flags}"
 
 
 _COLUMNS = {
@@ -190,12 +200,6 @@ def _smoothing(metadata: dict[str, Any]) -> str:
 def _mean(training: dict[str, Any]) -> str:
     count = training.get("checkpoints", 1)
     return f" in the last of {count} training runs, whose weights are averaged" if count > 1 else ""
-
-
-def _made_motion(metadata: dict[str, Any]) -> list[str]:
-    """Return the kinds of made motion that the network was trained on, as named by `synthesize`."""
-    config = metadata["training"]["config"]
-    return [kind for kind in ("seated", "rests") if config.get(f"{kind}_share", 0.0) > 0.0]
 
 
 def _deviations(parts: dict[str, dict[str, Any]]) -> list[str]:

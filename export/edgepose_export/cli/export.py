@@ -128,6 +128,7 @@ def export(
     others = _load_other(beside) if beside else {}
     trained = _read(checkpoints, out.stem, past, future, rounded)
     trained.metadata["precision"] = precision
+    trained.metadata["training"]["exported_by_recipe"] = click.get_current_context().obj is not None
     module = _measured_module(trained, data, others, out.name)
     archive.save(module, out, trained.metadata, overwrite)
     write_whole(card_path, card(trained.metadata), "the card", overwrite=overwrite)

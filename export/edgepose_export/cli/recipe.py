@@ -93,7 +93,9 @@ def run_recipe(name: str, mocap: tuple[Path, ...], out: Path, threads: int) -> N
     if "export" not in work.done or not archive.exists():
         checkpoints = [str(_stage_folder(work, stage) / "checkpoint.pt") for stage in recipe.average]
         words = ["--out", str(archive), "--measure", str(out / "recordings"), "--overwrite"]
-        export.main([*checkpoints, *words, *option_words(recipe.export)], standalone_mode=False)
+        export.main(
+            [*checkpoints, *words, *option_words(recipe.export)], standalone_mode=False, obj=recipe.name
+        )
         work.finish("export")
     say(f"{archive} is complete; run it with edgepose run --model {archive} --trust")
     if work.lost:
@@ -117,7 +119,7 @@ def _check_options(recipe: Recipe) -> None:
 
     here = [".", "--out", "."]
     calls = [(synthesize, f"recordings {one.folder}", [*here, *one.words()]) for one in recipe.recordings]
-    calls.append((export, "export", [*here, *option_words(recipe.export)]))
+    calls.append((export, "export", [".", "--out", "model.pt", *option_words(recipe.export)]))
     for command, where, words in calls:
         try:
             command.make_context(command.name, words)

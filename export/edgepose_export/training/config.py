@@ -189,7 +189,7 @@ def _kinds(ability: str) -> str:
     return f"kind = {' or '.join(names)}"
 
 
-_CHOICES = {
+CHOICES: dict[str, tuple[str, ...]] = {
     "kind": tuple(NETWORKS),
     "normalisation": SCHEMES,
     "targets": ("local-matrix", "global-6d"),
@@ -232,8 +232,8 @@ def _checked(
         if type(value) is not kind and not (kind is float and type(value) is int):
             words = {bool: "true or false", int: "a whole number", float: "a number", str: "a string"}
             raise ValueError(f"{name} is {value!r}; it must be {words[kind]}")
-        if kind is str and value not in _CHOICES[name]:
-            raise ValueError(f"{name} is {value!r}; it must be {' or '.join(map(repr, _CHOICES[name]))}")
+        if kind is str and value not in CHOICES[name]:
+            raise ValueError(f"{name} is {value!r}; it must be {' or '.join(map(repr, CHOICES[name]))}")
         if kind in (int, float):
             least, most = _RANGES.get(name, (0, high))
             if not least <= value <= most:

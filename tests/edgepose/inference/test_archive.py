@@ -1,6 +1,8 @@
 import hashlib
 import io
 import json
+import logging
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -138,6 +140,26 @@ def test_endless_metadata_is_not_unpacked(tmp_path):
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr("x/extra/edgepose.json", bytes(50 << 20))
     fails(path, "not a model archive of edgepose")
+
+
+def test_former_names(tmp_path, monkeypatch, capsys):
+    """They are found once nothing bundled has them, with one note from the command line."""
+    for name in ("birnn", "rnn-cmu"):
+        shutil.copy(archive.find_archive(name), tmp_path / f"{name}.pt")
+    monkeypatch.setattr(archive, "MODELS", tmp_path)
+    assert set(archive.ALIASES.values()) == {"birnn", "rnn"}
+    logger = logging.getLogger("edgepose")
+    monkeypatch.setattr(logger, "level", logging.INFO)
+    assert archive.find_archive("rnn-cmu") == tmp_path / "rnn-cmu.pt"
+    with pytest.raises(EdgeposeError, match="rnn: no such model; did you mean"):
+        archive.find_archive("rnn")
+    archive._note_alias.cache_clear()
+    records = []
+    monkeypatch.setattr(logger, "handlers", [handler := logging.Handler()])
+    monkeypatch.setattr(handler, "emit", lambda record: records.append(record.getMessage()))
+    for _ in range(2):
+        assert archive.find_archive("birnn-cmu") == tmp_path / "birnn.pt"
+    assert records == ["model birnn-cmu is called birnn now"]
 
 
 def test_find(tmp_path, made, monkeypatch):
