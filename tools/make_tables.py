@@ -22,11 +22,7 @@ from firmware_protocols.base import Protocol
 from firmware_protocols.registry import BUILT_IN, PROTOCOLS
 
 ROOT = Path(__file__).parents[1]
-<<<<<<< HEAD
-PAGES = ("README.md", "docs/guide/sensors.md", "docs/reference/models.md")
-=======
-PAGES = ("docs/guide/sensors.md", "docs/research/training.md")
->>>>>>> 86f4d5160e1f1537e4cb6b2bc7a7f62dd836a840
+PAGES = ("README.md", "docs/guide/sensors.md", "docs/reference/models.md", "docs/research/training.md")
 
 _BLOCK = re.compile(
     r"(<!-- table (\w+): made by tools/make_tables\.py -->\n).*?(<!-- end of table -->)", re.DOTALL
@@ -65,7 +61,6 @@ def _table(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([lines[0], "|" + "---|" * len(rows[0]), *lines[1:]]) + "\n"
 
 
-<<<<<<< HEAD
 @cache  # both tables need all of it
 def _measured() -> dict[str, dict[str, dict[str, Metric]]]:
     """Return the tables of `edgepose evaluate --real` for all shipped models."""
@@ -75,7 +70,8 @@ def _measured() -> dict[str, dict[str, dict[str, Metric]]]:
 
     models = {f"`{path.stem}`": Model(path.stem) for path in bundled_archives()}
     return measure_models(models)
-=======
+
+
 def settings() -> str:
     """Return the table of a training config's keys, from the docstrings and defaults of its classes."""
     from edgepose_export.networks.shape import NetworkShape
@@ -112,10 +108,6 @@ def _attributes(kind: type) -> dict[str, str]:
         elif line.startswith(" " * 8):
             texts[name] += f" {line.strip()}"
     return texts
-
-
-TABLES = {"protocols": protocols, "settings": settings}
->>>>>>> 86f4d5160e1f1537e4cb6b2bc7a7f62dd836a840
 
 
 def walker() -> str:
