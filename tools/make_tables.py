@@ -148,7 +148,7 @@ def _cell(metric: Metric, digits: int = 1) -> str:
     return f"{metric.mean:.{digits}f} ± {metric.std:.{digits}f}"
 
 
-TABLES: Mapping[str, Callable[[], str]] = {"protocols": protocols}
+TABLES: Mapping[str, Callable[[], str]] = {"protocols": protocols, "settings": settings}
 """Tables that are made from the code."""
 
 MEASURED: Mapping[str, Callable[[], str]] = {"walker": walker, "sitter": sitter}
