@@ -46,7 +46,7 @@ def learn_prior(inputs: tuple[Path, ...], out: Path, about: str, overwrite: bool
     from edgepose.sip.prior import save_prior
     from edgepose.skeleton import local_from_global
     from edgepose_export.cli.progress import progress
-    from edgepose_export.cli.synthesize import motion_files
+    from edgepose_export.cli.recording_jobs import motion_files
     from edgepose_export.mocap import pieces, read_motion
     from edgepose_export.training.sources import take_info
 

@@ -13,7 +13,8 @@ from edgepose.cli.terminal.messages import say
 from edgepose.errors import EdgeposeError
 from edgepose.utils.durable_files import write_whole
 from edgepose_export.cli.export import export
-from edgepose_export.cli.synthesize import NotAllConvertedError, Request, motion_files, synthesize
+from edgepose_export.cli.recording_jobs import motion_files
+from edgepose_export.cli.synthesize import NotAllConvertedError, Request, synthesize
 from edgepose_export.training.sources import OWN, TakeInfo, take_info
 
 if TYPE_CHECKING:

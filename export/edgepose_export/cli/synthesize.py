@@ -14,42 +14,24 @@ import click
 from edgepose.cli.options.outputs import overwrite_option
 from edgepose.cli.terminal.messages import say
 from edgepose.errors import EdgeposeError
-from edgepose.skeleton import Body
-from edgepose.utils.durable_files import replace_file
 from edgepose.utils.output_targets import check_free
 from edgepose_export.cli.journal import Journal
-from edgepose_export.training.sources import OWN, UNKNOWN, TakeInfo, take_info
+from edgepose_export.cli.recording_jobs import (
+    KINDS,
+    Job,
+    about_take,
+    convert,
+    file_name,
+    motion_files,
+    recording_path,
+)
+from edgepose_export.training.sources import UNKNOWN
 
 if TYPE_CHECKING:
-    from edgepose_export.mocap import Mapping, Motion
     from edgepose_export.mocap.zeroing import Zero
-
-KINDS = (".bvh", ".amc", ".npz")
 
 MOST_HOLD_FRAMES = 100_000
 """Longest time of standing before a motion, samples of a sensor."""
-
-
-class Job(NamedTuple):
-    """Settings of a conversion: the command's flags, and the folder that paths are relative to.
-
-    `license_note` is the licence of motion that no rule knows, `zero` that of the file's actor, or None for
-    that of the source.
-    """
-
-    out: Path
-    root: Path
-    rate: float
-    body: Body
-    hold_s: float
-    mounting_seed: int | None
-    seated_seed: int | None
-    rests_seed: int | None
-    license_note: str
-    overwrite: bool
-    t_pose: Path | None = None
-    mapping: Mapping | None = None
-    zero: Zero | None = None
 
 
 class Request(NamedTuple):
@@ -198,16 +180,7 @@ def synthesize(
     from edgepose.skeleton import default_body
     from edgepose_export.mocap.mapping import read_mapping
 
-    if out is None and picture is None:
-        raise click.UsageError("Missing option '--out', the folder for the recordings.")
-    if hold * rate > MOST_HOLD_FRAMES:
-        raise click.UsageError(
-            f"--hold {hold:g} at --rate {rate:g} takes too much memory: at most {MOST_HOLD_FRAMES} samples"
-        )
-    if seated_seed is not None and rests_seed is not None:
-        raise click.UsageError("--seated and --rests make different takes: call synthesize once for each")
-    if body_path and height:
-        raise click.UsageError("--body sets the height: omit --height")
+    _check_usage(click.get_current_context())
     body = read_smpl(body_path) if body_path else default_body(height or 1.75)
     files = [(root, path) for root in inputs for path in motion_files(root)]
     everything = files
@@ -225,35 +198,42 @@ def synthesize(
         return
     journal = Journal(out, _settings(click.get_current_context())) if resume else None
     overwrite |= journal is not None and journal.begun  # pieces of the file at which it was interrupted
-    job = Job(
-        out,
-        out,
-        rate,
-        body,
-        hold,
-        mounting_seed,
-        seated_seed,
-        rests_seed,
-        license_note,
-        overwrite,
-        t_pose,
-        mapping,
-    )
+    seeds = (mounting_seed, seated_seed, rests_seed)
+    job = Job(out, out, rate, body, hold, *seeds, license_note, overwrite, t_pose, mapping)
     tasks = [(path, job._replace(root=root if root.is_dir() else root.parent)) for root, path in files]
     _check_targets(tasks, overwrite)
     if journal:
         journal.begin()
-        tasks = [task for task in tasks if _name(*task) not in journal]
+        tasks = [task for task in tasks if file_name(*task) not in journal]
     if zero == "wearer" and tasks:
         tasks = _zeroed(tasks, everything, request.zeros, jobs)
-    failed = _convert_all(tasks, jobs, journal)
-    say(f"{len(files) - failed} of {len(files)} recordings written to {out}")
-    if failed:
-        raise NotAllConvertedError(failed, len(files))
+    _convert_all(tasks, len(files), out, jobs, journal)
 
 
-def _convert_all(tasks: list[tuple[Path, Job]], jobs: int, journal: Journal | None) -> int:
-    """Convert files, in several processes if `jobs` is more than 1; return how many cannot be converted."""
+def _check_usage(context: click.Context) -> None:
+    """Raise click.UsageError if flags do not go together."""
+    flags = context.params
+    if flags["out"] is None and flags["picture"] is None:
+        raise click.UsageError("Missing option '--out', the folder for the recordings.")
+    if flags["hold"] * flags["rate"] > MOST_HOLD_FRAMES:
+        raise click.UsageError(
+            f"--hold {flags['hold']:g} at --rate {flags['rate']:g} takes too much memory: at most "
+            f"{MOST_HOLD_FRAMES} samples"
+        )
+    if flags["seated_seed"] is not None and flags["rests_seed"] is not None:
+        raise click.UsageError("--seated and --rests make different takes: call synthesize once for each")
+    if flags["body_path"] and flags["height"]:
+        raise click.UsageError("--body sets the height: omit --height")
+
+
+def _convert_all(
+    tasks: list[tuple[Path, Job]], files: int, out: Path, jobs: int, journal: Journal | None
+) -> None:
+    """Convert files, in several processes if `jobs` is more than 1, and report those that cannot be.
+
+    Raises:
+        NotAllConvertedError: a file could not be converted.
+    """
     from edgepose_export.cli.progress import progress
 
     failed = 0
@@ -270,8 +250,10 @@ def _convert_all(tasks: list[tuple[Path, Job]], jobs: int, journal: Journal | No
                 failed += 1
                 say(f"skipped: {problem}")
             elif journal:
-                journal.add(_name(*task))
-    return failed
+                journal.add(file_name(*task))
+    say(f"{files - failed} of {files} recordings written to {out}")
+    if failed:
+        raise NotAllConvertedError(failed, files)
 
 
 class NotAllConvertedError(EdgeposeError):
@@ -296,11 +278,6 @@ def _settings(context: click.Context) -> dict[str, Any]:
     }
 
 
-def _name(path: Path, job: Job) -> str:
-    """Return the name of a motion file in the journal: its path below the folder of the motion."""
-    return path.relative_to(job.root).as_posix()
-
-
 def _zeroed(
     tasks: list[tuple[Path, Job]], files: list[tuple[Path, Path]], zeros: dict[str, Zero], jobs: int
 ) -> list[tuple[Path, Job]]:
@@ -316,14 +293,6 @@ def _zeroed(
             actors.setdefault(actor, []).append(path)
     zeros |= find_zeros(actors, job.t_pose, job.mapping, jobs) if actors else {}
     return [(path, job._replace(zero=zeros.get(about_take(path, job).actor))) for path, job in tasks]
-
-
-def about_take(path: Path, job: Job) -> TakeInfo:
-    """Return source, licence, actor and part of a motion file, by its path from the motion's folder on."""
-    info = take_info((job.root.absolute().name / path.relative_to(job.root)).with_suffix(""))
-    if info.source.name != OWN:
-        return info
-    return info._replace(source=info.source._replace(license=job.license_note))
 
 
 def _check_targets(tasks: list[tuple[Path, Job]], overwrite: bool) -> None:
@@ -344,98 +313,5 @@ def _check_targets(tasks: list[tuple[Path, Job]], overwrite: bool) -> None:
             raise EdgeposeError(f"{path} would be overwritten by its recording; give another --out")
         seen[target] = path
     if not overwrite:
-        targets = (_target(path, job, part) for path, job in tasks for part in ("", ".part1"))
+        targets = (recording_path(path, job, part) for path, job in tasks for part in ("", ".part1"))
         check_free(targets, "give --overwrite or another --out")
-
-
-def _target(path: Path, job: Job, part: str) -> Path:
-    """Return the path of the recording made of a motion file, or of a part of it."""
-    from edgepose_export.training.dataset import RESTS, SEATED
-
-    kind = SEATED if job.seated_seed is not None else RESTS if job.rests_seed is not None else ""
-    return job.out / path.relative_to(job.root).with_name(f"{path.stem}{part}{kind}.npz")
-
-
-def motion_files(root: Path) -> list[Path]:
-    """Return the motion files below a folder, or the file itself; T-poses of others are no motion."""
-    from edgepose_export.mocap.rest_search import is_t_pose_file
-
-    if root.is_file():
-        return [root]
-    return sorted(
-        path for path in root.rglob("*") if path.suffix.lower() in KINDS and not is_t_pose_file(path)
-    )
-
-
-def convert(path: Path, job: Job) -> str | None:
-    """Convert one file, cut into parts where the source jumps; return what was wrong with it, or None."""
-    import numpy as np
-
-    from edgepose.rotations import transpose
-    from edgepose_export.mocap import fault, pieces, read_motion, resample, scaled_to
-    from edgepose_export.synthesis.virtual_imus import (
-        random_mounting,
-        recording_arrays,
-        virtual_imus,
-        with_hold,
-    )
-
-    info = about_take(path, job)
-    try:
-        mounting = None if job.mounting_seed is None else random_mounting(job.mounting_seed)
-        whole = read_motion(path, job.t_pose, job.mapping)
-        problem = fault(whole, job.rate)
-        if problem:
-            return f"{path}: {problem}"
-        takes = pieces(whole)
-        if not takes:
-            return f"{path}: no part between two jumps is as long as a second"
-        for i, take in enumerate(takes):
-            motion = resample(scaled_to(take, job.body.leg_length_m), job.rate)
-            directions = None
-            if job.zero:
-                motion = motion._replace(rotations=motion.rotations @ job.zero.straight)
-                directions = transpose(job.zero.straight) @ job.zero.directions
-            if job.seated_seed is not None:
-                directions = None  # the legs are made on the body as it is zeroed
-            motion = _with_made_parts(motion, job, [i, *path.stem.encode()])
-            if job.hold_s:
-                motion = with_hold(motion, job.hold_s)
-            imus = virtual_imus(motion, job.body, mounting, directions)
-            part = f".part{i + 1}" if len(takes) > 1 else ""
-            target = _target(path, job, part)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            arrays = recording_arrays(motion, imus, info.source.license, info.source.name, info.actor)
-            arrays["zero"] = np.array(job.zero.evidence if job.zero else "source")
-            replace_file(
-                target,
-                lambda file, arrays=arrays: np.savez(file, **arrays),
-                "recording",
-                overwrite=job.overwrite,
-            )
-    except EdgeposeError as error:
-        return str(error)
-    except OSError as error:
-        return f"{path}: {error}"
-    return None
-
-
-def _with_made_parts(motion: Motion, job: Job, key: list[int]) -> Motion:
-    """Return a motion with synthetic sitting or rests if the job asks for them.
-
-    The key, numbers made of the take's name, is part of the seed, so that a take does not depend on the
-    others in the call.
-    """
-    import numpy as np
-
-    from edgepose_export.synthesis.floor import SHARE, on_the_floor
-    from edgepose_export.synthesis.rests import with_rests
-    from edgepose_export.synthesis.sitting import seated
-
-    if job.seated_seed is not None:
-        seed = [job.seated_seed, *key]
-        make = on_the_floor if np.random.default_rng([1, *seed]).random() < SHARE else seated
-        return make(motion, job.body, np.random.default_rng(seed))
-    if job.rests_seed is not None:
-        return with_rests(motion, job.body, np.random.default_rng([job.rests_seed, *key]))
-    return motion
