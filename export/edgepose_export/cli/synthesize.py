@@ -178,21 +178,18 @@ def synthesize(
     """
     from edgepose.formats.smpl_model import read_smpl
     from edgepose.skeleton import default_body
+    from edgepose_export.cli.skeleton_check import draw_skeletons
     from edgepose_export.mocap.mapping import read_mapping
 
     _check_usage(click.get_current_context())
     body = read_smpl(body_path) if body_path else default_body(height or 1.75)
-    files = [(root, path) for root in inputs for path in motion_files(root)]
-    everything = files
     request = click.get_current_context().obj or Request(None, {})
-    if request.files is not None:
-        files = [(root, path) for root, path in files if path in request.files]
+    everything = [(root, path) for root in inputs for path in motion_files(root)]
+    files = [pair for pair in everything if request.files is None or pair[1] in request.files]
     if not files:
         raise EdgeposeError(f"no motion files ({', '.join(KINDS)}) in {', '.join(map(str, inputs))}")
     mapping = read_mapping(mapping_path) if mapping_path else None
     if picture:
-        from edgepose_export.cli.skeleton_check import draw_skeletons
-
         draw_skeletons(files, picture, body, t_pose=t_pose, mapping=mapping, overwrite=overwrite)
     if out is None:
         return
