@@ -202,9 +202,8 @@ def synthesize(
     if journal:
         journal.begin()
         tasks = [task for task in tasks if file_name(*task) not in journal]
-    if zero == "wearer" and tasks:
-        tasks = _zeroed(tasks, everything, request.zeros, jobs)
-    _convert_all(tasks, len(files), out, jobs, journal)
+    zeroed = _zeroed(tasks, everything, request.zeros, jobs) if zero == "wearer" and tasks else tasks
+    _convert_all(zeroed, len(files), out, jobs, journal)
 
 
 def _check_usage(context: click.Context) -> None:
