@@ -295,6 +295,35 @@ def test_faults_of_mappings(tmp_path, text, message):
     assert message in str(caught.value)
 
 
+def test_two_bodies_in_one_file_need_a_mapping(tmp_path, walk):
+    family, path = FAMILIES["lafan"], tmp_path / "a.bvh"
+    more = (("B_LeftUpLeg", "Hips"), ("B_Head", "Neck"))
+    write_bvh(path, family._replace(more=more), walk.rotations, walk.translation)
+    for joint in ("left thigh", "head"):
+        name = {"left thigh": "LeftUpLeg", "head": "Head"}[joint]
+        with pytest.raises(EdgeposeError, match=f"joints {name} and B_{name} are both a {joint}; say which"):
+            read_motion(path, mapping=None if joint == "left thigh" else Mapping({"left_thigh": "LeftUpLeg"}))
+    found = read_motion(path, mapping=Mapping({"left_thigh": "LeftUpLeg", "head": "Head"}))
+    check(found, family, walk, "y")
+
+
+@pytest.mark.parametrize(
+    ("joints", "message"),
+    [
+        ({"pelvis": "Spine"}, "joint LeftUpLeg does not hang on Spine"),
+        ({"chest": "LeftArm"}, "not above LeftArm, the chest"),
+        ({"neck": "LeftArm"}, "joint Head does not hang on LeftArm"),
+        ({"head": "LeftToe"}, "joint LeftToe is not above Spine2, the chest"),
+        ({"left_hand": "LeftArm"}, "joint LeftArm does not hang on LeftForeArm"),
+    ],
+)
+def test_mappings_must_be_bodies(tmp_path, walk, joints, message):
+    write_bvh(tmp_path / "a.bvh", FAMILIES["lafan"], walk.rotations, walk.translation)
+    with pytest.raises(EdgeposeError) as caught:
+        read_motion(tmp_path / "a.bvh", mapping=Mapping(joints))
+    assert message in str(caught.value)
+
+
 def test_a_mapping_of_joints_that_are_not_there(tmp_path, walk):
     write_bvh(tmp_path / "a.bvh", FAMILIES["lafan"], walk.rotations, walk.translation)
     with pytest.raises(EdgeposeError, match=r"a\.bvh: the mapping's joint 'Bone12' \(left_hand\) is not in"):
@@ -431,7 +460,6 @@ def test_translation_is_scaled_by_the_legs(walk):
 
 
 def test_bones_are_followed_in_the_picture(tmp_path, walk):
-    pytest.importorskip("matplotlib")
     from edgepose_export.mocap.check_picture import draw_check, figures_of, skeleton_key
     from edgepose_export.mocap.retargeting import retarget
 
@@ -443,7 +471,7 @@ def test_bones_are_followed_in_the_picture(tmp_path, walk):
     np.testing.assert_allclose(row.source[:, joints], row.target[:, [7, 21, 15]], atol=2e-3)
     assert row.frames[:2] == (0, 5)
     assert (row.target[:, 1, 0] > row.target[:, 2, 0]).all()  # faces the viewer
-    draw_check([row, row], tmp_path / "a.png", False)
+    draw_check([row], tmp_path / "a.png", False)
     assert (tmp_path / "a.png").read_bytes()[:4] == b"\x89PNG"
     other = tmp_path / "b.bvh"
     write_bvh(other, FAMILIES["mixamo"], T_POSE, ORIGIN, axes="z, facing x")

@@ -147,6 +147,8 @@ def draw_check(rows: Sequence[Row], path: Path, overwrite: bool) -> None:
 
 
 def _draw_row(line: Sequence[Axes], entry: Row) -> None:
+    from matplotlib.collections import LineCollection
+
     column = 0
     for index, name in enumerate(_FRAMES):
         for view, axis, sign in _VIEWS:
@@ -155,8 +157,11 @@ def _draw_row(line: Sequence[Axes], entry: Row) -> None:
                 (entry.target[index], entry.target_bones),
             ):
                 ax = line[column]
-                for a, b, colour in bones:
-                    ax.plot(sign * joints[[a, b], axis], joints[[a, b], 1], color=colour, linewidth=1.6)
+                points = np.stack([sign * joints[:, axis], joints[:, 1]], axis=1)
+                segments = [points[[start, end]] for start, end, _ in bones]
+                ax.add_collection(
+                    LineCollection(segments, colors=[colour for *_, colour in bones], linewidths=1.6)
+                )
                 ax.set(xlim=(-_REACH_M * 0.6, _REACH_M * 0.6), ylim=(-_REACH_M, _REACH_M), aspect="equal")
                 ax.axis("off")
                 column += 1

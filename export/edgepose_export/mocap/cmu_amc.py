@@ -27,6 +27,6 @@ def read_cmu_amc(path: Path) -> Source:
         rest = standing(tree, roles, cmu_t_pose(tree.names))
     except EdgeposeError as error:
         raise EdgeposeError(f"{path}: {error}") from None
-    if not near_rest(limb_directions(rest, roles)):
+    if rest is None or not near_rest(limb_directions(rest, roles)):
         raise EdgeposeError(f"{path}: the limbs of the skeleton do not lie as in CMU's skeletons")
     return Source(tree, roles, rest, rest.up, 1.0, "cmu")

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edgepose.errors import EdgeposeError
 from edgepose.formats.joint_tree import JointTree, forward
 from edgepose.rotations import minimal_rotation, rotation_about_axis
 
@@ -44,13 +43,11 @@ class RestPose(NamedTuple):
     """(3,) the axis of the file's world that was up in this pose."""
 
 
-def standing(tree: JointTree, roles: Roles, local: Array) -> RestPose:
+def standing(tree: JointTree, roles: Roles, local: Array) -> RestPose | None:
     """Return the pose with local rotations (J, 3, 3) of a skeleton, brought upright, facing +Z.
 
-    Up is the axis along which the head is farthest above the feet.
-
-    Raises:
-        EdgeposeError: the joints of both sides coincide, so that there is no left and right.
+    Up is the axis along which the head is farthest above the feet. The result is None if the joints of both
+    sides coincide, so that there is no left and right.
     """
     posed = forward(tree._replace(rotations=local[None], positions=tree.offsets[None]))
     rotations, positions = posed[0][0], posed[1][0]
@@ -62,7 +59,7 @@ def standing(tree: JointTree, roles: Roles, local: Array) -> RestPose:
     )
     left = axes @ np.asarray(left)
     if not np.hypot(left[0], left[2]) > 1e-3 * np.abs(positions - positions[roles.pelvis]).max():
-        raise EdgeposeError("left and right hips and shoulders coincide")
+        return None
     heading = float(np.arctan2(-left[2], left[0]))
     square = np.round(heading / (np.pi / 2)) * (np.pi / 2)
     if abs(heading - square) < np.radians(_SQUARE_DEG):

@@ -41,41 +41,40 @@ def is_t_pose_file(path: Path) -> bool:
 def find_rest(path: Path, tree: JointTree, roles: Roles, t_pose: Path | None = None) -> Rest:
     """Return the T-pose of a file.
 
-    In this order: the given file; a file beside (`t_pose*.bvh`) with the same skeleton; what is known of
-    Bandai-Namco's skeleton; frame 0; what is known of CMU's; the zero pose, where all angles are zero.
-    Frame 0 is the T-pose if it is one as programs write it, and clearly closer to SMPL's than the zero pose.
-    Then it is no motion, nor is a frame 0 that is the zero pose.
+    In this order: the given file; what is known of Bandai-Namco's skeleton; a file beside (`t_pose*.bvh`)
+    with the same skeleton; frame 0; what is known of CMU's; the zero pose, where all angles are zero. Frame 0
+    is the T-pose if it is one as programs write it, and clearly closer to SMPL's than the zero pose. Then it
+    is no motion, nor is a frame 0 that is the zero pose.
 
     Raises:
         EdgeposeError: no T-pose; the message says what to give.
     """
     if t_pose is not None:
         return Rest(_from_file(t_pose, tree, roles), 0)
-    beside, misfits = _beside(path, tree, roles)
-    if beside is not None:
-        return Rest(beside, 0)
     if is_bandai(tree.names):
         # Both datasets share one skeleton; the zero of the collars differs, which only the name reveals.
         pose = _from_global(tree, roles, bandai_t_pose(tree.names, not path.name.startswith("dataset-1_")))
-        if not near_rest(limb_directions(pose, roles)):
+        if pose is None or not near_rest(limb_directions(pose, roles)):
             raise EdgeposeError("the limbs do not lie as in Bandai-Namco's skeleton")
         return Rest(pose, 0)
-    return _within(tree, roles, misfits)
+    beside, misfits = _beside(path, tree, roles)
+    return _within(tree, roles, misfits) if beside is None else Rest(beside, 0)
 
 
 def _within(tree: JointTree, roles: Roles, misfits: list[str]) -> Rest:
     """Return the T-pose in the file itself; `misfits`: faults of files beside."""
     zero = standing(tree, roles, np.tile(np.eye(3), (len(tree.names), 1, 1)))
     first = standing(tree, roles, tree.rotations[0])
-    zero_deg, first_deg = (deviation_deg(limb_directions(pose, roles)) for pose in (zero, first))
-    fault = rest_fault(zero, roles, tree.names)
-    if is_exact(first, roles) and (fault or first_deg < zero_deg - _CLEARLY_BETTER_DEG):
-        return Rest(first, _first_filled(tree))
+    fault = "left and right coincide" if zero is None else rest_fault(zero, roles, tree.names)
+    if first is not None and is_exact(first, roles):
+        better_deg = _deviation_deg(zero, roles) - _deviation_deg(first, roles)
+        if fault or better_deg > _CLEARLY_BETTER_DEG:
+            return Rest(first, _first_filled(tree))
     if is_cmu(tree.names):
         known = standing(tree, roles, cmu_t_pose(tree.names))
-        if near_rest(limb_directions(known, roles)):
+        if known is not None and near_rest(limb_directions(known, roles)):
             return Rest(known, 0)
-    if fault:
+    if zero is None or fault:
         raise EdgeposeError(
             f"no T-pose: where all angles are zero, {fault}; frame 0 is not the T-pose"
             f"{''.join(f'; {misfit}' for misfit in misfits)}; give --t-pose FILE, a BVH file of the same "
@@ -98,14 +97,16 @@ def _first_filled(tree: JointTree) -> int:
 def _beside(path: Path, tree: JointTree, roles: Roles) -> tuple[RestPose | None, list[str]]:
     """Return the T-pose in a file beside a file, None if there is none, and why other files are of no use."""
     poses, misfits = [], []
-    for file in sorted(path.parent.iterdir()):
-        if not is_t_pose_file(file):
-            continue
+    try:
+        files = sorted(filter(is_t_pose_file, path.parent.iterdir()))
+    except OSError:  # a folder that may not be listed
+        files = []
+    for file in files:
         try:
             poses.append(_from_file(file, tree, roles))
         except EdgeposeError as error:
             misfits.append(str(error))
-    return min(poses, key=lambda pose: deviation_deg(limb_directions(pose, roles)), default=None), misfits
+    return min(poses, key=lambda pose: _deviation_deg(pose, roles), default=None), misfits
 
 
 def _from_file(path: Path, tree: JointTree, roles: Roles) -> RestPose:
@@ -117,11 +118,15 @@ def _from_file(path: Path, tree: JointTree, roles: Roles) -> RestPose:
     other = read_bvh(path)
     order = _same_joints(path, tree, other, roles)
     poses = [standing(tree, roles, local) for local in other.rotations[:, order]]
-    best = min(poses, key=lambda pose: deviation_deg(limb_directions(pose, roles)))
-    fault = rest_fault(best, roles, tree.names)
-    if fault:
+    best = min(poses, key=lambda pose: _deviation_deg(pose, roles))
+    fault = "left and right coincide" if best is None else rest_fault(best, roles, tree.names)
+    if best is None or fault:
         raise EdgeposeError(f"{path} contains no T-pose: at best {fault}")
     return best
+
+
+def _deviation_deg(pose: RestPose | None, roles: Roles) -> float:
+    return np.inf if pose is None else deviation_deg(limb_directions(pose, roles))
 
 
 def _same_joints(path: Path, tree: JointTree, other: JointTree, roles: Roles) -> list[int]:
@@ -147,7 +152,7 @@ def _same_joints(path: Path, tree: JointTree, other: JointTree, roles: Roles) ->
     return [other.names.index(name) for name in tree.names]
 
 
-def _from_global(tree: JointTree, roles: Roles, rotations: Array) -> RestPose:
+def _from_global(tree: JointTree, roles: Roles, rotations: Array) -> RestPose | None:
     """Return the pose with global rotations (J, 3, 3)."""
     parents = list(tree.parents)
     local = transpose(rotations[parents]) @ rotations

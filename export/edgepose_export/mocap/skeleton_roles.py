@@ -126,8 +126,17 @@ class _Tree:
 
     def named(self, part: str, side: str = "") -> int | None:
         """Return the joint nearest to the root whose name means a part."""
-        found = [j for j, m in enumerate(self.meanings) if m is not None and (m.part, m.side) == (part, side)]
+        found = [j for j, m in enumerate(self.meanings) if m == Meaning(part, side)]
         return min(found, key=lambda joint: len(self.above(joint)), default=None)
+
+    def check_only(self, joint: int) -> None:
+        """Raise EdgeposeError if a joint that does not hang on this one has a name that means the same."""
+        for other, what in enumerate(self.meanings):
+            if what == self.meanings[joint] and what is not None and joint not in self.above(other):
+                raise EdgeposeError(
+                    f"joints {self.names[joint]} and {self.names[other]} are both a "
+                    f"{' '.join(filter(None, (what.side, what.part)))}; say which with --mapping FILE.toml"
+                )
 
     def part(self, joint: int) -> str | None:
         """Return what part a joint's name means."""
@@ -164,7 +173,12 @@ def _limb_joints(tree: _Tree, side: str, given: Mapping[str, int]) -> dict[str, 
         "forearm": named["forearm"],
         "hand": named["hand"],
     }
-    return {role: given.get(f"{side}_{role}", joint) for role, joint in joints.items()}
+    for role, joint in joints.items():
+        if f"{side}_{role}" in given:
+            joints[role] = given[f"{side}_{role}"]
+        elif joint is not None:
+            tree.check_only(joint)
+    return joints
 
 
 def _check_chain(tree: _Tree, joints: Sequence[int | None]) -> None:
@@ -183,7 +197,10 @@ def _trunk(
 ) -> tuple[int, tuple[int, ...]]:
     """Return the pelvis and the joints of the spine, of which the last is the chest."""
     left, right = (limbs[side] for side in SIDES)
-    pelvis = given.get("pelvis", tree.fork(_joint(left["thigh"]), _joint(right["thigh"])))
+    thighs = _joint(left["thigh"]), _joint(right["thigh"])
+    pelvis = given.get("pelvis", tree.fork(*thighs))
+    for thigh in thighs:
+        _check_chain(tree, [pelvis, thigh])
     arms = [
         _joint(joints["upper_arm"] if joints["collar"] is None else joints["collar"])
         for joints in (left, right)
@@ -206,12 +223,16 @@ def _neck_and_head(tree: _Tree, chest: int, given: Mapping[str, int]) -> tuple[i
     head = given.get("head", tree.named("head"))
     if head is None:
         head = _top(tree, chest)
+    elif "head" not in given:
+        tree.check_only(head)
     if head is None:
         raise EdgeposeError(_unknown(tree.names, ["head"]))
     if head == chest or chest not in tree.above(head):
         raise EdgeposeError(f"joint {tree.names[head]} is not above {tree.names[chest]}, the chest")
     path = [j for j in tree.between(chest, head)[:-1] if not is_helper(tree.names[j])]
-    return given.get("neck", path[0] if path else None), head
+    neck = given.get("neck", path[0] if path else None)
+    _check_chain(tree, [chest, neck, head])
+    return neck, head
 
 
 def _top(tree: _Tree, chest: int) -> int | None:
