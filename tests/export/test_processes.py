@@ -32,9 +32,11 @@ steps = 4
 sequences = 4
 window = 20
 validate_every = 2
+place_loss = 0.3
 [network]
 kind = "rnn"
 hidden = 8
+place = true
 """
 # What each process does with the gradients of its half of a batch, against the gradients of the whole batch.
 PROGRAM = """

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
 from edgepose.skeleton import JOINTS
 
@@ -65,6 +65,9 @@ _SHORTEST_S, _SHORTEST_SEAT_S = 0.08, 0.3
 """Shortest still phase that is a contact, and the same for the pelvis."""
 _GAP_S, _SEAT_GAP_S = 0.05, 0.5
 """Longest gap between two contacts that is closed, and the same for the pelvis."""
+
+_GROUND_S = 0.5
+"""Half of the time over which the height of the ground below a still joint is a minimum."""
 
 _FALL = 7.5
 """m/s^2. If the centre of mass accelerates downwards by more, nothing carries the body."""
@@ -149,9 +152,21 @@ def _on_ground(body: _Body, joint: int) -> Mask:
     result = np.zeros(len(near), bool)
     for run in _still(body, joint, _SHORTEST_S, body.carried):
         if near[run].any():
-            ground = clearance[run][near[run]].min()
-            result[run] = clearance[run] < ground + _TOLERANCE
+            result[run] = clearance[run] < _ground(clearance[run], near[run], body.rate) + _TOLERANCE
     return _closed(result, round(_GAP_S * body.rate), body.carried)
+
+
+def _ground(clearance: Array, near: Mask, rate: float) -> Array:
+    """Return the height (T,) of what a still joint stands on.
+
+    It is the least height within `_GROUND_S` at which the joint is near the ground (T,), interpolated where
+    it is not. It may change: a foot that stays where it is while its wearer gets up from the floor has
+    another height flat on its side than below the shank.
+    """
+    lowest = minimum_filter1d(np.where(near, clearance, np.inf), 2 * round(_GROUND_S * rate) + 1)
+    known = np.flatnonzero(np.isfinite(lowest))
+    ground: Array = np.interp(np.arange(len(lowest)), known, lowest[known])
+    return ground
 
 
 def _on_seat(body: _Body, touching: dict[int, Mask]) -> Mask:

@@ -132,9 +132,11 @@ def _place(data: Any) -> NDArray[np.float32] | None:
     if "contact" not in data or "velocity" not in data:
         return None
     contact, velocity = data["contact"], data["velocity"]
-    if contact.shape[1:] != (len(CONTACTS),) or contact.dtype.kind not in "iub" or not (contact <= 1).all():
+    whole = contact.shape[1:] == (len(CONTACTS),) and contact.dtype.kind in "iub"
+    if not (whole and np.isin(contact, (0, 1)).all()):
         raise ValueError("contacts are not 0 or 1")
-    if velocity.shape != (len(contact), 3) or not (np.abs(velocity) < MAX_VALUE).all():
+    numbers = velocity.dtype.kind == "f" and (np.abs(velocity) < MAX_VALUE).all()
+    if velocity.shape != (len(contact), 3) or not numbers:
         raise ValueError("a velocity is not finite, or absurd")
     return np.concatenate([contact, velocity], axis=1).astype(np.float32)
 

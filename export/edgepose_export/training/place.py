@@ -52,15 +52,16 @@ def place_loss(output: Tensor, target: Tensor, weights: Tensor) -> Tensor:
     return ((contact * weights * known).mean(-1).sum() + (moving * known).mean(-1).sum()) / frames
 
 
-def place_counts(output: Tensor, target: Tensor) -> Tensor:
+def place_counts(output: Tensor, target: Tensor, threshold: float = 0.0) -> Tensor:
     """Return sums (6,) over frames (..., 10), which add up to those of more frames, for `place_accuracy`.
 
     They are: feet in contact, found; feet in contact; feet not in contact, found; feet not in contact;
-    velocity errors, m/s; frames.
+    velocity errors, m/s; frames. `threshold` is the least output that means contact: 0 for logits, 0.5 for
+    probabilities.
     """
     known = target[..., 0].isfinite()
     output, target = output[known], target[known]
-    found, true = output[:, FEET] > 0.0, target[:, FEET] > 0.5
+    found, true = output[:, FEET] > threshold, target[:, FEET] > 0.5
     error = (output[:, len(CONTACTS) :] - target[:, len(CONTACTS) :]).norm(dim=-1)
     sums = [(found & true).sum(), true.sum(), (~found & ~true).sum(), (~true).sum(), error.sum(), known.sum()]
     return torch.stack([number.double() for number in sums])
