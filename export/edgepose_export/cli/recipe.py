@@ -91,7 +91,7 @@ def run_recipe(name: str, mocap: tuple[Path, ...], out: Path, threads: int) -> N
         for one in recordings:
             _make_recordings(one, takes, mocap, work, zeros, threads)
     _train_stages(recipe, work, threads)
-    if "export" not in work.done or not archive.exists():
+    if "export" not in work.done or not (archive.exists() and archive.with_suffix(".md").exists()):
         checkpoints = [str(_stage_folder(work, stage) / "checkpoint.pt") for stage in recipe.average]
         words = ["--out", str(archive), "--measure", str(out / "recordings"), "--overwrite"]
         export.main(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -95,6 +96,8 @@ def train(
             raise click.UsageError("--recipe needs folders with motion")
         if data or resume or init or steps or cache:
             raise click.UsageError("--recipe decides all but --out and --threads: give no other option")
+        if "TORCHELASTIC_RUN_ID" in os.environ:
+            raise click.UsageError("--recipe runs in one process: call it without torchrun")
         from edgepose_export.cli.recipe import run_recipe
 
         run_recipe(recipe, mocap, out, threads)
