@@ -64,7 +64,7 @@ RECORDING = (
     "convert {file} --to csv --filter kalman --out {out}",
     "calibrate --file {file} --from 0 --hold 0.6 --body-frame heading:0 --out {out}/calibration.json",
     "record {out}/recording.csv --file {file}",
-    "run --file {file} --calibration {seeds}/calibration.json --model rnn-cmu --csv {out}/p.csv "
+    "run --file {file} --calibration {seeds}/calibration.json --model rnn --csv {out}/p.csv "
     "--npz {out}/p.npz",
     "solve {file} --calibration {seeds}/calibration.json --method sop --csv {out}/p.csv --bvh {out}/p.bvh",
 )
@@ -79,7 +79,7 @@ CAPTURE = (
         "check --file {file} --json",
         "record {out}/r.csv --file {file}",
     ),
-    "run --file {file} --calibration {seeds}/calibration.json --model rnn-cmu --csv {out}/p.csv",
+    "run --file {file} --calibration {seeds}/calibration.json --model rnn --csv {out}/p.csv",
 )
 
 # --- a wearer -----------------------------------------------------------------------------------------------
@@ -194,7 +194,7 @@ def recording_kinds(folder: Path, recording: Recording) -> Iterator[Kind]:
 
 def pose_kinds(folder: Path, recording: Path, run: Run) -> Iterator[Kind]:
     """Yield the kinds of poses: as `run` writes them, and in the one format that is only read."""
-    words = f"run --file {recording} --calibration {folder}/calibration.json --model rnn-cmu --std".split()
+    words = f"run --file {recording} --calibration {folder}/calibration.json --model rnn --std".split()
     outputs = [
         word for ending in ("csv", "npz", "bvh") for word in (f"--{ending}", f"{folder}/poses.{ending}")
     ]
@@ -287,7 +287,7 @@ def settings_kinds(folder: Path, recording: Recording) -> Iterator[Kind]:
     use = "--calibration {file} --csv {out}/p.csv"
     npz = "{seeds}/recordings/npz.npz"
     commands = (
-        f"run --file {npz} --model rnn-cmu {use}",
+        f"run --file {npz} --model rnn {use}",
         f"solve {npz} --method sop {use}",
         f"check --file {npz} --calibration {{file}}",
     )
@@ -304,7 +304,7 @@ def settings_kinds(folder: Path, recording: Recording) -> Iterator[Kind]:
     for name in ("recordings/npz.npz", "calibration.json", "rig.toml"):
         (rig / name).parent.mkdir(exist_ok=True)
         shutil.copy(folder / name, rig / name)
-    yield Kind("rig", rig, ("run --rig {file} --model rnn-cmu",), "rig.toml")
+    yield Kind("rig", rig, ("run --rig {file} --model rnn",), "rig.toml")
     for name, text in zip(("pattern", "columns"), text_lines(recording), strict=True):
         (folder / f"{name}.bin").write_text(text)
         words = "check --file {seeds}/" + f"{name}.bin --json --protocol {{file}}"
@@ -331,7 +331,7 @@ def other_kinds(folder: Path) -> Iterator[Kind]:
         shutil.copy(DATA / "mocap" / name, capture)
     yield Kind("amc", capture, MOTION, "07_01.amc")
     yield Kind("bvh", DATA / "mocap" / "07_01.bvh", MOTION)
-    model = Path(__file__).parents[1] / "edgepose" / "inference" / "models" / "rnn-cmu.pt"
+    model = Path(__file__).parents[1] / "edgepose" / "inference" / "models" / "rnn.pt"
     yield Kind("model", model, ("models {file}", f"run --file {use} --model {{file}}"))
 
 

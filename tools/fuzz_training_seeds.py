@@ -56,7 +56,7 @@ def training_seeds(
     export = "export {file} --out {out}/new.pt"
     yield "checkpoint", trained / "best.pt", (export, f"{TRAIN} --init {{file}}"), None
     yield "config", folder / "config.toml", (TRAIN.replace("{seeds}/config.toml", "{file}"),), None
-    evaluate = "evaluate --model rnn-cmu --online stream --data {file} --part"
+    evaluate = "evaluate --model rnn --online stream --data {file} --part"
     train = TRAIN.replace("{seeds}/takes", "{file}")
     yield "takes", takes, (train, f"{evaluate} all"), ""
     published = folder / "published"

@@ -169,7 +169,7 @@ def test_a_folder_without_held_out_takes(made, tmp_path):
     assert f"has no recordings of {', '.join(HELD_OUT)}; measuring on validation" in said.stderr
     assert set(archive.read_info(tmp_path / "a.pt").metadata["measures"]) == {"validation"}
     assert "### validation" in (tmp_path / "a.md").read_text()
-    said = edgepose("evaluate", "--model", "rnn-cmu", "--data", tmp_path / "own")
+    said = edgepose("evaluate", "--model", "rnn", "--data", tmp_path / "own")
     assert "measuring on validation" in said.stderr
     assert said.stdout.startswith("\nvalidation\n")
 
@@ -178,7 +178,7 @@ def test_a_held_out_part_that_is_missing_is_named(made, tmp_path):
     folder, _, _ = made
     take = folder / "recordings" / "07_01.npz"
     (tmp_path / "07_01.npz").write_bytes(take.read_bytes())
-    said = edgepose("evaluate", "--model", "rnn-cmu", "--data", tmp_path)
+    said = edgepose("evaluate", "--model", "rnn", "--data", tmp_path)
     lacking = ", ".join(part for part in HELD_OUT if part != "cmu-walk-run")
     assert f"has no recordings of {lacking}; measuring on cmu-walk-run" in said.stderr
     assert said.stdout.startswith("\ncmu-walk-run\n")

@@ -30,7 +30,7 @@ def walking_on_the_spot(folder, deg_s):
     return read_take(path)
 
 
-@pytest.mark.parametrize("name", ["birnn", "rnn", "birnn-cmu", "rnn-cmu"])
+@pytest.mark.parametrize("name", ["birnn", "rnn"])
 def test_turns_do_not_leave_the_body_behind(name, tmp_path):
     info = archive.read_info(archive.find_archive(name))
     (mode,) = (mode for mode in modes_of(info.metadata) if mode.name == "stream")

@@ -60,7 +60,7 @@ def test_long_messages_are_broken_between_words(tmp_path):
         (NetworkConfig(), ["--model rnn"]),
         (NetworkConfig(online="window"), ["--online stream", "--model rnn"]),
         (NetworkConfig(model="rnn"), []),
-        (NetworkConfig(model="rnn-cmu", online="window"), []),
+        (NetworkConfig(model="rnn", online="window"), []),
     ],
 )
 def test_a_slow_machine_is_not_told_to_use_what_it_uses(settings, flags):

@@ -143,9 +143,10 @@ def test_the_unidirectional_model_to_csv_and_binary_udp(command, wearer, tmp_pat
     np.testing.assert_allclose([pose.rotations for pose in sent], rotations, atol=5e-6)
 
 
-@pytest.mark.parametrize("model", ["birnn-cmu", "rnn-cmu"])
-def test_the_free_weights_in_int8(wearer, tmp_path, model):
+@pytest.mark.parametrize("model", ["birnn", "rnn"])
+def test_weights_in_int8(wearer, tmp_path, model):
     words = ["--file", wearer.short, "--calibration", wearer.calibration, "--model", model]
+    words += ["--precision", "int8"]
     # A process in which PyTorch is imported as late as for a user: the warning is switched off before that.
     result = subprocess.run(
         [sys.executable, "-m", "edgepose", "run", *words, "--npz", tmp_path / "poses.npz"],

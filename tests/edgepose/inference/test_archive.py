@@ -144,8 +144,8 @@ def test_endless_metadata_is_not_unpacked(tmp_path):
 
 def test_former_names(tmp_path, monkeypatch, capsys):
     """They are found once nothing bundled has them, with one note from the command line."""
-    for name in ("birnn", "rnn-cmu"):
-        shutil.copy(archive.find_archive(name), tmp_path / f"{name}.pt")
+    for name, copy in (("birnn", "birnn"), ("rnn", "rnn-cmu")):
+        shutil.copy(archive.find_archive(name), tmp_path / f"{copy}.pt")
     monkeypatch.setattr(archive, "MODELS", tmp_path)
     assert set(archive.ALIASES.values()) == {"birnn", "rnn"}
     logger = logging.getLogger("edgepose")
