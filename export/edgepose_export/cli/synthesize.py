@@ -161,8 +161,10 @@ def synthesize(
         raise EdgeposeError(f"no motion files ({', '.join(KINDS)}) in {', '.join(map(str, inputs))}")
     mapping = read_mapping(mapping_path) if mapping_path else None
     if picture:
+        from edgepose.analysis.figures import check_picture
         from edgepose_export.cli.skeleton_check import draw_skeletons
 
+        check_picture(picture, "--check", overwrite)
         draw_skeletons(files, picture, body, t_pose=t_pose, mapping=mapping, overwrite=overwrite)
     if out is None:
         return
