@@ -51,7 +51,7 @@ def test_good_takes_are_kept_and_each_fault_costs_its_file(tmp_path, walk):
         "one": "too short: 1 frame at 60 Hz",
         "still": "no motion: all 5 frames are the same",
         "slow": "a frame rate of 1 Hz is not that of motion capture",
-        "dog": "no joint for left_foot, left_hand, right_foot, right_hand; joints not understood: ",
+        "dog": "unknown skeleton: no joint for left_foot, left_hand, right_foot, right_hand; joints not understood: ",
         "jumps": "no part between two jumps is as long as a second",
     }.items():
         assert [line for line in skipped if f"{name}.bvh: {reason}" in line], (name, skipped)
@@ -70,10 +70,8 @@ def test_t_pose_and_mapping_files(tmp_path, walk):
     (tmp_path / "map.toml").write_text('head = "Bone7"\nneck = "Neck"\nunit = "cm"\n')
     refused = edgepose("synthesize", take, "--out", tmp_path / "a")
     assert "no T-pose" in refused.output
-    done = edgepose(
-        "synthesize", take, "--out", tmp_path / "a", "--t-pose", stand, "--mapping", tmp_path / "map.toml",
-        "--jobs", 2,
-    )  # fmt: skip
+    flags = ("--t-pose", stand, "--mapping", tmp_path / "map.toml")
+    done = edgepose("synthesize", take, "--out", tmp_path / "a", *flags)
     assert done.exit_code == 0, done.output
     with np.load(tmp_path / "a" / "take.npz") as made:
         poses = rotvec_to_matrix(made["poses"].reshape(-1, 24, 3))
@@ -85,7 +83,7 @@ def test_t_pose_and_mapping_files(tmp_path, walk):
 
 
 def test_feet_stand_still_on_a_body_of_another_size(tmp_path, walk):
-    """The walker's stance foot slides as little on a small body as on their own: the way is scaled to the legs."""
+    """The way is scaled to the legs, so that a stance foot slides on no body."""
     takes = {}
     for height in (1.5, 1.9):
         out = tmp_path / str(height)
@@ -128,9 +126,8 @@ def test_a_picture_of_each_skeleton(tmp_path, walk):
     assert "pictures are written as" in str(edgepose("synthesize", folder, "--check", "a.txt").exception)
     (folder / "only").mkdir()
     shutil.move(folder / "dog.bvh", folder / "only")
-    assert "no skeleton to draw" in str(
-        edgepose("synthesize", folder / "only", "--check", tmp_path / "b.png").exception
-    )
+    nothing = edgepose("synthesize", folder / "only", "--check", tmp_path / "b.png")
+    assert "no skeleton to draw" in str(nothing.exception)
     needs = edgepose("synthesize", folder)
     assert needs.exit_code == 2
     assert "Missing option '--out'" in needs.output
