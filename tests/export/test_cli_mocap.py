@@ -51,7 +51,7 @@ def test_good_takes_are_kept_and_each_fault_costs_its_file(tmp_path, walk):
         "one": "too short: 1 frame at 60 Hz",
         "still": "no motion: all 5 frames are the same",
         "slow": "a frame rate of 1 Hz is not that of motion capture",
-        "dog": "unknown skeleton: no joint for left_foot, left_hand, right_foot, right_hand; joints not understood: ",
+        "dog": "unknown skeleton: no joint for left_foot, left_hand, right_foot, right_hand; joints not ",
         "jumps": "no part between two jumps is as long as a second",
     }.items():
         assert [line for line in skipped if f"{name}.bvh: {reason}" in line], (name, skipped)
