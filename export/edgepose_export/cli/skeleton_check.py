@@ -63,5 +63,5 @@ def draw_skeletons(
     if not rows:
         raise EdgeposeError("no skeleton to draw: AMASS files hold none, others cannot be read")
     draw_check(list(rows.values()), picture, overwrite)
-    more = f"; only the first {MOST_SKELETONS}" if len(rows) == MOST_SKELETONS else ""
-    say(f"{len(rows)} skeletons drawn to {picture}{more}")
+    what = "1 skeleton" if len(rows) == 1 else f"{len(rows)} skeletons"
+    say(f"{what} drawn to {picture}{' (no more fit)' if len(rows) == MOST_SKELETONS else ''}")

@@ -92,15 +92,9 @@ def train(
     if (recipe is None) == (config is None):
         raise click.UsageError("give --recipe to make a model from raw motion, or --config for a single run")
     if recipe is not None:
-        if not mocap:
-            raise click.UsageError("--recipe needs folders with motion")
         if data or resume or init or steps or cache:
             raise click.UsageError("--recipe decides all but --out and --threads: give no other option")
-        if "TORCHELASTIC_RUN_ID" in os.environ:
-            raise click.UsageError("--recipe runs in one process: call it without torchrun")
-        from edgepose_export.cli.recipe import run_recipe
-
-        run_recipe(recipe, mocap, out, threads)
+        _run_recipe(recipe, mocap, out, threads)
         return
     if mocap or config is None or data is None:
         raise click.UsageError("--config needs --data, and no folders with motion")
@@ -126,6 +120,16 @@ def train(
     with joined() as processes:
         about = {"run": Path(config).stem}
         train_on(settings, data, out, processes, about, resume=resume, init=init, cache=cache)
+
+
+def _run_recipe(recipe: str, mocap: tuple[Path, ...], out: Path, threads: int) -> None:
+    from edgepose_export.cli.recipe import run_recipe
+
+    if not mocap:
+        raise click.UsageError("--recipe needs folders with motion")
+    if "TORCHELASTIC_RUN_ID" in os.environ:
+        raise click.UsageError("--recipe runs in one process: call it without torchrun")
+    run_recipe(recipe, mocap, out, threads)
 
 
 class Plan(NamedTuple):
