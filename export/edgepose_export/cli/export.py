@@ -230,6 +230,7 @@ def _measures(path: Path, data: Path, others: Mapping[str, Archive]) -> dict[str
     from edgepose_export.cli.progress import labelled
     from edgepose_export.evaluation import evaluate as evaluation
     from edgepose_export.evaluation.baselines import learn
+    from edgepose_export.evaluation.place import accuracy
     from edgepose_export.evaluation.uncertainty import errors_and_deviations, reliability
 
     parts = default_parts(data)
@@ -243,11 +244,14 @@ def _measures(path: Path, data: Path, others: Mapping[str, Archive]) -> dict[str
             methods[f"{name}, {row}"] = method
     columns = evaluation.columns_of_parts(methods, data, parts, labelled("measuring"))
     (mode,) = (mode for mode in modes if mode.name == "stream")
-    deviations = {}
+    deviations, places = {}, {}
     for part in parts:
         takes = evaluation.takes_of(data, part, labelled("measuring deviations"))
         result = reliability(*errors_and_deviations(module, info.metadata, takes, mode))
         deviations[part] = {"within": list(result.within), "scale": result.scale, "values": result.values}
+        takes = evaluation.takes_of(data, part, labelled("measuring contacts"))
+        if found := accuracy(module, info.metadata, takes):
+            places[part] = found
     return {
         "measures": {
             part: {
@@ -257,4 +261,5 @@ def _measures(path: Path, data: Path, others: Mapping[str, Archive]) -> dict[str
             for part, rows in columns.items()
         },
         "deviations": deviations,
+        **({"place_accuracy": places} if places else {}),
     }
