@@ -134,6 +134,14 @@ def test_feet_stand_on_stairs_and_slopes(height):
     assert not got[:, 4:].any()
 
 
+def test_a_foot_that_stays_is_in_contact_while_its_ground_rises():
+    """The joints of a foot on its side are lower than those of one that stands; it may stay all the while."""
+    t = np.arange(300) / RATE
+    joints = posed(300)
+    joints[..., 1] += np.clip(0.05 * (t - 1.0), 0.0, 0.12)[:, None]
+    assert contacts(joints, RATE)[:, :4].all()
+
+
 def test_neither_the_height_of_the_floor_nor_the_size_of_the_wearer_matters():
     joints, _ = stepping(0.17)
     expected = contacts(joints, RATE)

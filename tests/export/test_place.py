@@ -12,6 +12,7 @@ from click.testing import CliRunner
 
 from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
+from edgepose.inference.archive import load, read_info
 from edgepose.inference.features import network_input
 from edgepose.inference.quantisation import pack_weights
 from edgepose.skeleton import default_body
@@ -382,17 +383,50 @@ def test_packed_weights_keep_the_head(parts, wearers, precision):
     assert not torch.equal(after, before)
 
 
-def test_the_command_tells_contacts_and_velocity(arrays, tmp_path):
+def edgepose(*words):
+    """Output of a command that has to succeed."""
+    done = CliRunner().invoke(cli, [str(word) for word in words], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+def test_training_export_and_evaluation_report_the_head(arrays, tmp_path):
+    recordings, run, path = tmp_path / "recordings", tmp_path / "run", tmp_path / "tiny.pt"
+    recordings.mkdir()
     for name in ("01_01", "03_01"):
-        (tmp_path / "recordings").mkdir(exist_ok=True)
-        np.savez(tmp_path / "recordings" / f"{name}.npz", **arrays)
+        np.savez(recordings / f"{name}.npz", **arrays)
+    old = {key: value for key, value in arrays.items() if key != "contact"}
+    np.savez(recordings / "07_01.npz", **old)
     (tmp_path / "tiny.toml").write_text(
         "steps = 2\nsequences = 4\nwindow = 20\nvalidate_every = 2\nplace_loss = 0.3\n"
         "[network]\nkind = 'rnn'\nhidden = 8\nplace = true\n"
     )
-    words = ["train", "--config", tmp_path / "tiny.toml", "--data", tmp_path / "recordings"]
-    done = CliRunner().invoke(cli, [*map(str, words), "--out", str(tmp_path / "run"), "--threads", "1"])
-    assert done.exit_code == 0, done.output
-    (line,) = (line for line in done.output.splitlines() if "step 2 of 2" in line)
-    log = json.loads((tmp_path / "run" / "log.jsonl").read_text())
+    data = ("--data", recordings)
+    said = edgepose("train", "--config", tmp_path / "tiny.toml", *data, "--out", run, "--threads", 1)
+    (line,) = (line for line in said.splitlines() if "step 2 of 2" in line)
+    log = json.loads((run / "log.jsonl").read_text())
     assert f"contacts {100 * log['contact']:.1f} %, velocity off by {log['velocity']:.2f} m/s," in line
+    edgepose("export", run / "checkpoint.pt", "--out", path, "--measure", recordings)
+    info = read_info(path)
+    assert "place_accuracy" not in info.metadata  # the held-out take has no labels
+    card = (tmp_path / "tiny.md").read_text()
+    assert "left_ankle, right_ankle, left_foot, right_foot, pelvis, left_wrist, right_wrist; velocity" in card
+    assert "### Contacts" not in card
+    (recordings / "07_01.npz").unlink()
+    edgepose("export", run / "checkpoint.pt", "--out", path, "--measure", recordings, "--overwrite")
+    info = read_info(path)
+    take = read_take(recordings / "03_01.npz")
+    with torch.no_grad():
+        whole = load(info, trust=True).forward_place(
+            torch.from_numpy(take.orientation)[None], torch.from_numpy(take.acceleration)[None]
+        )[2][0]
+    expected = place_accuracy(place_counts(whole, torch.from_numpy(take.place), threshold=0.5))
+    assert info.metadata["place_accuracy"] == {"validation": pytest.approx(expected, abs=1e-4)}
+    row = f"| validation | {100 * expected['contact']:.1f} | {expected['velocity']:.2f} |"
+    assert "### Contacts and velocity\n\n" in (tmp_path / "tiny.md").read_text()
+    assert row in (tmp_path / "tiny.md").read_text()
+    said = edgepose("evaluate", "--model", path, "--trust", *data, "--part", "validation")
+    assert said.splitlines()[-1] == (
+        f"validation, tiny streamed: contacts of the feet {100 * expected['contact']:.1f} % right, "
+        f"velocity off by {expected['velocity']:.2f} m/s"
+    )

@@ -46,6 +46,7 @@ def _summary(metadata: dict[str, Any]) -> list[str]:
         f"{_INPUTS[metadata['normalisation']]}.",
         f"- Targets: {metadata['targets']}; bones that carry a sensor are {metadata['measured_bones']}"
         f"{_smoothing(metadata)}.",
+        *_place(metadata),
         f"- Trained on: {training['summary']}; {training['takes']} takes, {training['hours']:.2f} h, "
         f"{training['steps']} steps{_mean(training)}.",
         "- Licences of the motion data:",
@@ -106,6 +107,7 @@ def _accuracy(metadata: dict[str, Any]) -> list[str]:
     return [
         *lines,
         *_deviations(metadata["deviations"]),
+        *_places(metadata.get("place_accuracy", {})),
         *_precisions(metadata["precisions"]),
         f"The parts: {'; '.join(f'`{part}` is {_about(part)}' for part in metadata['measures'])}. "
         "No training has seen any of these takes.",
@@ -218,6 +220,34 @@ def _deviations(parts: dict[str, dict[str, Any]]) -> list[str]:
     for part, numbers in parts.items():
         one, two = (100 * share for share in numbers["within"])
         lines.append(f"| {part} | {one:.1f} | {two:.1f} | {numbers['scale']:.2f} | {numbers['values']} |")
+    return [*lines, ""]
+
+
+def _place(metadata: dict[str, Any]) -> list[str]:
+    if "place" not in metadata:
+        return []
+    names = ", ".join(metadata["place"]["contacts"])
+    return [
+        f"- Also: probabilities that these joints rest on something: {names}; velocity of the pelvis "
+        f"({metadata['place']['velocity']})."
+    ]
+
+
+def _places(parts: dict[str, dict[str, float]]) -> list[str]:
+    """Return the table of the accuracy of contacts and velocity."""
+    if not parts:
+        return []
+    lines = [
+        "### Contacts and velocity",
+        "",
+        "Streamed as by `edgepose run`. Balanced accuracy: the mean of the shares of contacts of ankles and "
+        "toes, and of moments without contact, that are found.",
+        "",
+        "| part | contacts of the feet, balanced accuracy, % | error of the velocity, m/s |",
+        "|---|---|---|",
+    ]
+    for part, row in parts.items():
+        lines.append(f"| {part} | {100 * row['contact']:.1f} | {row['velocity']:.2f} |")
     return [*lines, ""]
 
 

@@ -270,12 +270,26 @@ def _tables(
     else:
         for part, rows in tables.items():
             show(f"\n{part}\n{format_table(rows)}")
+        _places(models, data, parts)
     if histogram:
         errors = {
             part: {name: row["sip_error_deg"] for name, row in rows.items()} for part, rows in columns.items()
         }
         plots.histogram(histogram, errors, overwrite)
         say(f"wrote {histogram}")
+
+
+def _places(models: list[_Model], data: Path, parts: tuple[str, ...]) -> None:
+    """Show the accuracy of contacts and velocity, of models and takes that have them."""
+    from edgepose_export.cli.progress import labelled
+    from edgepose_export.evaluation.evaluate import takes_of
+    from edgepose_export.evaluation.place import accuracy, describe
+
+    for part in parts:
+        for model in (model for model in models if "place" in model.metadata):
+            takes = takes_of(data, part, labelled("measuring contacts"))
+            if measures := accuracy(model.module, model.metadata, takes):
+                show(f"\n{part}, {model.name} streamed: {describe(measures)}")
 
 
 def _heat_map(

@@ -233,6 +233,7 @@ def _measures(path: Path, data: Path, others: Mapping[str, Archive]) -> dict[str
     from edgepose_export.cli.progress import labelled
     from edgepose_export.evaluation import evaluate as evaluation
     from edgepose_export.evaluation.baselines import learn
+    from edgepose_export.evaluation.place import accuracy
     from edgepose_export.evaluation.uncertainty import errors_and_deviations, reliability
     from edgepose_export.training.sources import single_parts
 
@@ -247,11 +248,14 @@ def _measures(path: Path, data: Path, others: Mapping[str, Archive]) -> dict[str
             methods[f"`{name}`, {row}"] = method
     columns = evaluation.columns_of_parts(methods, data, parts, labelled("measuring"))
     (mode,) = (mode for mode in modes if mode.name == "stream")
-    deviations = {}
+    deviations, places = {}, {}
     for part in single_parts(parts):
         takes = evaluation.takes_of(data, part, labelled("measuring deviations"))
         result = reliability(*errors_and_deviations(module, info.metadata, takes, mode))
         deviations[part] = {"within": list(result.within), "scale": result.scale, "values": result.values}
+        takes = evaluation.takes_of(data, part, labelled("measuring contacts"))
+        if found := accuracy(module, info.metadata, takes):
+            places[part] = found
     return {
         "measures": {
             part: {
@@ -261,6 +265,7 @@ def _measures(path: Path, data: Path, others: Mapping[str, Archive]) -> dict[str
             for part, rows in columns.items()
         },
         "deviations": deviations,
+        **({"place_accuracy": places} if places else {}),
     }
 
 

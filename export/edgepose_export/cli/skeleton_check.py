@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from edgepose.analysis.figures import check_picture
 from edgepose.cli.terminal.messages import say
 from edgepose.errors import EdgeposeError
 from edgepose.skeleton import Body
@@ -38,6 +39,7 @@ def draw_skeletons(
     Raises:
         EdgeposeError: no file can be drawn, or the picture cannot be written.
     """
+    check_picture(picture, "--check", overwrite)
     rows: dict[str, Row] = {}
     problems: dict[str, str] = {}
     for root, path in files:

@@ -176,7 +176,6 @@ def synthesize(
       edgepose synthesize mocap/ --out recordings/rests --rests 1
       edgepose synthesize mocap/ --check skeletons.png
     """
-    from edgepose.analysis.figures import check_picture
     from edgepose.formats.smpl_model import read_smpl
     from edgepose.skeleton import default_body
     from edgepose_export.cli.skeleton_check import draw_skeletons
@@ -191,7 +190,6 @@ def synthesize(
         raise EdgeposeError(f"no motion files ({', '.join(KINDS)}) in {', '.join(map(str, inputs))}")
     mapping = read_mapping(mapping_path) if mapping_path else None
     if picture:
-        check_picture(picture, "--check", overwrite)
         draw_skeletons(files, picture, body, t_pose=t_pose, mapping=mapping, overwrite=overwrite)
     if out is None:
         return
