@@ -22,11 +22,11 @@ DATA = Path(__file__).parents[1] / "data" / "mocap"
 @pytest.fixture(scope="module")
 def paths(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recordings")
-    for source in ("dataset-2_walk_normal_001.bvh", "07_01.bvh"):
-        motion = resample(read_motion(DATA / source))
+    for name in ("dataset-2_walk_normal_001", "07_01"):
+        motion = resample(read_motion(DATA / f"{name}.bvh"))
         imus, source = virtual_imus(motion, default_body()), SOURCES[motion.source]
         arrays = recording_arrays(motion, imus, source.license, source.name)
-        np.savez(folder / f"{Path(source).stem}.npz", **arrays)
+        np.savez(folder / f"{name}.npz", **arrays)
     return sorted(folder.glob("*.npz"))
 
 
