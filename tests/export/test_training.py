@@ -275,7 +275,7 @@ def test_windows_of_other_bodies(takes):
     """Accelerations and velocities are of another size, poses as before."""
     how = Augmentation(mirror=0.0, stature=0.1)
     one = Trainer(replace(SMALL, augmentation=how), tape(takes), tape(takes), ABOUT)
-    starts = torch.cat(one.starts)[:30]
+    starts = one.starts[""][:30]
     plain, batch = windows(one.train_tape, starts, one.config.window), one._batch(starts)
     order = torch.argsort(one.has_sitting[starts].int(), stable=True)
     factor = batch.acceleration / plain.acceleration[order]
