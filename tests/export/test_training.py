@@ -229,7 +229,7 @@ def test_share_of_made_sitting(takes):
 def test_shares_of_made_takes(takes):
     """Each kind of made takes has its own share, whether or not there are takes of the other."""
     sitting, resting = (takes[0]._replace(name=f"take.{kind}") for kind in ("seated", "rests"))
-    config = replace(SMALL, sequences=16, seated_share=0.25, rests_share=0.5, free_share=0.0)
+    config = replace(SMALL, sequences=16, seated_share=0.25, rests_share=0.5)
     end = len(sitting.pose)
     for made, expected in (([sitting, resting], (4, 8)), ([sitting], (4,)), ([resting], (8,))):
         one = Trainer(config, tape([*made, *takes]), tape(takes), ABOUT)
