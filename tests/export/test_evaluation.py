@@ -220,7 +220,7 @@ def test_tables_of_a_folder(tmp_path, tiny, walk):
             assert set(row) == set(metrics.LABELS)
             assert row["sip_error_deg"].frames == frames
             assert np.isfinite([value.mean for value in row.values()]).all()
-    for name in ("s_008_1_1", "tennis_KangTennisF18"):
+    for name in ("s_008_1_1", "tennis_KangTennisF16"):
         np.savez(tmp_path / f"{name}.npz", **arrays)
     parts = ("sports", "tennis", "basketball")
     sports = evaluation.columns_of_parts(methods, tmp_path, parts)
