@@ -99,7 +99,7 @@ def seated(motion: Motion, body: Body, rng: np.random.Generator) -> Motion:
     for joint, parent in ((3, 0), (6, 3), (9, 6), (12, 9), (13, 9), (14, 9), (15, 12), (16, 13), (17, 14),
                           (18, 16), (19, 17), (20, 18), (21, 19), (22, 20), (23, 21)):  # fmt: skip
         rotations[:, joint] = rotations[:, parent] @ local[:, joint]
-    return Motion(rotations, hips, motion.rate, motion.source)
+    return motion._replace(rotations=rotations, translation=hips)
 
 
 def _course(frames: int, rate: float, rng: np.random.Generator) -> tuple[Array, Array]:
