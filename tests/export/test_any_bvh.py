@@ -374,6 +374,16 @@ def edited(tmp_path, walk, old, new, **habits):
             r"\1OFFSET 0 0 0",
             "the bone from LeftUpLeg to LeftLeg has no length",
         ),
+        (
+            r"(JOINT RightForeArm\n{\n)OFFSET .*",
+            r"\1OFFSET -60 0 0",
+            "the bone from RightArm to RightForeArm is 2.21 times as long as that of the other side",
+        ),
+        (
+            r"JOINT LeftHand\n",
+            "JOINT " + "Left" * 40 + "Hand\n",
+            "a joint's name has 164 characters: LeftLeftLeftLeftLeft...",
+        ),
         (r"Frame Time: .*", "Frame Time: 0.5", "a frame rate of 2 Hz is not that of motion capture"),
         (r"Frame Time: .*", "Frame Time: 0.0001", "a frame rate of 1e+04 Hz"),
         (r"(JOINT Head\n{\n)OFFSET .*", r"\1OFFSET 0 -200 0", "no T-pose"),

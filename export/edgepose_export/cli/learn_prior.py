@@ -47,7 +47,7 @@ def learn_prior(inputs: tuple[Path, ...], out: Path, about: str, overwrite: bool
     from edgepose.skeleton import local_from_global
     from edgepose_export.cli.progress import progress
     from edgepose_export.cli.recording_jobs import motion_files
-    from edgepose_export.mocap import pieces, read_motion
+    from edgepose_export.mocap import fault, pieces, read_motion
     from edgepose_export.training.sources import take_info
 
     check_output(out, "the prior", (".npz",), overwrite)
@@ -57,11 +57,14 @@ def learn_prior(inputs: tuple[Path, ...], out: Path, about: str, overwrite: bool
     poses, sources = [np.empty((0, 24, 3))], set()
     for path in progress(files, "reading"):
         try:
-            takes = pieces(read_motion(path))
+            motion = read_motion(path)
+            problem = fault(motion)
+            if problem:
+                raise EdgeposeError(f"{path}: {problem}")
         except EdgeposeError as error:
             say(f"skipped: {error}")
             continue
-        for take in takes:
+        for take in pieces(motion):
             rows = take.rotations[:: max(1, round(take.rate / RATE))]
             poses.append(matrix_to_rotvec(local_from_global(rows)))
             sources.add(known[path].source.license)

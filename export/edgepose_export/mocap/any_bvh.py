@@ -27,6 +27,12 @@ RATES_HZ = (5.0, 2000.0)
 _RIGID = 0.05
 """Largest change of a limb's length as a share of it."""
 
+_SHORTEST = 0.02
+"""Shortest limb, as a share of the longest bone."""
+
+_UNEVEN = 1.5
+"""Largest ratio of the lengths of a limb on both sides."""
+
 _UPRIGHT = 0.9
 """Least length of the mean of unit vectors from feet to head of people who are on their feet all the time."""
 _TRAVEL_LEGS, _FLOOR_LEGS = 0.7, 0.35
@@ -78,7 +84,7 @@ def _rigid(tree: JointTree, roles: Roles) -> JointTree:
     Some programs write a shift against the offset, always zero, to the position channels of all joints.
 
     Raises:
-        EdgeposeError: a limb has no length, or its position channels change it.
+        EdgeposeError: a limb has no length, its position channels change it, or both sides differ.
     """
     positions = tree.positions
     shifts = np.abs(positions[:, 1:]).max(initial=0.0) < 1e-9 < np.abs(tree.offsets[1:]).max(initial=0.0)
@@ -86,20 +92,33 @@ def _rigid(tree: JointTree, roles: Roles) -> JointTree:
         positions = np.concatenate(
             [positions[:, :1], np.broadcast_to(tree.offsets[1:], positions[:, 1:].shape)], axis=1
         )
+    tree = tree._replace(positions=positions)
+    lengths = {limb: _limb_length(tree, *ends) for limb, ends in roles.limbs.items()}
+    for limb, (start, end) in roles.limbs.items():
+        other = lengths[limb - 1 if limb in (2, 5, 17, 19) else limb + 1]
+        if lengths[limb] > _UNEVEN * other:
+            raise EdgeposeError(
+                f"the bone from {tree.names[start]} to {tree.names[end]} is {lengths[limb] / other:.3g} "
+                "times as long as that of the other side"
+            )
+    return tree
+
+
+def _limb_length(tree: JointTree, start: int, end: int) -> float:
+    """Return the length of a bone; raise EdgeposeError if it is zero or changes, see `_rigid`."""
+    path = _path(tree, start, end)
+    length = float(np.linalg.norm(tree.offsets[path].sum(axis=0)))
     size = np.linalg.norm(tree.offsets[1:], axis=1).max(initial=0.0)
-    for start, end in roles.limbs.values():
-        path = _path(tree, start, end)
-        length = float(np.linalg.norm(tree.offsets[path].sum(axis=0)))
-        for joint in path:
-            change = np.linalg.norm(positions[:, joint] - tree.offsets[joint], axis=1).max()
-            if change > _RIGID * max(length, 1e-3 * size):
-                raise EdgeposeError(
-                    f"the position channels of joint {tree.names[joint]} do not lie as in its OFFSET: a bone "
-                    "changes its length"
-                )
-        if length < 0.02 * size:
-            raise EdgeposeError(f"the bone from {tree.names[start]} to {tree.names[end]} has no length")
-    return tree._replace(positions=positions)
+    for joint in path:
+        change = np.linalg.norm(tree.positions[:, joint] - tree.offsets[joint], axis=1).max()
+        if change > _RIGID * max(length, 1e-3 * size):
+            raise EdgeposeError(
+                f"the position channels of joint {tree.names[joint]} do not lie as in its OFFSET: a bone "
+                "changes its length"
+            )
+    if length < _SHORTEST * size:
+        raise EdgeposeError(f"the bone from {tree.names[start]} to {tree.names[end]} has no length")
+    return length
 
 
 def _path(tree: JointTree, top: int, bottom: int) -> list[int]:

@@ -50,7 +50,6 @@ _NO_BODY = {
 }  # fmt: skip
 """Words in names of joints that are no part of the body, or only a share of one."""
 
-_LONGEST_NAME = 120
 _VERTEBRA = re.compile(r"[lt]\d{1,2}")
 _WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 
@@ -73,8 +72,6 @@ def is_helper(name: str) -> bool:
 
 def meaning(name: str) -> Meaning | None:
     """Return the meaning of a joint's name, None if it has no known word."""
-    if len(name) > _LONGEST_NAME:
-        return None
     plain = without_namespace(name)
     if _VERTEBRA.fullmatch(plain.lower()):
         return Meaning("spine", "")

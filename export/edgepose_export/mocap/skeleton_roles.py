@@ -10,6 +10,8 @@ from edgepose.errors import EdgeposeError
 
 from .joint_words import LIMB_PARTS, Meaning, is_helper, meaning
 
+_LONGEST_NAME = 120
+
 SIDES = ("left", "right")
 _LIMB_ROLES = ("thigh", "shank", "foot", "upper_arm", "forearm", "hand")
 _OPTIONAL_ROLES = ("toes", "collar")
@@ -79,6 +81,9 @@ def find_roles(
     Raises:
         EdgeposeError: a role has no joint, or joints are not connected as in a body; the message names them.
     """
+    longest = max(names, key=len)
+    if len(longest) > _LONGEST_NAME:
+        raise EdgeposeError(f"a joint's name has {len(longest)} characters: {longest[:20]}...")
     tree = _Tree(names, parents)
     given = _given(names, mapping or {})
     limbs = {side: _limb_joints(tree, side, given) for side in SIDES}
@@ -106,6 +111,9 @@ class _Tree:
     def __init__(self, names: Sequence[str], parents: Sequence[int]) -> None:
         self.names, self.parents = names, parents
         self.meanings = [meaning(name) for name in names]
+        self._depths: list[int] = []
+        for parent in parents:
+            self._depths.append(0 if parent < 0 else self._depths[parent] + 1)
 
     def above(self, joint: int) -> list[int]:
         """Return a joint and all joints above it, up to the root."""
@@ -127,12 +135,15 @@ class _Tree:
     def named(self, part: str, side: str = "") -> int | None:
         """Return the joint nearest to the root whose name means a part."""
         found = [j for j, m in enumerate(self.meanings) if m == Meaning(part, side)]
-        return min(found, key=lambda joint: len(self.above(joint)), default=None)
+        return min(found, key=self._depths.__getitem__, default=None)
 
     def check_only(self, joint: int) -> None:
         """Raise EdgeposeError if a joint that does not hang on this one has a name that means the same."""
-        for other, what in enumerate(self.meanings):
-            if what == self.meanings[joint] and what is not None and joint not in self.above(other):
+        below = {joint}
+        for other, (what, parent) in enumerate(zip(self.meanings, self.parents, strict=True)):
+            if parent in below:
+                below.add(other)
+            elif other != joint and what is not None and what == self.meanings[joint]:
                 raise EdgeposeError(
                     f"joints {self.names[joint]} and {self.names[other]} are both a "
                     f"{' '.join(filter(None, (what.side, what.part)))}; say which with --mapping FILE.toml"

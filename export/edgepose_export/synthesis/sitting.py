@@ -106,7 +106,7 @@ def seated(motion: Motion, body: Body, rng: np.random.Generator) -> Motion:
         # The foot is flat on the floor; no sensor or target depends on it.
         rotations[:, list(joints[2:])] = np.eye(3)
     rotations = with_upper_body(rotations, local)
-    return Motion(rotations, hips, motion.rate, motion.source)
+    return motion._replace(rotations=rotations, translation=hips)
 
 
 def _course(frames: int, rate: float, rng: np.random.Generator) -> tuple[Array, Array]:
