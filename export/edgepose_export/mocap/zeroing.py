@@ -80,7 +80,7 @@ class Evidence(NamedTuple):
 def find_zero(evidence: Evidence) -> Zero:
     """Return the zero of an actor."""
     hinges = hinge_rotations(evidence.bends)
-    total, weight = _STANDING / _SPREAD**2, 1.0 / _SPREAD**2
+    total, weight = STANDING_DEG / _SPREAD**2, 1.0 / _SPREAD**2
     found = "none"
     for kind, summed, count in zip(_KINDS, evidence.sums, evidence.counts, strict=True):
         if count < LEAST_FRAMES:
@@ -229,7 +229,7 @@ def _rows(table: dict[str, tuple[tuple[float, ...], tuple[float, ...]]]) -> tupl
     return mean, spread
 
 
-_STANDING, _SPREAD = _rows(_STANDING_PEOPLE)
+STANDING_DEG, _SPREAD = _rows(_STANDING_PEOPLE)
 _HOLD = np.array([_HOLD_SPREAD.get(_kind(name), (4.0, 4.0, 4.0)) for name in JOINTS])
 _ARMS_RAISED = np.where([[_kind(name) in _ARMS] for name in JOINTS], 1e6, _HOLD + 1.0)
 _ZEROS = np.zeros((len(JOINTS), 3))

@@ -12,6 +12,7 @@ from edgepose.skeleton import JOINTS
 from edgepose_export.networks.normalisation import rotations_of, turn_about_y
 from edgepose_export.synthesis.contacts import CONTACTS, PLACE
 from edgepose_export.synthesis.loose_wear import biased, drifted, worn_loosely
+from edgepose_export.synthesis.straight_arms import with_straight_arms
 from edgepose_export.training.dataset import Batch
 
 
@@ -51,6 +52,8 @@ class Augmentation(NamedTuple):
         stature: relative standard deviation of the wearers' statures, from 1.45 to 2.0 m.
         proportions: factor on the variation of segments' lengths and of where sensors sit on them, see
             `body_shapes`.
+        straight_arms: how far, at most, from arms at ease to straight arms wearers are calibrated, see
+            `straight_arms`.
         swing_deg: rms angle by which sensors swing on clothing when walking; impacts swing them further, and
             tight straps less.
         slip_deg: standard deviation of slips about the length of a segment; three of ten sensors slip.
@@ -72,6 +75,7 @@ class Augmentation(NamedTuple):
     posture: float = 0.0
     stature: float = 0.0
     proportions: float = 0.0
+    straight_arms: float = 0.0
     swing_deg: float = 0.0
     slip_deg: float = 0.0
     drift_deg: float = 0.0
@@ -143,7 +147,8 @@ def _heading_changes(orientation: Tensor) -> Tensor:
 def augment(batch: Batch, sizes: Augmentation, generator: torch.Generator) -> Batch:
     """Return disturbed copies of sequences.
 
-    The true poses change only by mirroring and by the pelvis pitch, contacts and velocity only by mirroring.
+    The true poses change only by mirroring, by the pelvis pitch and by the zero of the arms, contacts and
+    velocity only by mirroring.
     `posture`, `stature` and `proportions` are not applied here, because they need the frames around the
     sequences; see `vary_bodies`.
     """
@@ -153,6 +158,8 @@ def augment(batch: Batch, sizes: Augmentation, generator: torch.Generator) -> Ba
         batch = _mirror_some(batch, chosen)
     if sizes.pelvis_pitch_deg:
         batch = _pitch_pelvis(batch, sizes.pelvis_pitch_deg, generator)
+    if sizes.straight_arms:
+        batch = with_straight_arms(batch, sizes.straight_arms, generator)
     disturbed = torch.ones(size)
     if sizes.aligned:
         disturbed = (torch.rand(size, generator=generator) >= sizes.aligned).float()

@@ -215,6 +215,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "mirror": (0.0, 1.0),
     "stature": (0.0, 1.0),
     "proportions": (0.0, 5.0),
+    "straight_arms": (0.0, 2.0),
     "silent": (0.0, 1.0),
     "smoothing": (0.0, 0.99),
 }
