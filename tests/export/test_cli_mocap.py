@@ -76,7 +76,7 @@ def test_t_pose_and_mapping_files(tmp_path, walk):
     with np.load(tmp_path / "a" / "take.npz") as made:
         poses = rotvec_to_matrix(made["poses"].reshape(-1, 24, 3))
         np.testing.assert_allclose(poses[0, 0], walk.rotations[0, 0], atol=1e-3)
-        assert str(made["source"]) == "bvh"
+        assert str(made["source"]) == "own"
     (tmp_path / "map.toml").write_text('tail = "Bone7"\n')
     wrong = edgepose("synthesize", take, "--out", tmp_path / "b", "--mapping", tmp_path / "map.toml")
     assert "unknown key 'tail'" in str(wrong.exception)
