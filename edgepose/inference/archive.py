@@ -108,8 +108,8 @@ def find_archive(name: str) -> Path:
 
 @cache
 def _note_alias(name: str) -> None:
-    """Log once that a name is a former one."""
-    _log.info("model %s is called %s now", name, ALIASES[name])
+    """Warn once that a name is a former one."""
+    _log.warning("model %s is called %s now", name, ALIASES[name])
 
 
 def _read_checksums(path: Path) -> set[str]:

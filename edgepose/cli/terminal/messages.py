@@ -161,7 +161,6 @@ def prepare() -> None:
         reconfigure(errors="backslashreplace")  # file names may be undecodable
     sys.stderr = _Messages(sys.stderr)
     logging.basicConfig(handlers=[_Handler()])
-    logging.getLogger("edgepose").setLevel(logging.INFO)
 
 
 def _reserve_standard_descriptors() -> None:
