@@ -24,6 +24,7 @@ from edgepose.placements import BONES, PLACEMENTS
 from edgepose.rotations import Array
 from edgepose.skeleton import default_body, forward_kinematics, local_from_global
 from edgepose_export.mocap import Motion, read_motion, resample
+from edgepose_export.mocap.zeroing import Evidence, find_zero
 from edgepose_export.synthesis.heading_routine import with_exercises
 from edgepose_export.synthesis.imu_errors import BMI270, ImuErrorModel, raw
 from edgepose_export.synthesis.virtual_imus import random_mounting, virtual_imus
@@ -122,7 +123,8 @@ def run(recording: Recording, found: calibration.Calibration, model: str) -> tup
 @click.option("--rigs", default=3, show_default=True, help="Number of mountings and chips to average over.")
 def main(model: str, rigs: int) -> None:
     """Run the command line."""
-    motion = with_exercises(resample(read_motion(CLIP), RATE), STAND_S)
+    clip = read_motion(CLIP)
+    motion = with_exercises(find_zero(Evidence.of(clip)).applied(resample(clip, RATE)), STAND_S)
     clip_s = STAND_S + EXERCISES_S + 3.0  # the clip starts here
     offsets = default_body().offsets
     summaries, bone_lines = {}, []

@@ -113,7 +113,8 @@ def read_input(path: Path, rig: Rig = IDEAL) -> Recording:
 
 def simulate_clip(path: Path, rig: Rig) -> Recording:
     """Simulate ideal sensors on the body of a clip; the wearer stands straight first."""
-    from edgepose_export.mocap import pieces, read_motion, resample
+    from edgepose_export.mocap import pieces, read_motion, resample, scaled_to
+    from edgepose_export.mocap.zeroing import Evidence, find_zero
     from edgepose_export.synthesis.heading_routine import with_exercises
     from edgepose_export.synthesis.virtual_imus import (
         random_mounting,
@@ -127,10 +128,12 @@ def simulate_clip(path: Path, rig: Rig) -> Recording:
         raise EdgeposeError(
             f"{path}: has jumps; make recordings of its {len(takes)} parts with edgepose synthesize"
         )
-    motion = resample(takes[0], CLIP_RATE)
+    zero = find_zero(Evidence.of(takes[0]))
+    body = default_body()
+    motion = zero.applied(resample(scaled_to(takes[0], body.leg_length_m), CLIP_RATE))
     motion = (with_exercises if rig.exercises else with_hold)(motion, CLIP_HOLD_S)
     mounting = None if rig.mounting is None else random_mounting(rig.mounting)
-    arrays = recording_arrays(motion, virtual_imus(motion, default_body(), mounting), path.name)
+    arrays = recording_arrays(motion, virtual_imus(motion, body, mounting, zero.back), path.name)
     sensors = {
         name: SensorData(
             arrays["t"], *(arrays[f"{name}_{key}"].astype(float) for key in ("quat", "acc", "gyr"))

@@ -75,7 +75,6 @@ def convert(path: Path, job: Job) -> str | None:
     """Convert one file, cut into parts where the source jumps; return what was wrong with it, or None."""
     import numpy as np
 
-    from edgepose.rotations import transpose
     from edgepose_export.mocap import fault, pieces, read_motion, resample, scaled_to
     from edgepose_export.synthesis.virtual_imus import (
         random_mounting,
@@ -98,8 +97,7 @@ def convert(path: Path, job: Job) -> str | None:
             motion = resample(scaled_to(take, job.body.leg_length_m), job.rate)
             directions = None
             if job.zero:
-                motion = motion._replace(rotations=motion.rotations @ job.zero.straight)
-                directions = transpose(job.zero.straight) @ job.zero.directions
+                motion, directions = job.zero.applied(motion), job.zero.back
             if job.seated_seed is not None:
                 directions = None  # the legs are made on the body as it is zeroed
             motion = _with_made_parts(motion, job, [i, *path.stem.encode()])

@@ -48,6 +48,15 @@ class Zero(NamedTuple):
     straight: Array
     evidence: str
 
+    def applied(self, motion: Motion) -> Motion:
+        """Return a take of the actor with bones that have R_TB0 in the straight pose."""
+        return motion._replace(rotations=motion.rotations @ self.straight)
+
+    @property
+    def back(self) -> Array:
+        """Right factors (24, 3, 3) from `straight` to `directions`, for `virtual_imus`."""
+        return np.swapaxes(self.straight, -1, -2) @ self.directions
+
 
 class Evidence(NamedTuple):
     """Evidence of an actor's straight pose, over any number of takes of one skeleton.

@@ -28,6 +28,7 @@ from edgepose.formats.poses.registry import read_poses
 from edgepose.placements import PLACEMENTS
 from edgepose.skeleton import local_from_global
 from edgepose_export.mocap import read_motion, resample
+from edgepose_export.mocap.zeroing import Evidence, find_zero
 from edgepose_export.synthesis.heading_routine import with_exercises
 from tests.support import processes
 from tests.support.datagrams import free_address
@@ -72,7 +73,9 @@ def rig(tmp_path_factory) -> Rig:
 
 def true_poses(time_s: np.ndarray) -> np.ndarray:
     """Local rotations (T, 24, 3, 3) of the simulated wearer."""
-    motion = with_exercises(resample(read_motion(CLIP), 100.0), STAND_S)
+    clip = read_motion(CLIP)
+    straight = find_zero(Evidence.of(clip)).applied(resample(clip, 100.0))
+    motion = with_exercises(straight, STAND_S)
     return local_from_global(motion.rotations[np.round(time_s * 100).astype(int)])
 
 
