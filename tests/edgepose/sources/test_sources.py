@@ -396,12 +396,12 @@ def listen(n, least_frames=0, **options):
     with open_source(**options) as source:
         for now_s, batch, *_ in source:
             got += batch
-            complete = bool(batch) and all(sample.acc and sample.quat for sample in batch)
-            if complete:
+            if batch and all(sample.acc and sample.quat for sample in batch):
                 clock.push(batch, now_s)
                 frames += clock.frames(now_s)
             missing -= Counter(sample.sensor for sample in batch)
-            if not missing and (len(frames) >= least_frames or not complete or len(got) > 60 * n):
+            enough = len(frames) >= least_frames or len(got) > 60 * n
+            if not missing and (enough or not (got[-1].acc and got[-1].quat)):
                 return source, got, frames
     raise AssertionError("a live source does not end")
 
