@@ -15,6 +15,11 @@ from edgepose.skeleton import JOINTS
 
 Array = NDArray[np.float64]
 
+CONTACTS = (
+    "left_ankle", "right_ankle", "left_foot", "right_foot", "pelvis", "left_wrist", "right_wrist",
+)  # fmt: skip
+"""Joints whose contacts are estimated, in the order of all arrays; "foot" is the base of the toes."""
+
 _ORDER = {name: i for i, name in enumerate(SITES)}
 
 
@@ -30,6 +35,7 @@ class PoseFrame(NamedTuple):
         translation: (3,) position of the pelvis in T, metres, if it is estimated.
         held: placements or sites of sensors without new data, whose last values were repeated.
         warming_up: the network has seen fewer frames than its window holds.
+        contacts: (7,) probabilities that the joints `CONTACTS` rest on something, if they are estimated.
     """
 
     index: int  # type: ignore[assignment]  # hides tuple.index, which is not needed here
@@ -39,6 +45,7 @@ class PoseFrame(NamedTuple):
     translation: NDArray[np.float64] | None = None
     held: frozenset[str] = frozenset()
     warming_up: bool = False
+    contacts: NDArray[np.float32] | None = None
 
     @property
     def status(self) -> str:

@@ -31,12 +31,15 @@ class EngineOutput(NamedTuple):
         rotations: (24, 3, 3) local rotations, joint 0 relative to T.
         std: (24,) standard deviations, radians.
         warming_up: fewer frames have been seen than the network's past needs.
+        place: (10,) probabilities of the contacts `edgepose.pose.CONTACTS`, then the velocity of the pelvis
+            in its level frame, m/s; None if the archive does not estimate them.
     """
 
     frame: Any
     rotations: Array
     std: Array
     warming_up: bool
+    place: Array | None = None
 
 
 def check_finite(output: EngineOutput) -> None:

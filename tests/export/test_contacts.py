@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from edgepose.pose import CONTACTS
 from edgepose.rotations import rotation_about_axis
 from edgepose.skeleton import JOINTS, PARENTS, default_body, forward_kinematics, local_from_global
 from edgepose_export.mocap import read_motion, resample
 from edgepose_export.networks.normalisation import turn_about_y
 from edgepose_export.synthesis import sitting
-from edgepose_export.synthesis.contacts import CONTACTS, contacts, level_velocity
+from edgepose_export.synthesis.contacts import contacts, level_velocity
 from edgepose_export.synthesis.virtual_imus import straight_pose, virtual_imus
 
 CLIP = Path(__file__).parents[2] / "tools" / "data" / "09_12.bvh"

@@ -15,13 +15,14 @@ from edgepose.errors import EdgeposeError
 from edgepose.inference.archive import load, read_info
 from edgepose.inference.features import network_input
 from edgepose.inference.quantisation import pack_weights
+from edgepose.pose import CONTACTS
 from edgepose.skeleton import default_body
 from edgepose_export.archive.torchscript import script
 from edgepose_export.mocap import read_motion, resample
 from edgepose_export.networks.registry import NETWORKS
 from edgepose_export.networks.shape import NetworkShape
 from edgepose_export.synthesis.augmentation import Augmentation
-from edgepose_export.synthesis.contacts import CONTACTS, contacts, level_velocity
+from edgepose_export.synthesis.contacts import contacts, level_velocity
 from edgepose_export.synthesis.virtual_imus import recording_arrays, virtual_imus
 from edgepose_export.training.config import TrainConfig, config_from
 from edgepose_export.training.dataset import read_take, tape

@@ -16,13 +16,13 @@ from edgepose import __version__
 from edgepose.errors import EdgeposeError
 from edgepose.inference.archive import FORMAT, METADATA_FILE
 from edgepose.placements import PLACEMENTS
+from edgepose.pose import CONTACTS
 from edgepose.skeleton import JOINTS
 from edgepose.utils.durable_files import write_whole
 from edgepose_export.networks.kind import Network, Statistics
 from edgepose_export.networks.normalisation import FirstFrameNormaliser
 from edgepose_export.networks.registry import NETWORKS
 from edgepose_export.networks.shape import NetworkShape, PoseDecoder
-from edgepose_export.synthesis.contacts import CONTACTS
 from edgepose_export.training.dataset import RATE
 
 PLACE_OUTPUTS = {"contacts": list(CONTACTS), "velocity": "level pelvis frame, m/s"}

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from edgepose.pose import CONTACTS
 from edgepose_export.networks.lstm_ends import NormalisationAndDecoding
 from edgepose_export.networks.packed_linear import PackedLinear
 from edgepose_export.networks.shape import PoseNetwork
-from edgepose_export.synthesis.contacts import CONTACTS
 
 
 class PlaceHead(nn.Module):
@@ -31,7 +31,7 @@ class PlaceMethods(nn.Module):
     """Methods that archives of networks with a head for the place have in addition.
 
     Beside each method with poses there is one that also returns the place of the same frames, before the
-    state. It is (B, [T,] 10): probabilities of the contacts in the order of `contacts.CONTACTS`, and the
+    state. It is (B, [T,] 10): probabilities of the contacts in the order of `edgepose.pose.CONTACTS`, and the
     velocity of the pelvis in its level frame, m/s. Apart from one linear layer these methods cost the same.
     The archives, which inherit from this class first, provide `whole`, `at`, `advanced` and `drained`.
     """

@@ -8,9 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from edgepose.placements import PLACEMENTS, ROOT
+from edgepose.pose import CONTACTS
 from edgepose.skeleton import JOINTS
 from edgepose_export.networks.normalisation import rotations_of, turn_about_y
-from edgepose_export.synthesis.contacts import CONTACTS, PLACE
+from edgepose_export.synthesis.contacts import PLACE
 from edgepose_export.synthesis.loose_wear import biased, drifted, worn_loosely
 from edgepose_export.synthesis.straight_arms import with_straight_arms
 from edgepose_export.training.dataset import Batch

@@ -16,15 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
+from edgepose.pose import CONTACTS
 from edgepose.skeleton import JOINTS
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-CONTACTS = (
-    "left_ankle", "right_ankle", "left_foot", "right_foot", "pelvis", "left_wrist", "right_wrist",
-)  # fmt: skip
-"""Joints with a contact, in the order of all arrays; "foot" is the base of the toes."""
 
 PLACE = len(CONTACTS) + 3
 """Numbers per frame: one contact for each of these joints, then the velocity of the pelvis."""

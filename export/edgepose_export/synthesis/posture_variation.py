@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from edgepose.placements import BONES, ROOT
+from edgepose.pose import CONTACTS
 from edgepose.skeleton import JOINTS, PARENTS
 from edgepose_export.networks.normalisation import rotations_of
 from edgepose_export.synthesis.body_shapes import LEVERS, Shapes
-from edgepose_export.synthesis.contacts import CONTACTS
 from edgepose_export.training.dataset import RATE, Batch
 
 BEFORE, AFTER = 2, 1

@@ -17,10 +17,11 @@ from edgepose.calibration import GRAVITY
 from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.base import MAX_VALUE
 from edgepose.placements import BONES, PLACEMENTS
+from edgepose.pose import CONTACTS
 from edgepose.skeleton import PARENTS, forward_kinematics
 from edgepose.utils.safe_npz import BROKEN, open_npz
 from edgepose.utils.similar_names import choices
-from edgepose_export.synthesis.contacts import CONTACTS, PLACE
+from edgepose_export.synthesis.contacts import PLACE
 from edgepose_export.synthesis.virtual_imus import INERTIAL_FROM_BODY
 from edgepose_export.training.sources import GROUPS, HELD_OUT, OWN, RULES, VALIDATION, part_of
 
@@ -246,8 +247,8 @@ class Batch(NamedTuple):
         orientation: (B, T, 6, 3, 3) R_TB.
         acceleration: (B, T, 6, 3) in T, m/s^2.
         relative: (B, T, 24, 3, 3) true global rotations in the root's frame.
-        place: (B, T, 10) contacts, 0 or 1, of the joints `contacts.CONTACTS`, then the velocity of the pelvis
-            in its level frame, m/s; NaN where they are unknown.
+        place: (B, T, 10) contacts, 0 or 1, of the joints `edgepose.pose.CONTACTS`, then the velocity of the
+            pelvis in its level frame, m/s; NaN where they are unknown.
     """
 
     orientation: Tensor

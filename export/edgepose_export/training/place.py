@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from edgepose_export.synthesis.contacts import CONTACTS
+from edgepose.pose import CONTACTS
 from edgepose_export.training.dataset import PackedTakes
 from edgepose_export.training.distributed import ALONE, Processes
 

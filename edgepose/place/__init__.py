@@ -1,0 +1,5 @@
+"""The place of a wearer in the room: the path of the pelvis, from poses, contacts and velocity."""
+
+from edgepose.place.tracker import Place, PlaceTracker
+
+__all__ = ["Place", "PlaceTracker"]
