@@ -9,7 +9,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 LEVELS = (
     "errors placements rotations skeleton imu pose utils",
-    "formats orientation calibration inference",
+    "formats orientation calibration inference place",
     "sources sinks sip analysis diagnostics viewer convert record config",
     "pipeline",
     "benchmarks",
@@ -17,7 +17,7 @@ LEVELS = (
     "__main__",
 )
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms.split()}
-STATIONS = {"sources", "orientation", "calibration", "inference", "sinks"}
+STATIONS = {"sources", "orientation", "calibration", "inference", "place", "sinks"}
 
 
 def modules(package: Path) -> Iterator[tuple[str, ast.Module]]:
