@@ -30,6 +30,9 @@ GAP_S = 0.2
 
 _LOWER = 0.01
 """The foot that stands changes if the other one is lower by more, metres; only without contacts."""
+_UPSET = 0.15
+"""A foot higher above the lowest point of the body does not stand, metres; only without contacts."""
+_PELVIS = CONTACTS.index("pelvis")
 
 
 class Place(NamedTuple):
@@ -75,14 +78,15 @@ class PlaceTracker:
             place: (10,) the network's contacts and velocity, see `EngineOutput.place`; None without them.
         """
         points = self._points.positions(rotations)
-        if place is not None and not np.isfinite(place).all():
-            place = None
+        numbers: list[float] | None = None if place is None else place.tolist()
+        if numbers is not None and not math.isfinite(sum(numbers)):
+            place = numbers = None
         if math.isfinite(sum(map(sum, points))) and math.isfinite(time_s):
-            self._follow(time_s, points, rotations, place)
+            self._follow(time_s, points, rotations[0], numbers)
         contacts = None if place is None else np.asarray(place[: len(CONTACTS)], np.float32)
         return Place(np.array(self._position), contacts)
 
-    def _follow(self, time_s: float, points: list[Point], rotations: Input, place: Input | None) -> None:
+    def _follow(self, time_s: float, points: list[Point], pelvis: Input, numbers: list[float] | None) -> None:
         """Move to the next frame."""
         before, dt = self._before, time_s - self._time_s
         self._time_s, self._before = time_s, points
@@ -93,12 +97,11 @@ class PlaceTracker:
             self._velocity.reset()
             self._ground.lift()
             return
-        if place is None:
+        if numbers is None:
             probabilities, velocity = self._lower_foot(points), None
         else:
-            numbers = place.tolist()
             probabilities = numbers[: len(CONTACTS)]
-            velocity = _along_t(numbers[len(CONTACTS) :], rotations[0])
+            velocity = _along_t(numbers[len(CONTACTS) :], pelvis)
         share = shares(probabilities)
         x, y, z = self._velocity.update(dt, before, points, share, velocity)
         position = self._position
@@ -108,11 +111,13 @@ class PlaceTracker:
         self._ground.correct(dt, position, points, probabilities, share)
 
     def _lower_foot(self, points: list[Point]) -> list[float]:
-        """Return contacts of the lower foot only."""
+        """Return contacts of the lower foot only, or of the pelvis if the body does not stand on its feet."""
         other = 1 - self._standing
         if points[other][1] < points[self._standing][1] - _LOWER:
             self._standing = other
-        return [float(i == self._standing) for i in range(len(CONTACTS))]
+        lifted = self._ground.height_of(points) + points[self._standing][1] > _UPSET
+        stands_on = _PELVIS if lifted else self._standing
+        return [float(i == stands_on) for i in range(len(CONTACTS))]
 
 
 def _along_t(velocity: list[float], pelvis: Input) -> list[float]:

@@ -92,12 +92,12 @@ class PelvisVelocity:
         return self._velocity
 
     def _predicted(self, dt: float, contact: float, network: Sequence[float] | None) -> list[float]:
-        """Return the velocity if nothing touches the ground: it follows the network's, and falls."""
+        """Return the velocity if nothing touches the ground: it follows the network's, or ends, and falls."""
         x, y, z = self._velocity
-        y -= (1.0 - contact) * _GRAVITY * dt
+        to_x = to_y = to_z = 0.0
         if network is not None:
-            part = min(1.0, dt / _PREDICTION_S)
-            x += part * (network[0] + self._correction[0] - x)
-            y += part * (network[1] - y)
-            z += part * (network[2] + self._correction[1] - z)
-        return [x, y, z]
+            to_x, to_y, to_z = network
+            to_x, to_z = to_x + self._correction[0], to_z + self._correction[1]
+        part = min(1.0, dt / _PREDICTION_S)
+        y -= (1.0 - contact) * _GRAVITY * dt
+        return [x + part * (to_x - x), y + part * (to_y - y), z + part * (to_z - z)]

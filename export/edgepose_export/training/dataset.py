@@ -50,6 +50,7 @@ class Take(NamedTuple):
         place: (T, 10) float32 contacts and velocity, see `Batch`; None if they are unknown.
         source: name of its source, see `sources.SOURCES`.
         actor: key of its actor, see `sources.TakeInfo`.
+        translation: (T, 3) float32 true position of the pelvis, metres, if it is known.
     """
 
     name: str
@@ -60,6 +61,7 @@ class Take(NamedTuple):
     place: NDArray[np.float32] | None = None
     source: str = OWN
     actor: str = OWN
+    translation: NDArray[np.float32] | None = None
 
     @property
     def place_or_nan(self) -> NDArray[np.float32]:
@@ -93,9 +95,12 @@ def read_take(path: Path, root: Path | None = None) -> Take:
             license_note, source = str(data["license"]), str(data["source"])
             actor = str(data["actor"]) if "actor" in data else source
             place = _place(data)
+            translation = data.get("trans")
         if not len(poses) == len(quats) == len(force) == (len(poses) if place is None else len(place)):
             raise ValueError("sensors and poses differ in length")
         _check_numbers(quats, force, poses)
+        if translation is not None:
+            _check_translation(translation, len(poses))
     except (OSError, *BROKEN) as error:
         raise EdgeposeError(
             f"{path}: not a recording with true poses ({error}); make it with edgepose synthesize"
@@ -125,6 +130,7 @@ def read_take(path: Path, root: Path | None = None) -> Take:
         place,
         source=source,
         actor=actor,
+        translation=None if translation is None else translation.astype(np.float32),
     )
 
 
@@ -140,6 +146,14 @@ def _place(data: Any) -> NDArray[np.float32] | None:
     if velocity.shape != (len(contact), 3) or not numbers:
         raise ValueError("a velocity is not finite, or absurd")
     return np.concatenate([contact, velocity], axis=1).astype(np.float32)
+
+
+def _check_translation(translation: NDArray[Any], frames: int) -> None:
+    """Raise ValueError unless positions are possible, one for each frame."""
+    if translation.shape != (frames, 3) or translation.dtype.kind not in "fiu":
+        raise ValueError("positions and poses differ in length")
+    if not (np.abs(translation) < MAX_VALUE).all():
+        raise ValueError("a position is not finite, or absurd")
 
 
 def _check_numbers(quats: NDArray[Any], force: NDArray[Any], poses: NDArray[Any]) -> None:
