@@ -23,7 +23,9 @@ HEAT_MAP_FRAMES = [0, 1, 5, 10, 20, 50, 100, 200]
 """Past and future frames of DIP's figure 6."""
 
 
-class _Model(NamedTuple):
+class EvaluatedModel(NamedTuple):
+    """A model of the command line, and the modes to run it in."""
+
     name: str
     metadata: dict[str, Any]
     module: torch.jit.ScriptModule
@@ -104,6 +106,17 @@ class _Model(NamedTuple):
     type=PICTURE,
     help="Draw and print actual errors against predicted standard deviations.",
 )
+@click.option(
+    "--place",
+    is_flag=True,
+    help="Measure the wearer's path instead of poses: error after some seconds and over some metres, height, "
+    "slide of the feet.",
+)
+@click.option(
+    "--paths",
+    type=PICTURE,
+    help="Draw estimated and true paths, seen from above, with --place or --real.",
+)
 @overwrite_option
 def evaluate(
     names: tuple[str, ...],
@@ -120,6 +133,8 @@ def evaluate(
     heat_map: Path | None,
     every: int,
     reliability: Path | None,
+    place: bool,
+    paths: Path | None,
     overwrite: bool,
 ) -> None:
     """Measure models against true poses. All frames count, including the first and last ones of a take.
@@ -133,32 +148,32 @@ def evaluate(
       edgepose evaluate --data recordings/ --table 3 --histogram errors.png
       edgepose evaluate --data DIP_IMU/s_09 --part published --table 3 --model birnn --model dip-birnn.pt
       edgepose evaluate --data recordings/ --part cmu-walk-run --heat-map window.png --every 10
+      edgepose evaluate --data recordings/ --place --part cmu-walk-run --paths paths.png
     """
     if real:
-        _real(names, trust, data)
+        _real(names, trust, data, paths, overwrite)
         return
     if data is None:
         raise click.UsageError("give --data FOLDER, or --real")
-    if table and (modes or past is not None or future is not None):
-        raise click.UsageError("--table decides how models run: omit --online, --past and --future")
-    if heat_map and (table or histogram or baselines):
-        raise click.UsageError("--heat-map replaces the tables: omit --table, --histogram and --baselines")
-    if heat_map and len(names) > 1:
-        raise click.UsageError("--heat-map takes one --model")
+    _check_combination(**click.get_current_context().params)
     from edgepose.analysis.figures import check_picture
     from edgepose_export.training.dataset import check_part
 
     for part in parts:
         if part != "published":
             check_part(part)
-    for picture in (histogram, heat_map, reliability):
+    for picture in (histogram, heat_map, reliability, paths):
         if picture:
             check_picture(picture, "drawing", overwrite)
     models = [_model(name, trust, modes, past, future, table) for name in names]
     if len({model.name for model in models}) < len(models):  # files with the same name in several folders
         models = [model._replace(name=name) for model, name in zip(models, names, strict=True)]
     chosen = parts or default_parts(data)
-    if heat_map:
+    if place:
+        from edgepose_export.cli.evaluate_place import evaluate_place
+
+        evaluate_place(models, data, chosen, paths, overwrite)
+    elif heat_map:
         _heat_map(models[0], data, chosen, every, heat_map, overwrite)
     else:
         _tables(models, data, chosen, baselines, table, histogram, overwrite)
@@ -166,29 +181,62 @@ def evaluate(
         _reliability(models, data, chosen, reliability, overwrite)
 
 
-_REAL = {"names", "trust", "data", "real"}
+def _check_combination(
+    *,
+    names: tuple[str, ...],
+    modes: tuple[str, ...],
+    past: int | None,
+    future: int | None,
+    place: bool,
+    **flags: Any,
+) -> None:
+    """Raise UsageError if flags contradict each other."""
+    table, heat_map = flags["table"], flags["heat_map"]
+    tables = flags["histogram"] or flags["baselines"]
+    if table and (modes or past is not None or future is not None):
+        raise click.UsageError("--table decides how models run: omit --online, --past and --future")
+    if heat_map and (table or tables):
+        raise click.UsageError("--heat-map replaces the tables: omit --table, --histogram and --baselines")
+    if place and (table or tables or heat_map or modes or flags["reliability"]):
+        raise click.UsageError(
+            "--place has tables and a picture of its own: omit --table, --histogram, --heat-map, --reliability, "
+            "--baselines and --online"
+        )
+    if flags["paths"] and not place:
+        raise click.UsageError("--paths belongs to --place or --real")
+    if heat_map and len(names) > 1:
+        raise click.UsageError("--heat-map takes one --model")
+
+
+_REAL = {"names", "trust", "data", "real", "paths", "overwrite"}
 """Parameters that apply to --real."""
 
 
-def _real(names: tuple[str, ...], trust: bool, folder: Path | None) -> None:
+def _real(
+    names: tuple[str, ...], trust: bool, folder: Path | None, paths: Path | None, overwrite: bool
+) -> None:
     """Measure models on real wearers."""
     context = click.get_current_context()
     for parameter in context.command.params:
         name = parameter.name or ""
         if name not in _REAL and context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
             raise click.UsageError(f"--real runs models as `edgepose run` does: omit {parameter.opts[0]}")
+    from edgepose.analysis.figures import check_picture
     from edgepose.inference.model import Model
+    from edgepose_export.cli.evaluate_place import evaluate_real_place
     from edgepose_export.cli.progress import labelled
     from edgepose_export.evaluation import real_wearers
 
     real_wearers.check_folder(folder or real_wearers.FOLDER)
-    models = {name: Model(name, trust=trust) for name in names}
+    if paths:
+        check_picture(paths, "drawing", overwrite)
     stems = [Path(name).stem for name in names]
-    if len(set(stems)) == len(names):
-        models = dict(zip(stems, models.values(), strict=True))
-    for title, rows in real_wearers.measure_models(models, folder, labelled("measuring")).items():
-        show(f"\n{real_wearers.format_table(title, rows)}")
+    rows = dict(zip(stems if len(set(stems)) == len(names) else names, names, strict=True))
+    models = {row: Model(name, trust=trust) for row, name in rows.items()}
+    for title, table in real_wearers.measure_models(models, folder, labelled("measuring")).items():
+        show(f"\n{real_wearers.format_table(title, table)}")
     show(f"\n{real_wearers.LEGEND}")
+    evaluate_real_place(rows, trust, folder or real_wearers.FOLDER, paths, overwrite)
 
 
 def default_parts(data: Path) -> tuple[str, ...]:
@@ -207,7 +255,7 @@ def default_parts(data: Path) -> tuple[str, ...]:
 
 def _model(
     name: str, trust: bool, modes: tuple[str, ...], past: int | None, future: int | None, table: str | None
-) -> _Model:
+) -> EvaluatedModel:
     from edgepose.inference import archive
     from edgepose_export.evaluation.evaluate import modes_of
     from edgepose_export.evaluation.paper_tables import TABLES
@@ -226,7 +274,7 @@ def _model(
         chosen = TABLES[table].modes(about)
     else:
         chosen = [mode for mode in modes_of(about) if not modes or mode.name in modes]
-    return _Model(path.stem, about, module, chosen)
+    return EvaluatedModel(path.stem, about, module, chosen)
 
 
 def _no_window(metadata: dict[str, Any]) -> str:
@@ -235,12 +283,12 @@ def _no_window(metadata: dict[str, Any]) -> str:
     return "sees a fixed number of frames" if fixed else "is unidirectional"
 
 
-def _row_name(models: list[_Model], model: _Model, mode: Mode) -> str:
+def _row_name(models: list[EvaluatedModel], model: EvaluatedModel, mode: Mode) -> str:
     return f"{model.name}, {mode}" if len(models) > 1 else str(mode)
 
 
 def _tables(
-    models: list[_Model],
+    models: list[EvaluatedModel],
     data: Path,
     parts: tuple[str, ...],
     baselines: bool,
@@ -279,7 +327,7 @@ def _tables(
         say(f"wrote {histogram}")
 
 
-def _places(models: list[_Model], data: Path, parts: tuple[str, ...]) -> None:
+def _places(models: list[EvaluatedModel], data: Path, parts: tuple[str, ...]) -> None:
     """Show the accuracy of contacts and velocity, of models and takes that have them."""
     from edgepose_export.cli.progress import labelled
     from edgepose_export.evaluation.evaluate import takes_of
@@ -293,7 +341,7 @@ def _places(models: list[_Model], data: Path, parts: tuple[str, ...]) -> None:
 
 
 def _heat_map(
-    model: _Model, data: Path, parts: tuple[str, ...], every: int, path: Path, overwrite: bool
+    model: EvaluatedModel, data: Path, parts: tuple[str, ...], every: int, path: Path, overwrite: bool
 ) -> None:
     from edgepose.inference.archive import is_windowed
 
@@ -319,7 +367,7 @@ def _heat_map(
 
 
 def _reliability(
-    models: list[_Model], data: Path, parts: tuple[str, ...], path: Path, overwrite: bool
+    models: list[EvaluatedModel], data: Path, parts: tuple[str, ...], path: Path, overwrite: bool
 ) -> None:
     from edgepose_export.cli.progress import labelled
     from edgepose_export.evaluation import plots

@@ -112,10 +112,12 @@ def tracked(time_s: Array, poses: Place, places: Iterable[Place | None]) -> Arra
     return np.array([tracker.update(*frame).translation for frame in frames])
 
 
-def estimates(poses: Place, place: Place, time_s: Array | None = None) -> dict[str, Array]:
-    """Return the positions (T, 3) of the pelvis by row of the tables."""
+def estimates(
+    poses: Place, place: Place, time_s: Array | None = None, only: str | None = None
+) -> dict[str, Array]:
+    """Return the positions (T, 3) of the pelvis by row of the tables, of all rows or of one."""
     times = np.arange(len(poses)) / RATE if time_s is None else time_s
-    inputs = {name: change(place) for name, change in ROWS.items()}
+    inputs = {name: change(place) for name, change in ROWS.items() if only in (name, None)}
     return {
         name: tracked(times, poses, [None] * len(poses) if given is None else given)
         for name, given in inputs.items()

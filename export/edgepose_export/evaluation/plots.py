@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,8 @@ from edgepose.utils.durable_files import reason
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from edgepose_export.evaluation.paths import Path as Way
+    from edgepose_export.evaluation.real_paths import RealPath
     from edgepose_export.evaluation.uncertainty import Reliability
 
 Array = NDArray[np.float64]
@@ -84,6 +86,45 @@ def reliability_plot(
         ax.plot([0, most], [0, most], color="0.6", linestyle="--", label="as predicted")
         ax.set(xlabel="predicted standard deviation, deg", ylabel="actual RMS error, deg")
     _legend(figure, axes)
+    _save(figure, path, overwrite)
+
+
+def path_plot(path: Path, parts: Mapping[str, Sequence[Way]], row: str, overwrite: bool = True) -> None:
+    """Draw paths seen from above, one panel for each part: true ones in grey, estimates in colour.
+
+    Args:
+        path: picture to write.
+        parts: paths by part of the split.
+        row: the estimate to draw.
+        overwrite: whether an existing file may be replaced.
+    """
+    figure, axes = _panels(list(parts))
+    for ax, ways in zip(axes, parts.values(), strict=True):
+        for i, way in enumerate(ways):
+            true, estimate = way.true - way.true[0], way.estimates[row] - way.estimates[row][0]
+            # The wearer's left is at the left of a wearer who walks up the page.
+            ax.plot(-true[:, 0], true[:, 2], color="0.6", linewidth=3, label="true" if i == 0 else None)
+            ax.plot(-estimate[:, 0], estimate[:, 2], linewidth=1.2, label="estimated" if i == 0 else None)
+        ax.set(xlabel="to the right, m", ylabel="ahead, m", aspect="equal")
+        ax.set_adjustable("datalim")
+    _legend(figure, axes)
+    _save(figure, path, overwrite)
+
+
+def real_path_plot(
+    path: Path, models: Mapping[str, tuple[RealPath, RealPath]], overwrite: bool = True
+) -> None:
+    """Draw the walker's path, seen from above, and heights of the sitter's pelvis and feet over time."""
+    figure, (above, side) = _panels(["walker, from above", "sitter, heights"])
+    for i, (name, (walker, sitter)) in enumerate(models.items()):
+        ink = f"C{i}"
+        above.plot(-walker.pelvis[:, 0], walker.pelvis[:, 2], color=ink, label=name)
+        side.plot(sitter.wearer.time_s, sitter.pelvis[:, 1], color=ink, label=name)
+        side.plot(sitter.wearer.time_s, sitter.feet[:, :, 1], color=ink, linewidth=0.6)
+    above.set(xlabel="to the right, m", ylabel="ahead, m", aspect="equal")
+    above.set_adjustable("datalim")
+    side.set(xlabel="time, s", ylabel="pelvis, and soles (thin), m", ylim=(-0.1, None))
+    _legend(figure, [above, side])
     _save(figure, path, overwrite)
 
 
