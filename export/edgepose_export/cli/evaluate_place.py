@@ -31,7 +31,7 @@ def evaluate_place(
     """
     from edgepose_export.cli.progress import labelled
     from edgepose_export.evaluation.evaluate import takes_of
-    from edgepose_export.evaluation.paths import BOTH, format_table, measured, summarise
+    from edgepose_export.evaluation.paths import BOTH, LEGEND, format_table, measured, summarise
     from edgepose_export.evaluation.plots import path_plot
 
     able = [model for model in models if "place" in model.metadata]
@@ -49,11 +49,14 @@ def evaluate_place(
                 raise EdgeposeError(
                     f"{data}: no recording of {part} has contacts; make them again with edgepose synthesize"
                 )
-            show(f"\n{format_table(f'{part}, {model.name}', summarise(path.errors for path in paths))}")
+            show(
+                f"\n{format_table(f'{part}, {model.name}: errors of the path', summarise(path.errors for path in paths))}"
+            )
             kinds = summarise({BOTH: path.kinds} for path in paths)
-            show(f"\n{format_table('the same by kind of motion, after 2 s, cm', kinds)}")
+            show(f"\n{format_table(f'{part}, {model.name}: after 2 s, by kind of motion', kinds)}")
             if model is able[0]:
                 drawn[part] = sorted(paths, key=_length, reverse=True)[:SHOWN]
+    show(f"\n{LEGEND}")
     if picture:
         path_plot(picture, drawn, BOTH, overwrite)
         say(f"wrote {picture}")

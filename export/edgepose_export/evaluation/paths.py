@@ -43,7 +43,7 @@ FRAMES = 256
 ANKLES, KNEES = [7, 8], [4, 5]
 
 Row = dict[str, Array]
-"""Errors by column: "2 s, cm", "7 m, %", "height, cm", "slide, cm/s" and the like."""
+"""Errors by column, see `LEGEND`."""
 
 
 class Path(NamedTuple):
@@ -77,18 +77,26 @@ def _with(contacts: bool, velocity: bool) -> Callable[[Place], Place | None]:
 
 
 ROWS: Mapping[str, Callable[[Place], Place | None]] = {
-    "no heads: the lower foot stands": _with(contacts=False, velocity=False),
-    "velocity alone": _with(contacts=False, velocity=True),
-    "contacts alone": _with(contacts=True, velocity=False),
-    "contacts and velocity": _with(contacts=True, velocity=True),
+    "no heads": _with(contacts=False, velocity=False),
+    "velocity": _with(contacts=False, velocity=True),
+    "contacts": _with(contacts=True, velocity=False),
+    "both": _with(contacts=True, velocity=True),
 }
 """What the tracker is given of the network's output (T, 10), by row of the tables."""
 
-BOTH = "contacts and velocity"
+BOTH = "both"
 """The row of a run."""
 
-TRUTH = "true motion"
+TRUTH = "truth"
 """The row of the true path; its feet, too, roll and slide while they are in contact."""
+
+LEGEND = """\
+means; count: measured times, ways, frames, takes
+2 s, ...: error after this time, cm; 1 m, ...: error over a way this long, % of it
+height: error of the height against the first second, cm; at end: in the last one
+slide: movement of a sole between the ends of a contact, cm per second of contact
+no heads: the lower foot stands still; velocity: the network's velocity alone;
+    contacts: its contacts alone; both: as in a run; truth: the true motion"""
 
 
 def streamed(module: torch.jit.ScriptModule, take: Take, future: int) -> tuple[Place, Place]:
@@ -157,14 +165,14 @@ def errors(way: Array, true: Array, feet: Array, planted: NDArray[np.bool_]) -> 
         feet: (T, 2, 3) soles relative to the pelvis.
         planted: (T, 2) whether they truly are in contact with the ground.
     """
-    row = {f"{seconds:g} s, cm": 100.0 * _after(way, true, seconds) for seconds in SECONDS}
-    row |= {f"{metres:g} m, %": 100.0 * _over(way, true, metres) for metres in METRES}
+    row = {f"{seconds:g} s": 100.0 * _after(way, true, seconds) for seconds in SECONDS}
+    row |= {f"{metres:g} m": 100.0 * _over(way, true, metres) for metres in METRES}
     height = way[:, 1] - true[:, 1]
     second = round(RATE)
     height -= np.median(height[:second])
-    row["height, cm"] = 100.0 * np.abs(height)
-    row["at the end"] = 100.0 * np.abs(np.median(height[-second:], keepdims=True))
-    row["slide, cm/s"] = 100.0 * _slides(way[:, None] + feet, planted)
+    row["height"] = 100.0 * np.abs(height)
+    row["at end"] = 100.0 * np.abs(np.median(height[-second:], keepdims=True))
+    row["slide"] = 100.0 * _slides(way[:, None] + feet, planted)
     return row
 
 
