@@ -159,9 +159,8 @@ def evaluate(
     from edgepose.analysis.figures import check_picture
     from edgepose_export.training.dataset import check_part
 
-    for part in parts:
-        if part != "published":
-            check_part(part)
+    for part in set(parts) - {"published"}:
+        check_part(part)
     for picture in (histogram, heat_map, reliability, paths):
         if picture:
             check_picture(picture, "drawing", overwrite)
@@ -199,8 +198,8 @@ def _check_combination(
         raise click.UsageError("--heat-map replaces the tables: omit --table, --histogram and --baselines")
     if place and (table or tables or heat_map or modes or flags["reliability"]):
         raise click.UsageError(
-            "--place has tables and a picture of its own: omit --table, --histogram, --heat-map, --reliability, "
-            "--baselines and --online"
+            "--place has tables and a picture of its own: omit --table, --histogram, --heat-map, "
+            "--reliability, --baselines and --online"
         )
     if flags["paths"] and not place:
         raise click.UsageError("--paths belongs to --place or --real")

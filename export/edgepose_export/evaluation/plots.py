@@ -26,6 +26,9 @@ PANEL_IN, DPI = 4.5, 150
 MOST_DEG = 60
 """Larger errors are counted in the last bin of a histogram."""
 
+PATH_FRAMES = 900
+"""Frames of a path that are drawn; longer ones are tangles."""
+
 
 def histogram(path: Path, parts: Mapping[str, Mapping[str, Array]], overwrite: bool = True) -> None:
     """Draw the distribution of errors, as DIP's figure 5.
@@ -90,7 +93,7 @@ def reliability_plot(
 
 
 def path_plot(path: Path, parts: Mapping[str, Sequence[Way]], row: str, overwrite: bool = True) -> None:
-    """Draw paths seen from above, one panel for each part: true ones in grey, estimates in colour.
+    """Draw the starts of paths from above, one panel for each part: true ones in grey, estimates in colour.
 
     Args:
         path: picture to write.
@@ -101,7 +104,7 @@ def path_plot(path: Path, parts: Mapping[str, Sequence[Way]], row: str, overwrit
     figure, axes = _panels(list(parts))
     for ax, ways in zip(axes, parts.values(), strict=True):
         for i, way in enumerate(ways):
-            true, estimate = way.true - way.true[0], way.estimates[row] - way.estimates[row][0]
+            true, estimate = (each[:PATH_FRAMES] - each[0] for each in (way.true, way.estimates[row]))
             # The wearer's left is at the left of a wearer who walks up the page.
             ax.plot(-true[:, 0], true[:, 2], color="0.6", linewidth=3, label="true" if i == 0 else None)
             ax.plot(-estimate[:, 0], estimate[:, 2], linewidth=1.2, label="estimated" if i == 0 else None)
