@@ -18,6 +18,7 @@ from edgepose.formats.poses.csv_columns import ROTATION_FORMATS
 from edgepose.imu import FILTERS
 from edgepose.sinks.output_files import check_output
 from edgepose.sinks.registry import SINKS
+from edgepose.skeleton import Body, default_body
 from edgepose.utils.output_targets import is_stream
 from edgepose.utils.similar_names import choices
 from edgepose.utils.sockets import parse_host_and_port
@@ -95,6 +96,7 @@ class OutputConfig:
         rotations: representation of rotations in the CSV.
         std: add the network's standard deviations to the CSV.
         height: the wearer's stature, metres.
+        leg_length: length of the wearer's thigh and shank, metres; None for the average at this height.
         overwrite: replace existing files.
     """
 
@@ -102,6 +104,7 @@ class OutputConfig:
     rotations: str
     std: bool
     height: float
+    leg_length: float | None
     overwrite: bool
 
     def __init__(
@@ -111,6 +114,7 @@ class OutputConfig:
         rotations: str = "axis-angle",
         std: bool = False,
         height: float = 1.75,
+        leg_length: float | None = None,
         overwrite: bool = False,
         sinks: Mapping[str, str] | None = None,
         **outputs: Any,
@@ -122,6 +126,7 @@ class OutputConfig:
             rotations: representation of rotations in the CSV.
             std: add the network's standard deviations to the CSV.
             height: the wearer's stature, metres.
+            leg_length: length of the wearer's thigh and shank, metres.
             overwrite: replace existing files.
             sinks: targets of outputs from other packages (entry points `edgepose.sinks`), by output name.
             **outputs: targets of this package's outputs, as text or parsed; True for `view`. None and False
@@ -149,7 +154,7 @@ class OutputConfig:
             raise ConfigError(
                 f"rotations: {rotations!r} is not one of {', '.join(map(repr, ROTATION_FORMATS))}"
             )
-        values = (tuple(pairs), rotations, std, height, overwrite)
+        values = (tuple(pairs), rotations, std, height, leg_length, overwrite)
         for each, value in zip(dataclasses.fields(self), values, strict=True):
             object.__setattr__(self, each.name, value)
 
@@ -164,6 +169,15 @@ class OutputConfig:
     def any(self) -> bool:
         """Whether there is any output."""
         return bool(self.targets)
+
+    @property
+    def body(self) -> Body:
+        """The wearer's body.
+
+        Raises:
+            EdgeposeError: `height` or `leg_length` is impossible.
+        """
+        return default_body(self.height, leg_length_m=self.leg_length)
 
     @property
     def files(self) -> dict[str, str | Path]:
@@ -215,7 +229,8 @@ class WearerConfig:
         outputs: the outputs for poses.
         filter: orientation filter, one of `edgepose.imu.FILTERS`.
         no_mag: do not use magnetometers in the filter.
-        control: address to listen on for re-zero requests.
+        no_place: do not follow the wearer through the room; poses have no translation.
+        control: address to listen on for requests, see `edgepose.pipeline.remote_control`.
         name: the wearer's name in messages; empty for a single wearer.
         path: the TOML file that the configuration was read from, if any.
     """
@@ -225,6 +240,7 @@ class WearerConfig:
     outputs: OutputConfig
     filter: str = "none"
     no_mag: bool = False
+    no_place: bool = False
     control: tuple[str, int] | None = None
     name: str = ""
     path: Path | None = None
@@ -306,7 +322,9 @@ _KEYS = {
     "rotations": _TEXT,
     "std": _SWITCH,
     "height": _NUMBER,
+    "leg-length": _NUMBER,
     "overwrite": _SWITCH,
+    "no-place": _SWITCH,
     "control": _TEXT,
 }
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edgepose.errors import EdgeposeError
+from edgepose.placements import PLACEMENTS
 
 Array = NDArray[np.float64]
 
@@ -94,6 +95,14 @@ MIN_HEIGHT, MAX_HEIGHT = 0.8, 2.5
 """Range of statures that `default_body` accepts, metres; others are mistakes, mostly centimetres."""
 
 
+MOST_LEG_CHANGE = 0.15
+"""Largest share by which `with_leg_length` changes legs; people of one stature differ by less."""
+
+_KNEES_AND_ANKLES = [JOINTS.index(f"{side}_{j}") for side in ("left", "right") for j in ("knee", "ankle")]
+_TRUNK = [JOINTS.index(name) for name in ("spine1", "spine2", "spine3", "neck", "head")]
+_LOWER_LEGS = [i for i, name in enumerate(PLACEMENTS) if name.endswith("lower_leg")]
+
+
 class Body(NamedTuple):
     """Bone lengths of one wearer and the points on the skin where virtual sensors sit, metres."""
 
@@ -106,11 +115,8 @@ class Body(NamedTuple):
 
     @property
     def leg_length_m(self) -> float:
-        """Length of thigh and shank, mean of both sides, metres."""
-        knees_and_ankles = [
-            JOINTS.index(f"{side}_{j}") for side in ("left", "right") for j in ("knee", "ankle")
-        ]
-        return float(np.linalg.norm(self.offsets[knees_and_ankles], axis=1).sum() / 2.0)
+        """Length of thigh and shank, hip joint to ankle, mean of both sides, metres."""
+        return float(np.linalg.norm(self.offsets[_KNEES_AND_ANKLES], axis=1).sum() / 2.0)
 
 
 @cache
@@ -120,13 +126,18 @@ def _table() -> dict[str, Any]:
     return table
 
 
-def default_body(height_m: float = 1.75, sex: str = "neutral") -> Body:
-    """Return an average body for a stature in metres; `sex` is "neutral", "male" or "female".
+def default_body(height_m: float = 1.75, sex: str = "neutral", leg_length_m: float | None = None) -> Body:
+    """Return an average body for a stature.
 
     Interpolated linearly between the statures of `body.json`, scaled in proportion beyond them.
 
+    Args:
+        height_m: stature, metres.
+        sex: "neutral", "male" or "female".
+        leg_length_m: length of thigh and shank, metres, see `with_leg_length`; None for the average.
+
     Raises:
-        EdgeposeError: an impossible stature, or an unknown sex.
+        EdgeposeError: an impossible stature or leg length, or an unknown sex.
     """
     table = _table()
     if sex not in table["sexes"]:
@@ -146,5 +157,32 @@ def default_body(height_m: float = 1.75, sex: str = "neutral") -> Body:
         blend: Array = ((1 - t) * low + t * high) * (height_m / clipped_m)
         return blend
 
-    body = table["sexes"][sex]
-    return Body(at(body["offsets"]), at(body["sensors"]), float(height_m))
+    rows = table["sexes"][sex]
+    body = Body(at(rows["offsets"]), at(rows["sensors"]), float(height_m))
+    return body if leg_length_m is None else with_leg_length(body, leg_length_m)
+
+
+def with_leg_length(body: Body, leg_length_m: float) -> Body:
+    """Return a body of the same stature with other legs: what these gain in height, the trunk loses.
+
+    Args:
+        body: the body to change.
+        leg_length_m: length of thigh and shank, hip joint to ankle, metres.
+
+    Raises:
+        EdgeposeError: the legs would differ from the body's by more than `MOST_LEG_CHANGE`.
+    """
+    ratio = leg_length_m / body.leg_length_m
+    if not abs(ratio - 1.0) <= MOST_LEG_CHANGE:  # also true of NaN
+        low, high = ((1.0 + change) * body.leg_length_m for change in (-MOST_LEG_CHANGE, MOST_LEG_CHANGE))
+        raise EdgeposeError(
+            f"leg length {leg_length_m:g} m does not fit a height of {body.height_m:g} m, for which it is "
+            f"{low:.2f} to {high:.2f} m: measure from the hip joint to the ankle, in metres, and give the "
+            "height, too"
+        )
+    offsets, sensors = body.offsets.copy(), body.sensors.copy()
+    offsets[_KNEES_AND_ANKLES] *= ratio
+    sensors[_LOWER_LEGS] *= ratio
+    gained_m = standing_pelvis_position(offsets)[1] - standing_pelvis_position(body.offsets)[1]
+    offsets[_TRUNK, 1] *= 1.0 - gained_m / offsets[_TRUNK, 1].sum()
+    return Body(offsets, sensors, body.height_m)

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from edgepose.errors import ModelError
 from edgepose.inference.quantisation import suppress_quantisation_warning
 from edgepose.placements import PLACEMENTS
+from edgepose.pose import CONTACTS
 from edgepose.utils.similar_names import choices
 
 if TYPE_CHECKING:
@@ -60,6 +61,11 @@ class ArchiveInfo(NamedTuple):
 def is_windowed(metadata: Mapping[str, Any]) -> bool:
     """Whether a model can compute a window of any length, past and future, for each frame."""
     return bool(metadata.get("windowed", metadata["kind"] == "birnn"))  # the first archives do not say
+
+
+def has_place(metadata: Mapping[str, Any]) -> bool:
+    """Whether a model estimates contacts and the velocity of the pelvis, see `EngineOutput.place`."""
+    return "place" in metadata
 
 
 def _settings() -> str:
@@ -169,6 +175,9 @@ def _check_metadata(path: Path, metadata: Any) -> None:
         raise ModelError(f"{path}: the archive's ability to compute windows is neither true nor false")
     if metadata.get("placements") != list(PLACEMENTS):
         raise ModelError(f"{path}: made for other sensor placements: {metadata.get('placements')}")
+    place = metadata.get("place")
+    if has_place(metadata) and not (isinstance(place, dict) and place.get("contacts") == list(CONTACTS)):
+        raise ModelError(f"{path}: made for other contacts: {place}")
     if not isinstance(metadata.get("rate_hz"), (int, float)) or not 1 <= metadata["rate_hz"] <= 1000:
         raise ModelError(f"{path}: the archive's frame rate {metadata.get('rate_hz')!r} is not a rate")
     for name in ("past", "future"):

@@ -7,7 +7,7 @@ the last ones, at `finish`, with the future that is left.
 from __future__ import annotations
 
 from collections import defaultdict, deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -43,8 +43,9 @@ class EngineOutput(NamedTuple):
 
 
 def check_finite(output: EngineOutput) -> None:
-    """Raise ModelError if a pose is NaN or infinite, as a network with damaged weights makes them."""
-    if not (np.isfinite(output.rotations).all() and np.isfinite(output.std).all()):
+    """Raise ModelError if an output is NaN or infinite, as a network with damaged weights makes them."""
+    arrays = output.rotations, output.std, *(() if output.place is None else (output.place,))
+    if not all(np.isfinite(array).all() for array in arrays):
         raise ModelError(
             "the network computes NaN or infinite numbers, so its archive is damaged; get or export it again"
         )
@@ -74,12 +75,73 @@ class Engine(Protocol):
         """Return the poses of the frames that still wait for their future."""
 
 
+class _Results(NamedTuple):
+    """A network's results for B wearers: rotations, deviations and places, None if these are not wanted."""
+
+    rotations: torch.Tensor
+    std: torch.Tensor
+    place: torch.Tensor | None = None
+
+    def of_wearers(self) -> Iterator[tuple[Array, Array, Sequence[Array | None]]]:
+        """Yield rotations, deviations and places for each wearer."""
+        rotations, std = self.rotations.numpy(), self.std.numpy()
+        place = [[None] * len(row) for row in std] if self.place is None else self.place.numpy()
+        return zip(rotations, std, place, strict=True)
+
+
+class _Network:
+    """A loaded archive that is called with or without the place; its poses are the same."""
+
+    def __init__(self, module: torch.jit.ScriptModule, place: bool) -> None:
+        self._module, self._ending = module, "_place" if place else ""
+
+    def start(self, batch: int, future: int) -> list[torch.Tensor]:
+        """Return the state before the first frame of a stream."""
+        state: list[torch.Tensor] = self._module.start(batch, future)
+        return state
+
+    def window(self, orientation: torch.Tensor, acceleration: torch.Tensor, index: int) -> _Results:
+        """Return the results for frame `index` of a window, with a time axis of one frame."""
+        results = self._method("window")(orientation, acceleration, index)
+        return _Results(*(tensor[:, None] for tensor in results))
+
+    def stream(
+        self, orientation: torch.Tensor, acceleration: torch.Tensor, state: list[torch.Tensor]
+    ) -> tuple[_Results, list[torch.Tensor]]:
+        """Return the results that are ready after a frame, and the new state."""
+        *results, state = self._method("stream")(orientation, acceleration, state)
+        return _Results(*results), state
+
+    def stream_many(
+        self, orientation: torch.Tensor, acceleration: torch.Tensor, state: list[torch.Tensor]
+    ) -> tuple[_Results, list[torch.Tensor]]:
+        """Return the results that are ready after several frames, and the new state."""
+        *results, state = self._method("stream_many")(orientation, acceleration, state)
+        return _Results(*results), state
+
+    def drain(self, state: list[torch.Tensor]) -> _Results:
+        """Return the results of the frames that still wait for their future."""
+        return _Results(*self._method("drain")(state))
+
+    def _method(self, name: str) -> Any:
+        return getattr(self._module, name + self._ending)
+
+
 class WindowEngine:
     """Runs the network for each frame over `past` frames before it, itself and `future` frames after it."""
 
-    def __init__(self, module: torch.jit.ScriptModule, past: int, future: int) -> None:
-        """Warm the module up; past and future are numbers of frames, 0 or more."""
-        self._module, self._past, self._future = module, past, future
+    def __init__(
+        self, module: torch.jit.ScriptModule, past: int, future: int, *, place: bool = False
+    ) -> None:
+        """Warm the module up.
+
+        Args:
+            module: a loaded archive.
+            past: number of frames before the present one, 0 or more.
+            future: number of frames after it, 0 or more.
+            place: estimate the place as well, for archives that have it (`archive.has_place`).
+        """
+        self._network, self._past, self._future = _Network(module, place), past, future
         self._tags: deque[Any] = deque()
         self._seen = 0
         self._orientation = torch.zeros(1, 0, 6, 3, 3)
@@ -87,7 +149,9 @@ class WindowEngine:
         length = past + 1 + future
         with torch.inference_mode():
             for _ in range(WARM_UP):
-                module.window(torch.eye(3).expand(1, length, 6, 3, 3), torch.zeros(1, length, 6, 3), past)
+                self._network.window(
+                    torch.eye(3).expand(1, length, 6, 3, 3), torch.zeros(1, length, 6, 3), past
+                )
 
     def push(self, tag: Any, orientation: Input, acceleration: Input) -> list[EngineOutput]:
         """See `Engine.push`."""
@@ -112,10 +176,11 @@ class WindowEngine:
         index = length - 1 - future
         first = max(0, index - self._past)
         with torch.inference_mode():
-            rotations, std = self._module.window(
+            results = self._network.window(
                 self._orientation[:, first:], self._acceleration[:, first:], index - first
             )
-        return EngineOutput(self._tags.popleft(), rotations[0].numpy(), std[0].numpy(), index < self._past)
+        ((rotations, std, place),) = results.of_wearers()
+        return EngineOutput(self._tags.popleft(), rotations[0], std[0], index < self._past, place[0])
 
 
 class _StreamState:
@@ -126,11 +191,13 @@ class _StreamState:
         self.tags: deque[Any] = deque()
         self.done = 0
 
-    def outputs(self, rotations: Array, std: Array, past: int) -> list[EngineOutput]:
-        """Return the wearer's next poses, from rotations (T, 24, 3, 3) and deviations (T, 24)."""
+    def outputs(
+        self, rotations: Array, std: Array, places: Sequence[Array | None], past: int
+    ) -> list[EngineOutput]:
+        """Return the wearer's next T poses, from rotations (T, 24, 3, 3), deviations (T, 24) and T places."""
         outputs = []
-        for pose, deviation in zip(rotations, std, strict=True):
-            outputs.append(EngineOutput(self.tags.popleft(), pose, deviation, self.done < past))
+        for pose, deviation, place in zip(rotations, std, places, strict=True):
+            outputs.append(EngineOutput(self.tags.popleft(), pose, deviation, self.done < past, place))
             self.done += 1
         return outputs
 
@@ -139,7 +206,13 @@ class StreamEngine:
     """Runs the network on each frame once, carrying its state; `future` is 0 for a unidirectional network."""
 
     def __init__(
-        self, module: torch.jit.ScriptModule, past: int, future: int, frames_per_step: int = 1
+        self,
+        module: torch.jit.ScriptModule,
+        past: int,
+        future: int,
+        frames_per_step: int = 1,
+        *,
+        place: bool = False,
     ) -> None:
         """Warm the module up.
 
@@ -148,16 +221,17 @@ class StreamEngine:
             past: number of first poses that are marked as `warming_up`.
             future: number of frames that a pose waits for.
             frames_per_step: number of frames run at once, if poses need not come frame by frame.
+            place: estimate the place as well, for archives that have it (`archive.has_place`).
         """
-        self._module, self._past, self._frames_per_step = module, past, frames_per_step
+        self._network, self._past, self._frames_per_step = _Network(module, place), past, frames_per_step
         self._frames: list[tuple[torch.Tensor, torch.Tensor]] = []
         with torch.inference_mode():
-            self._stream = _StreamState(module.start(1, future))
+            self._stream = _StreamState(self._network.start(1, future))
             at_rest = (torch.eye(3).expand(6, 3, 3), torch.zeros(6, 3))
             for _ in range(WARM_UP + future):
                 self._frames = [at_rest] * frames_per_step
                 self._run()
-            self._stream = _StreamState(module.start(1, future))
+            self._stream = _StreamState(self._network.start(1, future))
 
     def push(self, tag: Any, orientation: Input, acceleration: Input) -> list[EngineOutput]:
         """See `Engine.push`; with several frames per step, their poses come all at once."""
@@ -166,31 +240,32 @@ class StreamEngine:
         if len(self._frames) < self._frames_per_step:
             return []
         with torch.inference_mode():
-            return self._outputs(*self._run())
+            return self._outputs(self._run())
 
     def finish(self) -> list[EngineOutput]:
         """See `Engine.finish`."""
         with torch.inference_mode():
-            outputs = self._outputs(*self._run()) if self._frames else []
-            return outputs + self._outputs(*self._module.drain(self._stream.state))
+            outputs = self._outputs(self._run()) if self._frames else []
+            return outputs + self._outputs(self._network.drain(self._stream.state))
 
-    def _run(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Run the network on the collected frames; return the poses that are ready."""
+    def _run(self) -> _Results:
+        """Run the network on the collected frames; return the results that are ready."""
         frames, self._frames = self._frames, []
         if len(frames) == 1:
             orientation, acceleration = frames[0]
-            rotations, std, self._stream.state = self._module.stream(
+            results, self._stream.state = self._network.stream(
                 orientation[None], acceleration[None], self._stream.state
             )
         else:
             orientations, accelerations = (torch.stack(column)[None] for column in zip(*frames, strict=True))
-            rotations, std, self._stream.state = self._module.stream_many(
+            results, self._stream.state = self._network.stream_many(
                 orientations, accelerations, self._stream.state
             )
-        return rotations, std
+        return results
 
-    def _outputs(self, rotations: torch.Tensor, std: torch.Tensor) -> list[EngineOutput]:
-        return self._stream.outputs(rotations[0].numpy(), std[0].numpy(), self._past)
+    def _outputs(self, results: _Results) -> list[EngineOutput]:
+        (columns,) = results.of_wearers()
+        return self._stream.outputs(*columns, self._past)
 
 
 class MultiWearerEngine:
@@ -208,6 +283,8 @@ class MultiWearerEngine:
         future: int,
         wearers: int,
         isolate_wearers: bool = False,
+        *,
+        place: bool = False,
     ) -> None:
         """Warm the module up.
 
@@ -217,20 +294,21 @@ class MultiWearerEngine:
             future: number of frames that a pose waits for.
             wearers: number of wearers; they are numbered from 0.
             isolate_wearers: run the network once per wearer, for models whose results batching would change.
+            place: estimate the places as well, for archives that have them (`archive.has_place`).
         """
-        self._module, self._past, self._isolate = module, past, isolate_wearers
+        self._network, self._past, self._isolate = _Network(module, place), past, isolate_wearers
         with torch.inference_mode():
             # Whether each tensor of a state has a row per wearer; the others are the same for all.
             self._has_rows = [
                 one.shape != two.shape
-                for one, two in zip(module.start(1, future), module.start(2, future), strict=True)
+                for one, two in zip(*(self._network.start(count, future) for count in (1, 2)), strict=True)
             ]
             at_rest = EngineInput(None, np.tile(np.eye(3), (6, 1, 1)), np.zeros((6, 3)))
             for count in {1, wearers}:
-                self._streams = [_StreamState(module.start(1, future)) for _ in range(count)]
+                self._streams = [_StreamState(self._network.start(1, future)) for _ in range(count)]
                 for _ in range(WARM_UP + future):
                     self.push(dict.fromkeys(range(count), at_rest))
-            self._streams = [_StreamState(module.start(1, future)) for _ in range(wearers)]
+            self._streams = [_StreamState(self._network.start(1, future)) for _ in range(wearers)]
 
     def push(self, inputs: Mapping[int, EngineInput]) -> dict[int, list[EngineOutput]]:
         """Process the next frame of some wearers; return the poses that are ready, by wearer."""
@@ -250,8 +328,8 @@ class MultiWearerEngine:
         """Return the poses of a wearer's frames that still wait for their future."""
         stream = self._streams[wearer]
         with torch.inference_mode():
-            rotations, std = self._module.drain(stream.state)
-        return stream.outputs(rotations[0].numpy(), std[0].numpy(), self._past)
+            (columns,) = self._network.drain(stream.state).of_wearers()
+        return stream.outputs(*columns, self._past)
 
     def _step(self, wearers: list[int], inputs: Mapping[int, EngineInput]) -> dict[int, list[EngineOutput]]:
         """Run one pass for wearers whose states have the same shape; return their poses."""
@@ -264,15 +342,15 @@ class MultiWearerEngine:
                 zip(*(stream.state for stream in streams), strict=True), self._has_rows, strict=True
             )
         ]
-        rotations, std, state = self._module.stream(orientation, acceleration, state)
+        results, state = self._network.stream(orientation, acceleration, state)
         columns = [
             tensor.split(1) if has_rows else [tensor] * len(streams)
             for tensor, has_rows in zip(state, self._has_rows, strict=True)
         ]
-        poses, deviations, outputs = rotations.numpy(), std.numpy(), {}
-        for i, (wearer, stream) in enumerate(zip(wearers, streams, strict=True)):
-            stream.state = [column[i] for column in columns]
-            outputs[wearer] = stream.outputs(poses[i], deviations[i], self._past)
+        outputs = {}
+        for i, (wearer, arrays) in enumerate(zip(wearers, results.of_wearers(), strict=True)):
+            streams[i].state = [column[i] for column in columns]
+            outputs[wearer] = streams[i].outputs(*arrays, self._past)
         return outputs
 
 

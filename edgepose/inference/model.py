@@ -26,6 +26,8 @@ class Model:
         past: frames in a bidirectional model's window before the present one.
         future: frames after the present one that the model waits for; 0 for a unidirectional model.
         precision: precision of the weights at run time.
+        has_place: whether the model estimates contacts and the velocity of the pelvis, see
+            `edgepose.inference.engine.EngineOutput`.
     """
 
     def __init__(self, name: str | Path, *, trust: bool = False, precision: str = "auto") -> None:
@@ -43,6 +45,7 @@ class Model:
         self.metadata: dict[str, Any] = info.metadata
         self.rate_hz = float(info.metadata["rate_hz"])
         self.past, self.future = int(info.metadata["past"]), int(info.metadata["future"])
+        self.has_place = archive.has_place(info.metadata)
         self._module = archive.load(info, trust)
         self.precision = quantise_weights(self._module, info, precision)
 
@@ -53,7 +56,9 @@ class Model:
             frames_per_step: number of frames computed together; more than one is faster, for recordings.
         """
         many = frames_per_step > 1 and self.precision != "int8" and hasattr(self._module, "stream_many")
-        return StreamEngine(self._module, self.past, self.future, frames_per_step if many else 1)
+        return StreamEngine(
+            self._module, self.past, self.future, frames_per_step if many else 1, place=self.has_place
+        )
 
     def poses(self, orientation: ArrayLike, acceleration: ArrayLike) -> NDArray[np.float32]:
         """Estimate the poses of a whole recording (DIP section 3).

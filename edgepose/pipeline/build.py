@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from datetime import datetime
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +19,8 @@ from edgepose.diagnostics.rig_monitor import RigMonitor
 from edgepose.errors import CalibrationError, EdgeposeError, FileFormatError, prefix_errors
 from edgepose.orientation.stage import OrientationStage
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
-from edgepose.pipeline.remote_control import RezeroRequests
+from edgepose.pipeline.place_stage import PlaceStage
+from edgepose.pipeline.remote_control import Request, Requests
 from edgepose.pipeline.rig_comparison import missing_heading_reset, other_devices
 from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
 from edgepose.placements import PLACEMENTS
@@ -46,7 +48,7 @@ class OpenWearer:
         stack: ExitStack,
         config: WearerConfig,
         calibration: Calibration,
-        by_key: Callable[[], list[float]],
+        by_key: Callable[[], list[Request]],
         blocking: bool,
         notify: Notify,
     ) -> None:
@@ -56,7 +58,7 @@ class OpenWearer:
             stack: closes the source and the control socket.
             config: the wearer's configuration.
             calibration: the wearer's calibration, see `load_wearer_calibration`.
-            by_key: returns the re-zero requests from the keyboard.
+            by_key: returns the requests from the keyboard.
             blocking: see `edgepose.sources.open_source`.
             notify: called with each line for the user.
 
@@ -67,7 +69,7 @@ class OpenWearer:
         self._config, self._calibration = config, calibration
         with prefix_errors(config.name):
             self.source = stack.enter_context(open_source(**config.source.arguments(), blocking=blocking))
-            self._requests = RezeroRequests(stack, config.control, by_key)
+            self._requests = Requests(stack, config.control, by_key)
             self._orient = OrientationStage(config.filter, magnetometer=calibration.north)
         self._sinks: list[Sink] = []
 
@@ -92,7 +94,10 @@ class OpenWearer:
                 "edgepose": edgepose.__version__,
             }
             self._sinks = open_outputs(
-                stack, self._config.outputs, rate, stopped, wearer=self._config.name, about=about
+                *(stack, self._config.outputs, rate, stopped),
+                translation=not self._config.no_place,
+                wearer=self._config.name,
+                about=about,
             )
 
     def pipeline(
@@ -110,9 +115,12 @@ class OpenWearer:
         headings = HeadingRezero(
             self._calibration,
             hold_first=source.live and _restarts_with_filter(self._calibration),
-            requests=self._requests.poll,
+            requests=self._rezero_requests,
             notify=self.notify,
         )
+        place = None
+        if not self._config.no_place:
+            place = PlaceStage(self._config.outputs.body, partial(self._requests.poll, "origin"), self.notify)
         return WearerPipeline(
             FrameSynchronizer(rate, grid=several and source.file is None),
             headings,
@@ -124,7 +132,13 @@ class OpenWearer:
             RigMonitor(),
             self.notify,
             future / rate if source.live else None,
+            place,
         )
+
+    def _rezero_requests(self) -> list[float]:
+        if self._config.no_place and self._requests.poll("origin"):
+            self.notify("reset of the place ignored: this run has --no-place")
+        return self._requests.poll("rezero")
 
     def _differences(self) -> list[str]:
         devices = self.source.devices
@@ -157,6 +171,8 @@ class OpenWearer:
             self.notify(
                 "held     " + ", ".join(f"{name} in {count} frames" for count, name in worst if count)
             )
+        if summary.way_m is not None:
+            self.notify(f"way      {summary.way_m:.1f} m walked")
         if summary.latencies_s and self._config.source.live:
             self.notify(_latency(summary, rate, future))
         lines = self._orient.summary_lines()

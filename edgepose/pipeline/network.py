@@ -115,7 +115,8 @@ class Network:
 
         Args:
             wearers: one wearer, or several who share the network.
-            notify: called with one message if the precision is slow here or had to be changed.
+            notify: called with one message if the precision is slow here or had to be changed, and one if
+                the model cannot tell where wearers are.
 
         Raises:
             ModelError: the archive is not trusted, or cannot run here.
@@ -125,21 +126,29 @@ class Network:
 
         module = archive.load(self.info, self.config.trust)
         precision = quantise_weights(module, self.info, self.config.precision, notify)
-        return self._engine(module, wearers, precision), precision
+        place = not all(wearer.no_place for wearer in wearers)
+        if place and not archive.has_place(self.info.metadata):
+            notify(
+                f"{self.config.model} does not estimate contacts: the lowest foot counts as standing still, "
+                "so the path is less accurate"
+            )
+            place = False
+        return self._engine(module, wearers, precision, place), precision
 
     def _engine(
-        self, module: torch.jit.ScriptModule, wearers: Sequence[WearerConfig], precision: str
+        self, module: torch.jit.ScriptModule, wearers: Sequence[WearerConfig], precision: str, place: bool
     ) -> Engine | MultiWearerEngine:
         from edgepose.inference.engine import MultiWearerEngine, StreamEngine, WindowEngine
 
         # int8 activations share one scale per batch, so batching would change results.
         batched = precision != "int8"
         if len(wearers) > 1:
-            return MultiWearerEngine(module, self.past, self.future, len(wearers), not batched)
+            return MultiWearerEngine(module, self.past, self.future, len(wearers), not batched, place=place)
         if self.windowed:
-            return WindowEngine(module, self.past, self.future)
+            return WindowEngine(module, self.past, self.future, place=place)
         # No one waits for single poses of a recording, so several frames go into a step.
         source = wearers[0].source
         recorded = not source.live and source.file is not None and source.file.is_file()
         together = recorded and batched and hasattr(module, "stream_many")
-        return StreamEngine(module, self.past, self.future, FRAMES_PER_STEP if together else 1)
+        frames_per_step = FRAMES_PER_STEP if together else 1
+        return StreamEngine(module, self.past, self.future, frames_per_step, place=place)

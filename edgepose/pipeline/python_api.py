@@ -12,9 +12,11 @@ from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.orientation.stage import OrientationStage
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
+from edgepose.pipeline.place_stage import PlaceStage
 from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
 from edgepose.pose import PoseFrame
 from edgepose.sinks.base import Sink
+from edgepose.skeleton import default_body
 from edgepose.sources import Batch
 
 if TYPE_CHECKING:
@@ -46,7 +48,14 @@ class Pipeline:
     """
 
     def __init__(
-        self, calibration: Calibration, model: str | Path | Model = "birnn", *, trust: bool = False
+        self,
+        calibration: Calibration,
+        model: str | Path | Model = "birnn",
+        *,
+        trust: bool = False,
+        height: float = 1.75,
+        leg_length: float | None = None,
+        place: bool = True,
     ) -> None:
         """Load the model.
 
@@ -54,13 +63,19 @@ class Pipeline:
             calibration: the wearer's calibration; it names the orientation filter to use.
             model: name of a bundled model, path of an archive, or a loaded model.
             trust: load an archive although its checksum is unknown.
+            height: the wearer's stature, metres.
+            leg_length: length of the wearer's thigh and shank, hip joint to ankle, metres; None for the
+                average at this height.
+            place: follow the wearer through the room; otherwise poses have no translation.
 
         Raises:
             ModelError: the archive cannot be loaded.
+            EdgeposeError: the height or leg length is impossible.
         """
         from edgepose.inference.model import Model
 
-        self._calibration = calibration
+        self._calibration, self._follow = calibration, place
+        self._body = default_body(height, leg_length_m=leg_length)
         self._model = model if isinstance(model, Model) else Model(model, trust=trust)
         self.summary = RunSummary()
 
@@ -78,7 +93,11 @@ class Pipeline:
         calibration = self._calibration
         orient = OrientationStage(calibration.filter, magnetometer=calibration.north)
         pipeline = WearerPipeline(
-            FrameSynchronizer(self._model.rate_hz), HeadingRezero(calibration), [buffer], orient
+            FrameSynchronizer(self._model.rate_hz),
+            HeadingRezero(calibration),
+            [buffer],
+            orient,
+            place=PlaceStage(self._body) if self._follow else None,
         )
         self.summary = pipeline.summary
         failure: EdgeposeError | None = None

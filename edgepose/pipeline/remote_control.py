@@ -1,20 +1,39 @@
-"""Re-zero requests during a run: by key, or over UDP by the text `rezero` or OSC message /edgepose/rezero."""
+"""Requests during a run, by key or over UDP: to re-zero the headings, or to reset the place to the origin.
+
+Over UDP they are the texts `rezero` and `origin`, or the OSC messages /edgepose/rezero and /edgepose/origin.
+"""
 
 from __future__ import annotations
 
 import math
 import socket
 import struct
+from collections import defaultdict
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
+from typing import Literal, NamedTuple
 
 from edgepose.errors import DeviceError
 from edgepose.utils.sockets import resolve
 
+Action = Literal["rezero", "origin"]
+
 MAX_DELAY_S = 60.0
 # OSC terminates a string with a zero byte and pads it to a multiple of four.
-_ADDRESS = b"/edgepose/rezero" + bytes(4)
+_ADDRESSES: dict[bytes, Action] = {
+    b"/edgepose/rezero" + bytes(4): "rezero",
+    b"/edgepose/origin" + bytes(4): "origin",
+}
+_ADDRESS_LENGTH = 20
+_TEXTS: dict[bytes, Action] = {b"rezero": "rezero", b"origin": "origin"}
+
+
+class Request(NamedTuple):
+    """A request, and the time until it is to be met, seconds."""
+
+    action: Action
+    delay_s: float = 0.0
 
 
 class Control:
@@ -46,21 +65,21 @@ class Control:
                 "give an address of this machine and a free port"
             ) from error
 
-    def requests(self) -> list[float]:
-        """Return the delay of each re-zero request received since the last call, seconds."""
-        delays = []
+    def requests(self) -> list[Request]:
+        """Return the requests received since the last call."""
+        requests = []
         # Limited, so that a flood of datagrams does not stop the frames.
         for _ in range(16):
             try:
                 datagram = self._socket.recv(1024)
             except OSError:  # nothing to receive
                 break
-            delay_s = parse(datagram)
-            if delay_s is None:
+            request = parse(datagram)
+            if request is None:
                 self.ignored += 1
             else:
-                delays.append(delay_s)
-        return delays
+                requests.append(request)
+        return requests
 
     def close(self) -> None:
         """Close the socket."""
@@ -75,35 +94,40 @@ class Control:
         self.close()
 
 
-def parse(datagram: bytes) -> float | None:
-    """Return the delay until the requested hold, seconds; None if the datagram is not a request.
+def parse(datagram: bytes) -> Request | None:
+    """Return the request in a datagram; None if there is none.
 
     An OSC 1.0 message may have one argument, the delay in seconds, as int32 or float32.
     """
-    if datagram.strip() == b"rezero":
-        return 0.0
-    address, rest = datagram[: len(_ADDRESS)], datagram[len(_ADDRESS) :]
-    if address != _ADDRESS:
+    action = _TEXTS.get(datagram.strip())
+    if action is not None:
+        return Request(action)
+    address, rest = datagram[:_ADDRESS_LENGTH], datagram[_ADDRESS_LENGTH:]
+    action = _ADDRESSES.get(address)
+    if action is None:
         return None
     # Old senders omit the type tags.
     if rest in (b"", b",\0\0\0"):
-        return 0.0
+        return Request(action)
     form = {b",i\0\0": ">i", b",f\0\0": ">f"}.get(rest[:4])
     if form is None or len(rest) != 8:
         return None
     (delay_s,) = struct.unpack(form, rest[4:])
-    return float(delay_s) if math.isfinite(delay_s) and 0.0 <= delay_s <= MAX_DELAY_S else None
+    in_range = math.isfinite(delay_s) and 0.0 <= delay_s <= MAX_DELAY_S
+    return Request(action, float(delay_s)) if in_range else None
 
 
-KEY_DELAY_S = 3.0
-"""Time from a key press to the hold, seconds: the wearer has to leave the keyboard first."""
+_REZERO = Request("rezero", 3.0)
+"""Re-zeroing by key: the wearer has to leave the keyboard first."""
+
+KEYS = {"r": _REZERO, "R": _REZERO, "\r": _REZERO, "\n": _REZERO, **dict.fromkeys("oO", Request("origin"))}
 
 
-class RezeroRequests:
-    """Requests to re-zero the headings, from the keyboard or over UDP."""
+class Requests:
+    """A wearer's requests, from the keyboard or over UDP."""
 
     def __init__(
-        self, stack: ExitStack, control: tuple[str, int] | None, by_key: Callable[[], list[float]]
+        self, stack: ExitStack, control: tuple[str, int] | None, by_key: Callable[[], list[Request]]
     ) -> None:
         """Listen until the stack is closed.
 
@@ -117,10 +141,13 @@ class RezeroRequests:
         """
         self._control = None if control is None else stack.enter_context(Control(*control))
         self._by_key = by_key
+        self._pending: defaultdict[Action, list[float]] = defaultdict(list)
 
-    def poll(self) -> list[float]:
-        """Return the delay of each new request, seconds."""
-        return self._by_key() + ([] if self._control is None else self._control.requests())
+    def poll(self, action: Action) -> list[float]:
+        """Return the delay of each new request for an action, seconds; poll for all actions in turn."""
+        for request in self._by_key() + ([] if self._control is None else self._control.requests()):
+            self._pending[request.action].append(request.delay_s)
+        return self._pending.pop(action, [])
 
     def summary_lines(self) -> list[str]:
         """Return the lines for the end of the run."""
@@ -129,7 +156,7 @@ class RezeroRequests:
         return [f"control  {self._control.ignored} datagrams without a known request"]
 
 
-def key_requests(count: int, pressed: Callable[[], str]) -> list[Callable[[], list[float]]]:
+def key_requests(count: int, pressed: Callable[[], str]) -> list[Callable[[], list[Request]]]:
     """Return one callable per wearer, which returns the requests since its last call.
 
     Every key press goes to all wearers.
@@ -138,12 +165,12 @@ def key_requests(count: int, pressed: Callable[[], str]) -> list[Callable[[], li
         count: number of wearers.
         pressed: returns the keys pressed since its last call.
     """
-    pending: list[list[float]] = [[] for _ in range(count)]
+    pending: list[list[Request]] = [[] for _ in range(count)]
 
-    def by_key(wearer: int) -> list[float]:
-        delays = [KEY_DELAY_S for key in pressed() if key in "rR\r\n"]
+    def by_key(wearer: int) -> list[Request]:
+        new = [KEYS[key] for key in pressed() if key in KEYS]
         for queue in pending:
-            queue += delays
+            queue += new
         requests, pending[wearer] = pending[wearer], []
         return requests
 

@@ -20,6 +20,7 @@ from edgepose.inference.engine import EngineInput, EngineOutput, check_finite
 from edgepose.pipeline.dropout import extrapolate_dropouts
 from edgepose.pipeline.dropout_monitor import DropoutMonitor
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
+from edgepose.pipeline.place_stage import PlaceStage
 from edgepose.pipeline.pose_writer import PoseWriter
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseFrame
@@ -43,6 +44,7 @@ class RunSummary:
         seconds: wall time from the first samples to the end.
         latency_s: time from the arrival of the newest packet here until the newest pose was sent, seconds.
         latencies_s: latencies of the newest LATENCIES poses, in no order, seconds.
+        way_m: way walked, metres, see `PlaceStage`; None if the place is not followed.
         error: the error that ended the run early, if any.
     """
 
@@ -54,6 +56,7 @@ class RunSummary:
     seconds: float = 0.0
     latency_s: float = 0.0
     latencies_s: array[float] = field(default_factory=lambda: array("f"), repr=False)
+    way_m: float | None = None
     error: EdgeposeError | None = None
 
     def sent(self, latency_s: float) -> None:
@@ -67,7 +70,7 @@ class RunSummary:
 
 
 def pose_frame(output: EngineOutput) -> PoseFrame:
-    """Return the pose of a frame from the network's output.
+    """Return the pose of a frame from the network's output, without translation and contacts.
 
     Raises:
         ModelError: the network has computed NaN or infinity.
@@ -99,6 +102,7 @@ class WearerPipeline:
         rig: RigMonitor | None = None,
         warn: Callable[[str], None] = lambda text: None,
         look_ahead_s: float | None = None,
+        place: PlaceStage | None = None,
     ) -> None:
         """Join the stages.
 
@@ -114,12 +118,13 @@ class WearerPipeline:
             warn: called with one message per finding of `misfits` and `rig`, and about skipped poses.
             look_ahead_s: time by which poses come later than their frames, seconds, if samples come at their
                 own pace; see `PoseWriter`.
+            place: follows the wearer through the room; None leaves the poses without translation.
         """
         self.summary, self.clock = RunSummary(), clock
         self.arrived = self._started = time.perf_counter()
         self._headings, self._sinks, self._orient, self._notify = headings, sinks, orient, notify
         self._on_pose, self._misfits, self._rig, self._warn = on_pose, misfits, rig, warn
-        self._writer = PoseWriter(sinks, look_ahead_s, warn)
+        self._writer, self._place = PoseWriter(sinks, look_ahead_s, warn), place
         self._dropouts = DropoutMonitor()
         self._source_s = 0.0  # time on the source's clock at 0 of the clock of `arrived`
         self._bones: NDArray[np.float64] | None = None  # those of the previous frame
@@ -151,7 +156,11 @@ class WearerPipeline:
         for output in outputs:
             frame: ImuFrame = output.frame
             age_s = time.perf_counter() + self._source_s - frame.time_s
-            self._writer.write(pose_frame(output), age_s)
+            pose = pose_frame(output)
+            if self._place is not None:
+                pose = self._place.add_to(pose, output)
+                summary.way_m = self._place.way_m
+            self._writer.write(pose, age_s)
             summary.warming_up += output.warming_up
             if frame.held.any():
                 summary.held += 1

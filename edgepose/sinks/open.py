@@ -10,7 +10,7 @@ from typing import Any
 from edgepose.config import OutputConfig
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.sinks.registry import SINKS, sink_factory
-from edgepose.skeleton import Body, default_body
+from edgepose.skeleton import Body
 from edgepose.utils.output_targets import has_reader
 
 
@@ -32,7 +32,7 @@ def open_outputs(
         outputs: the outputs to open.
         rate: poses per second.
         stopped: whether the run is to end, see `SinkContext`.
-        body: the wearer's body; None for the default body of the configured height.
+        body: the wearer's body; None for that of the configuration.
         translation: every pose has a translation.
         wearer: the wearer's name, for messages.
         about: origin of the poses, see `PoseSequence`.
@@ -45,7 +45,7 @@ def open_outputs(
     """
     outputs.check()
     context = SinkContext(
-        body=body or default_body(outputs.height),
+        body=body or outputs.body,
         height=outputs.height,
         rate=rate,
         rotations=outputs.rotations,

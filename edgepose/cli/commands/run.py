@@ -33,7 +33,8 @@ def run(wearers: list[WearerConfig], settings: NetworkConfig) -> None:
     """Turn packets or a recording into poses until the source ends or Ctrl-C.
 
     During a live run, press r or Enter on the terminal (or send a message to --control) and stand in the
-    calibration pose once more to re-zero the headings.
+    calibration pose once more to re-zero the headings. Press o to put the wearer back at the origin of the
+    room, on the ground.
 
     \b
     Examples:
@@ -63,18 +64,20 @@ def run(wearers: list[WearerConfig], settings: NetworkConfig) -> None:
         stop = stack.enter_context(StopSignal())
         for wearer in opened:
             wearer.open_outputs(stack, network.rate_hz, network.config.model, lambda: stop.asked)
-        say(_headline(network, precision, len(wearers), keys.listening))
+        say(_headline(network, precision, wearers, keys.listening))
         pipelines = run_wearers(opened, engine, network, live, lambda: stop.asked, _progress(network))
     end_status()
     report_wearers(wearers, opened, pipelines, network)
 
 
-def _headline(network: Network, precision: str, wearer_count: int, has_keys: bool) -> str:
-    wearers = f"{wearer_count} wearers with " if wearer_count > 1 else ""
+def _headline(network: Network, precision: str, wearers: list[WearerConfig], has_keys: bool) -> str:
+    count = f"{len(wearers)} wearers with " if len(wearers) > 1 else ""
     mode = "window" if network.windowed else "stream"
     hint = ", r re-zeroes headings" if has_keys else ""
+    if has_keys and not all(wearer.no_place for wearer in wearers):
+        hint += ", o resets the place"
     return (
-        f"running {wearers}{network.config.model} ({network.kind}, {mode}) in {precision}; "
+        f"running {count}{network.config.model} ({network.kind}, {mode}) in {precision}; "
         f"Ctrl-C ends the run{hint}"
     )
 

@@ -8,10 +8,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from edgepose.skeleton import MAX_HEIGHT, MIN_HEIGHT
+from edgepose.skeleton import MAX_HEIGHT, MIN_HEIGHT, with_leg_length
 
 if TYPE_CHECKING:
     from edgepose.skeleton import Body
+
+leg_length_option = click.option(
+    "--leg-length",
+    type=float,
+    metavar="METRES",
+    help="Length of the wearer's thigh and shank, metres: standing, from the bony point at the side of the "
+    "hip, where the leg turns, straight down to the ankle bone.  [default: the average for --height]",
+)
+"""The flag --leg-length."""
 
 
 class BodyFlags(NamedTuple):
@@ -19,6 +28,7 @@ class BodyFlags(NamedTuple):
 
     body: str
     height: float | None
+    leg_length: float | None
     sex: str | None
     weight: float | None
     words: tuple[str, ...]
@@ -39,6 +49,8 @@ class BodyFlags(NamedTuple):
 
         if self.body in ("smpl", "hinges"):
             body = shaped_body(self.height or 1.75, self.sex or "neutral", self.weight, self.words)
+            if self.leg_length is not None:
+                body = with_leg_length(body, self.leg_length)
         else:
             from edgepose.formats.smpl_model import read_smpl
 
@@ -66,6 +78,7 @@ def body_options(command: Callable[..., Any]) -> Callable[..., Any]:
             type=click.FloatRange(MIN_HEIGHT, MAX_HEIGHT),
             help="The wearer's height, metres.  [default: 1.75]",
         ),
+        leg_length_option,
         click.option(
             "--sex",
             type=click.Choice(["neutral", "male", "female"]),
@@ -94,9 +107,11 @@ def body_options(command: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(command)
     def with_body(**values: Any) -> Any:
         body = BodyFlags(*(values.pop(name) for name in BodyFlags._fields))
-        if body.body not in ("smpl", "hinges") and (body.height or body.sex or body.weight or body.words):
+        shape = body.height, body.leg_length, body.sex, body.weight, body.words
+        if body.body not in ("smpl", "hinges") and any(value not in (None, ()) for value in shape):
             raise click.UsageError(
-                "a body from a file has its own shape: leave out --height, --sex, --weight and --words"
+                "a body from a file has its own shape: leave out --height, --leg-length, --sex, --weight and "
+                "--words"
             )
         return command(body=body, **values)
 

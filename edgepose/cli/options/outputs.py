@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from edgepose.cli.options.body import leg_length_option
 from edgepose.cli.options.gathered import Command, gathered
 from edgepose.config import OutputConfig
 from edgepose.errors import EdgeposeError
@@ -86,7 +87,8 @@ def output_options(command: Command) -> Command:
         type=float,
         default=1.75,
         show_default=True,
-        help="The wearer's height, metres, for the bones of --bvh, --osc and --view.",
+        help="The wearer's height, metres: for the way that their steps cover, and for the bones of --bvh, "
+        "--osc and --view.",
     )
     other_sinks_option = click.option(
         "--sink",
@@ -98,7 +100,7 @@ def output_options(command: Command) -> Command:
     )
     flags = [
         *_flags(SINKS, {"csv": [_rotations_option, std_option]}),
-        *(height_option, overwrite_option, other_sinks_option),
+        *(height_option, leg_length_option, overwrite_option, other_sinks_option),
     ]
     return gathered(command, flags, "outputs", OutputConfig)
 

@@ -36,10 +36,16 @@ def _required_without_rig(ctx: click.Context, param: click.Parameter, value: Pat
 )
 @output_options
 @click.option(
+    "--no-place",
+    is_flag=True,
+    help="Do not follow the wearer through the room: the pelvis stays above one point of the ground.",
+)
+@click.option(
     "--control",
     callback=address,
     metavar="HOST:PORT",
-    help="Listen here for the datagram `rezero` or the OSC message /edgepose/rezero; live sources only.",
+    help="Listen here for the datagrams `rezero` and `origin` or the OSC messages /edgepose/rezero and "
+    "/edgepose/origin; live sources only.",
 )
 def _flags(**values: Any) -> WearerConfig:
     with usage_errors():
