@@ -171,18 +171,23 @@ def test_a_wish_before_the_first_headings_is_answered():
 
 # --- wishes by datagram -------------------------------------------------------------------------------------
 
-OSC = b"/edgepose/rezero\0\0\0\0"
+OSC, ORIGIN = b"/edgepose/rezero\0\0\0\0", b"/edgepose/origin\0\0\0\0"
 
 
 @pytest.mark.parametrize(
-    ("datagram", "delay_s"),
+    ("datagram", "request_"),
     [
-        (b"rezero", 0.0),
-        (b"rezero\n", 0.0),
-        (OSC, 0.0),
-        (OSC + b",\0\0\0", 0.0),
-        (OSC + b",i\0\0" + struct.pack(">i", 4), 4.0),
-        (OSC + b",f\0\0" + struct.pack(">f", 2.5), 2.5),
+        (b"rezero", ("rezero", 0.0)),
+        (b"rezero\n", ("rezero", 0.0)),
+        (OSC, ("rezero", 0.0)),
+        (OSC + b",\0\0\0", ("rezero", 0.0)),
+        (OSC + b",i\0\0" + struct.pack(">i", 4), ("rezero", 4.0)),
+        (OSC + b",f\0\0" + struct.pack(">f", 2.5), ("rezero", 2.5)),
+        (b"origin", ("origin", 0.0)),
+        (ORIGIN, ("origin", 0.0)),
+        (ORIGIN + b",f\0\0" + struct.pack(">f", 2.5), ("origin", 2.5)),
+        (b"/edgepose/origin", None),
+        (b"originrezero", None),
         (b"", None),
         (b"rezero please", None),
         (b"REZERO", None),
@@ -196,26 +201,26 @@ OSC = b"/edgepose/rezero\0\0\0\0"
         (OSC + b",ff\0" + bytes(8), None),
     ],
 )
-def test_what_a_datagram_asks_for(datagram, delay_s):
-    assert parse(datagram) == delay_s
+def test_what_a_datagram_asks_for(datagram, request_):
+    assert parse(datagram) == request_
 
 
 @given(st.one_of(st.binary(max_size=60), st.binary(max_size=16).map(lambda tail: OSC + tail)))
 def test_any_datagram_is_a_wish_within_bounds_or_nothing(datagram):
-    delay_s = parse(datagram)
-    assert delay_s is None or 0.0 <= delay_s <= 60.0
+    request = parse(datagram)
+    assert request is None or (request.action == "rezero" and 0.0 <= request.delay_s <= 60.0)
 
 
 def test_a_socket_hears_wishes_and_counts_the_rest():
     with Control("127.0.0.1", 0) as control, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.connect(control._socket.getsockname())
         assert control.requests() == []
-        for datagram in (b"rezero", b"hello", os.urandom(2000), OSC + b",f\0\0" + struct.pack(">f", 1.5)):
+        for datagram in (b"rezero", b"origin", b"hello", os.urandom(2000), OSC + b",f\0\0" + struct.pack(">f", 1.5)):
             sender.send(datagram)
         heard, until = [], time.monotonic() + 10
-        while len(heard) < 2 and time.monotonic() < until:
+        while len(heard) < 3 and time.monotonic() < until:
             heard += control.requests()
-        assert heard == [0.0, 1.5]
+        assert heard == [("rezero", 0.0), ("origin", 0.0), ("rezero", 1.5)]
         assert control.ignored == 2
         port = control._socket.getsockname()[1]
         with pytest.raises(EdgeposeError, match=f"cannot listen on 127.0.0.1 port {port}: .* a free port"):
