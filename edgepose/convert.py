@@ -307,7 +307,7 @@ def _write_poses(path: Path, poses: PoseSequence, options: Options) -> None:
     if path.suffix == ".bvh":
         sink = BvhSink(path, poses.rate, default_body(options.height_m), options.names)
     else:
-        sink = CsvSink(path, translation=poses.translation is not None)
+        sink = CsvSink(path, translation=poses.translation is not None, contacts=poses.contacts is not None)
     with sink:
         for pose in poses.pose_frames():
             sink.write(pose)

@@ -101,6 +101,7 @@ class PoseSequence(NamedTuple):
         held: T sets, see `PoseFrame`.
         warming_up: T flags, see `PoseFrame`.
         about: what the file says about its origin: `model`, `calibration`, `source`, `date`, `edgepose`.
+        contacts: (T, 7) probabilities that the joints `CONTACTS` rest on something, if the file has them.
     """
 
     frames: NDArray[np.int64]
@@ -110,6 +111,7 @@ class PoseSequence(NamedTuple):
     held: list[frozenset[str]]
     warming_up: list[bool]
     about: Mapping[str, str] = MappingProxyType({})
+    contacts: NDArray[np.float32] | None = None
 
     @property
     def status(self) -> list[str]:
@@ -141,8 +143,9 @@ class PoseSequence(NamedTuple):
         unknown_std = np.full(len(JOINTS), np.nan, np.float32)
         for i, (frame, time_s) in enumerate(zip(self.frames.tolist(), self.time_s.tolist(), strict=True)):
             translation = None if self.translation is None else self.translation[i]
+            contacts = None if self.contacts is None else self.contacts[i]
             state = self.held[i], self.warming_up[i]
-            yield PoseFrame(frame, time_s, self.rotations[i], unknown_std, translation, *state)
+            yield PoseFrame(frame, time_s, self.rotations[i], unknown_std, translation, *state, contacts)
 
 
 def tidy_rate(frame_time: float) -> float:

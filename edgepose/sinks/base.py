@@ -74,6 +74,7 @@ class SinkContext(NamedTuple):
             `edgepose.formats.poses.csv_columns`.
         std: write standard deviations, if the format has room for them.
         translation: poses have a translation.
+        contacts: poses have contacts.
         overwrite: replace existing files.
         about: origin of the poses, see `PoseSequence`.
         stopped: whether the run is to end; a reader that has stopped reading is then not waited for.
@@ -86,6 +87,7 @@ class SinkContext(NamedTuple):
     rotations: str = "axis-angle"
     std: bool = False
     translation: bool = False
+    contacts: bool = False
     overwrite: bool = False
     about: Mapping[str, str] = MappingProxyType({})
     stopped: Callable[[], bool] = lambda: False

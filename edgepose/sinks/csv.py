@@ -26,6 +26,7 @@ class CsvSink(PoseFileSink):
         rotations: str = "axis-angle",
         std: bool = False,
         translation: bool = False,
+        contacts: bool = False,
         *,
         overwrite: bool = True,
         follow: bool = True,
@@ -38,6 +39,7 @@ class CsvSink(PoseFileSink):
             rotations: a key of `ROTATION_FORMATS`; angles are in radians.
             std: add the network's standard deviation of each joint, radians.
             translation: add the position of the pelvis, metres, which every pose must then have.
+            contacts: add the probabilities of contact, which every pose must then have.
             overwrite: replace an existing file.
             follow: write to the target of a symbolic link; if false, replace the link.
             stopped: whether the run is to end; a reader that has stopped reading is then not waited for.
@@ -49,8 +51,9 @@ class CsvSink(PoseFileSink):
             raise EdgeposeError(
                 f"unknown rotations {rotations!r}: choose one of {', '.join(ROTATION_FORMATS)}"
             )
-        self._rotations, self._std, self._translation = rotations, std, translation
-        columns = pose_columns(rotations, std, translation)
+        self._rotations, self._std = rotations, std
+        self._translation, self._contacts = translation, contacts
+        columns = pose_columns(rotations, std, translation, contacts)
         self._format = ",".join(["%d,%.6f,%s"] + ["%.6f"] * (len(columns) - 3)) + "\n"
         self._rows: list[str] = []
         output = GrowingFile(path, "poses", overwrite=overwrite, follow=follow, stopped=stopped)
@@ -64,6 +67,10 @@ class CsvSink(PoseFileSink):
             if pose.translation is None:
                 raise ValueError(f"pose {pose.index} has no translation")
             values += pose.translation.tolist()
+        if self._contacts:
+            if pose.contacts is None:
+                raise ValueError(f"pose {pose.index} has no contacts")
+            values += pose.contacts.tolist()
         status = format_status(pose.held, pose.warming_up)
         self._rows.append(self._format % (pose.index, pose.time_s, status, *values))
         return not self._output.regular
@@ -77,7 +84,7 @@ class CsvSink(PoseFileSink):
 def open_sink(target: str, context: SinkContext) -> Sink:
     """Open a `CsvSink`."""
     return CsvSink(
-        *(target, context.rotations, context.std, context.translation),
+        *(target, context.rotations, context.std, context.translation, context.contacts),
         overwrite=context.overwrite,
         stopped=context.stopped,
     )

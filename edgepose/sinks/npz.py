@@ -30,6 +30,7 @@ class NpzSink(Sink):
         path: str | Path,
         rate: float = 60.0,
         translation: bool = False,
+        contacts: bool = False,
         joints: int = 24,
         about: Mapping[str, str] = MappingProxyType({}),
         *,
@@ -41,6 +42,7 @@ class NpzSink(Sink):
             path: file to write.
             rate: frames per second.
             translation: whether the poses have a translation.
+            contacts: whether the poses have contacts.
             joints: number of joints to write, a key of `JOINT_COUNTS`.
             about: origin of the poses, see `PoseSequence`.
             overwrite: replace an existing NPZ file; the CSV file of another run is never replaced.
@@ -60,7 +62,9 @@ class NpzSink(Sink):
             )
         self._settings = rate, joints, about
         self._closed, self._count = False, 0
-        self._csv = CsvSink(self._part, translation=translation, overwrite=False, follow=False)
+        self._csv = CsvSink(
+            self._part, translation=translation, contacts=contacts, overwrite=False, follow=False
+        )
         self._csv.start()
 
     def write(self, pose: PoseFrame) -> None:
@@ -117,7 +121,8 @@ class NpzSink(Sink):
 
 def open_sink(target: FileTarget, context: SinkContext) -> Sink:
     """Open an `NpzSink`; a device or pipe gets the file once it is complete."""
-    settings = context.rate, context.translation, int(target.option), context.about
+    place = context.translation, context.contacts
+    settings = context.rate, *place, int(target.option), context.about
     if target.path != "-" and is_stream(target.path):
         return SpooledSink(target.path, lambda part: NpzSink(part, *settings), context.stopped)
     return NpzSink(target.path, *settings, overwrite=context.overwrite)

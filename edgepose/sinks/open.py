@@ -22,6 +22,7 @@ def open_outputs(
     *,
     body: Body | None = None,
     translation: bool = False,
+    contacts: bool = False,
     wearer: str = "",
     about: Mapping[str, str] = MappingProxyType({}),
 ) -> list[Sink]:
@@ -34,6 +35,7 @@ def open_outputs(
         stopped: whether the run is to end, see `SinkContext`.
         body: the wearer's body; None for that of the configuration.
         translation: every pose has a translation.
+        contacts: every pose has contacts.
         wearer: the wearer's name, for messages.
         about: origin of the poses, see `PoseSequence`.
 
@@ -51,6 +53,7 @@ def open_outputs(
         rotations=outputs.rotations,
         std=outputs.std,
         translation=translation,
+        contacts=contacts,
         overwrite=outputs.overwrite,
         about=about,
         stopped=stopped,

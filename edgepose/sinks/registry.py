@@ -92,7 +92,7 @@ SINKS = {
     "udp": Output(
         "edgepose.sinks.udp:open_sink",
         "Send each pose as a datagram.",
-        "HOST:PORT[,format=json|binary][,broadcast|multicast]",
+        "HOST:PORT[,format=json|binary|binary-v1][,broadcast|multicast]",
         parse_destination,
         Destination,
     ),

@@ -5,10 +5,14 @@ from __future__ import annotations
 import socket
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from edgepose.errors import EdgeposeError
 from edgepose.pose import PoseFrame
 from edgepose.rotations import matrix_to_rotvec
 from edgepose.sinks.base import Sink, SinkContext
+from edgepose.skeleton import Body, default_body, standing_pelvis_position
 from edgepose.utils.sockets import resolve
 
 CLIENTS = 16
@@ -20,10 +24,17 @@ SEND_BUFFER = 16_384
 _TEXT = ",".join(["%g"] * 72) + "#%g,%g,%g$"
 
 
-def encode(pose: PoseFrame) -> bytes:
-    """Encode a pose: 72 axis-angle numbers, SMPL order, radians, "#", pelvis position, metres (or 0), "$"."""
-    translation = (0.0, 0.0, 0.0) if pose.translation is None else tuple(pose.translation)
-    return (_TEXT % (*matrix_to_rotvec(pose.rotations).ravel().tolist(), *translation)).encode()
+def encode(pose: PoseFrame, standing: NDArray[np.float64]) -> bytes:
+    """Encode a pose: 72 axis-angle numbers, SMPL order, radians, "#", translation, metres, "$".
+
+    As TransPose's, the translation is 0 where a body that stands straight begins, and where it is unknown.
+
+    Args:
+        pose: the pose.
+        standing: (3,) position of the pelvis of that body, metres.
+    """
+    moved = np.zeros(3) if pose.translation is None else pose.translation - standing
+    return (_TEXT % (*matrix_to_rotvec(pose.rotations).ravel().tolist(), *moved.tolist())).encode()
 
 
 @dataclass
@@ -43,13 +54,19 @@ class TcpSink(Sink):
 
     live = True
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(self, host: str, port: int, body: Body | None = None) -> None:
         """Listen on an address of this machine.
+
+        Args:
+            host: name or address.
+            port: TCP port.
+            body: the wearer's body; None for the default body.
 
         Raises:
             EdgeposeError: the address is not this machine's, or another program listens on it.
         """
         self.missed = 0
+        self._standing = standing_pelvis_position((body or default_body()).offsets)
         self._viewers: list[_Viewer] = []
         try:
             family, address = resolve(host, port, socket.SOCK_STREAM)
@@ -64,7 +81,7 @@ class TcpSink(Sink):
         """Send a pose to the connected viewers."""
         self._accept()
         if self._viewers:
-            text = encode(pose)
+            text = encode(pose, self._standing)
             self._viewers = [viewer for viewer in self._viewers if self._offer(viewer, text)]
 
     def close(self) -> None:
@@ -111,4 +128,4 @@ class TcpSink(Sink):
 
 def open_sink(target: tuple[str, int], context: SinkContext) -> Sink:
     """Open a `TcpSink` on a host and port."""
-    return TcpSink(*target)
+    return TcpSink(*target, context.body)

@@ -6,59 +6,91 @@ import json
 import socket
 import struct
 from abc import abstractmethod
-from collections.abc import Sequence
-from functools import lru_cache
+from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
 from ipaddress import ip_address
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
+from edgepose.formats.joint_tree import LARGEST
 from edgepose.placements import PLACEMENTS
-from edgepose.pose import PoseFrame, format_status, parse_status
+from edgepose.pose import CONTACTS, PoseFrame, format_status, parse_status
 from edgepose.rotations import matrix_to_quat, matrix_to_rotvec, quat_to_matrix, rotvec_to_matrix
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.skeleton import JOINTS
 from edgepose.utils.sockets import Destination, address_text, resolve
 
 MAGIC = b"EPOS"
-VERSION = 1
+
+_UNKNOWN_STD = np.full(len(JOINTS), np.nan, np.float32)
+_UNKNOWN_STD.setflags(write=False)
 
 _FILLING_WINDOW = 1
 """Bit of a datagram's flags: the network has seen fewer frames than its window holds."""
 
-_JSON = '{"frame":%d,"time_s":%.6f,"status":%s,"pose":[' + ",".join(["%.6f"] * 72) + "]}\n"
+_CONTACTS = 2
+"""Bit of a datagram's flags: the contacts are known."""
+
+_JSON = '{"frame":%d,"time_s":%.6f,"status":%s,"pose":[' + ",".join(["%.6f"] * 72) + "]"
 # Magic, version, flags, held sensors, joints, time, frame, quaternions: each at a multiple of its size.
 _BINARY = struct.Struct("<4sBBBBdI96f")
+_PLACE = struct.Struct("<3f7f")
+"""Translation and contacts, which follow in version 2."""
+
+_SIZES = {1: _BINARY.size, 2: _BINARY.size + _PLACE.size}
+"""Bytes of a binary datagram of each version."""
 
 
 def encode_json(pose: PoseFrame) -> bytes:
-    """Encode a pose as a line of JSON: frame, time_s, status, pose (72 axis-angle numbers, SMPL order)."""
+    """Encode a pose as a line of JSON: frame, time_s, status, pose (72 axis-angle numbers, SMPL order).
+
+    Known translations and contacts follow as trans and contacts.
+    """
     numbers = matrix_to_rotvec(pose.rotations).ravel().tolist()
     status = _quoted(format_status(pose.held, pose.warming_up))
-    return (_JSON % (pose.index, pose.time_s, status, *numbers)).encode()
+    text = _JSON % (pose.index, pose.time_s, status, *numbers)
+    for key, values in (("trans", pose.translation), ("contacts", pose.contacts)):
+        if values is not None:
+            text += f',"{key}":[{",".join(f"{value:.6f}" for value in values.tolist())}]'
+    return f"{text}}}\n".encode()
 
 
-def encode_binary(pose: PoseFrame) -> bytes:
-    """Encode a pose as a binary datagram of 404 bytes."""
+def encode_binary(pose: PoseFrame, newest: int = 2) -> bytes:
+    """Encode a pose as a binary datagram: of version 2 if its translation is known, of version 1 otherwise.
+
+    Args:
+        pose: the pose.
+        newest: highest version that the receiver reads.
+    """
     flags = _FILLING_WINDOW if pose.warming_up else 0
     held = sum(1 << i for i, name in enumerate(PLACEMENTS) if name in pose.held)
+    place = b""
+    if pose.translation is not None and newest > 1:
+        flags |= 0 if pose.contacts is None else _CONTACTS
+        contacts = np.zeros(len(CONTACTS)) if pose.contacts is None else pose.contacts
+        place = _PLACE.pack(*pose.translation.tolist(), *contacts.tolist())
     quats = matrix_to_quat(pose.rotations).ravel().tolist()
     index = pose.index & 0xFFFFFFFF  # wraps after two years at 60 Hz
-    return _BINARY.pack(MAGIC, VERSION, flags, held, len(JOINTS), pose.time_s, index, *quats)
+    version = 2 if place else 1
+    return _BINARY.pack(MAGIC, version, flags, held, len(JOINTS), pose.time_s, index, *quats) + place
 
 
 def decode_binary(datagram: bytes) -> PoseFrame:
-    """Decode a binary datagram; `std`, which is not sent, is NaN.
+    """Decode a binary datagram of any version; `std`, which is not sent, is NaN.
 
     Raises:
-        EdgeposeError: not a datagram of this kind and version, or its numbers are not rotations.
+        EdgeposeError: not a datagram of this kind and version, or its numbers are not valid.
     """
-    if len(datagram) != _BINARY.size or not datagram.startswith(MAGIC):
+    if len(datagram) not in _SIZES.values() or not datagram.startswith(MAGIC):
         raise EdgeposeError(f"not a pose datagram: {len(datagram)} bytes that begin with {datagram[:4]!r}")
-    _, version, flags, held, joints, time_s, index, *numbers = _BINARY.unpack(datagram)
-    if version != VERSION or joints != len(JOINTS):
+    _, version, flags, held, joints, time_s, index, *numbers = _BINARY.unpack_from(datagram)
+    if _SIZES.get(version) != len(datagram) or joints != len(JOINTS):
         raise EdgeposeError(
-            f"pose datagram of version {version} with {joints} joints; supported is version 1 with 24"
+            f"pose datagram of version {version} with {joints} joints in {len(datagram)} bytes; supported "
+            "are versions 1 and 2 with 24"
         )
     quats = np.array(numbers).reshape(-1, 4)
     norms = np.linalg.norm(quats, axis=-1, keepdims=True)
@@ -68,8 +100,12 @@ def decode_binary(datagram: bytes) -> PoseFrame:
         )
     rotations = quat_to_matrix(quats / norms).astype(np.float32)
     names = frozenset(name for i, name in enumerate(PLACEMENTS) if held >> i & 1)
-    std = np.full(len(JOINTS), np.nan, np.float32)
-    return PoseFrame(index, time_s, rotations, std, None, names, bool(flags & _FILLING_WINDOW))
+    place = _PLACE.unpack_from(datagram, _BINARY.size) if version > 1 else ()
+    return PoseFrame(
+        *(index, time_s, rotations, _UNKNOWN_STD, _translation(place[:3] or None, index), names),
+        bool(flags & _FILLING_WINDOW),
+        _contacts(place[3:] if flags & _CONTACTS else None, index),
+    )
 
 
 def decode_json(datagram: bytes) -> PoseFrame:
@@ -83,18 +119,47 @@ def decode_json(datagram: bytes) -> PoseFrame:
         index, time_s = int(message["frame"]), float(message["time_s"])
         held, warming_up = parse_status(str(message["status"]))
         vectors = np.array(message["pose"], float)
+        translation = _translation(message.get("trans"), index)
+        contacts = _contacts(message.get("contacts"), index)
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         raise EdgeposeError(f"not a pose datagram: {len(datagram)} bytes, {type(error).__name__}") from None
     if vectors.shape != (3 * len(JOINTS),) or not (np.abs(vectors) < 1e3).all() or not np.isfinite(time_s):
         raise EdgeposeError(f"damaged pose datagram: time or angles of frame {index} are not valid numbers")
     rotations = rotvec_to_matrix(vectors.reshape(-1, 3)).astype(np.float32)
-    std = np.full(len(JOINTS), np.nan, np.float32)
-    return PoseFrame(index, time_s, rotations, std, None, held, warming_up)
+    return PoseFrame(index, time_s, rotations, _UNKNOWN_STD, translation, held, warming_up, contacts)
+
+
+def _translation(numbers: Any, index: int) -> NDArray[np.float64] | None:
+    """Return the translation (3,) of a frame; None if there is none, EdgeposeError if it cannot be one."""
+    if numbers is None:
+        return None
+    translation = np.array(numbers, float)
+    if translation.shape != (3,) or not (np.abs(translation) < LARGEST).all():
+        raise EdgeposeError(f"damaged pose datagram: the place of frame {index} is not a valid position")
+    return translation
+
+
+def _contacts(numbers: Any, index: int) -> NDArray[np.float32] | None:
+    """Return the contacts (7,) of a frame; None if there are none, EdgeposeError if they cannot be any."""
+    if numbers is None:
+        return None
+    contacts = np.array(numbers, float)
+    if contacts.shape != (len(CONTACTS),) or not ((contacts >= 0.0) & (contacts <= 1.0)).all():
+        raise EdgeposeError(f"damaged pose datagram: contacts of frame {index} are not from 0 to 1")
+    return contacts.astype(np.float32)
 
 
 def decode(datagram: bytes) -> PoseFrame:
     """Decode a datagram of either kind; see `decode_binary` and `decode_json`."""
     return decode_binary(datagram) if datagram.startswith(MAGIC) else decode_json(datagram)
+
+
+ENCODERS: dict[str, Callable[[PoseFrame], bytes]] = {
+    "json": encode_json,
+    "binary": encode_binary,
+    "binary-v1": partial(encode_binary, newest=1),
+}
+"""Encoders of each format; "binary-v1" is for receivers that do not know version 2."""
 
 
 class DatagramSink(Sink):
@@ -186,8 +251,8 @@ class UdpSink(DatagramSink):
     """Sends each pose as one datagram, JSON or binary."""
 
     def __init__(self, host: str, port: int, format: str = "json", cast: str = "") -> None:
-        """Resolve the host name; `format` is "json" or "binary". See `DatagramSink`."""
-        self._encode = {"json": encode_json, "binary": encode_binary}[format]
+        """Resolve the host name; `format` is a key of `ENCODERS`. See `DatagramSink`."""
+        self._encode = ENCODERS[format]
         super().__init__(host, port, cast)
 
     def encode(self, pose: PoseFrame) -> Sequence[bytes]:

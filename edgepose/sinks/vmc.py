@@ -69,7 +69,6 @@ def _bundle(messages: Sequence[bytes]) -> bytes:
 
 _BONE_HEADS = [_string("/VMC/Ext/Bone/Pos") + _string(",sfffffff") + _string(bone) for bone in BONES]
 _ROOT = _string("/VMC/Ext/Root/Pos") + _string(",sfffffff") + _string("root")
-_ROOT += struct.pack(">7f", 0, 0, 0, 0, 0, 0, 1)
 _OK = _string("/VMC/Ext/OK") + _string(",i") + struct.pack(">i", 1)
 _TIME = _string("/VMC/Ext/T") + _string(",f")
 _HALF = (len(BONES) + 1) // 2
@@ -113,12 +112,16 @@ class VmcSink(DatagramSink):
         position = pose.translation
         if position is None:
             position = grounded_pelvis_position(pose.rotations, self._offsets)
-        positions[0] = position * TO_UNITY
+        # The root stands on the floor below the pelvis, so that an avatar whose receiver keeps its own bone
+        # positions walks, too.
+        x_m, height_m, z_m = position * TO_UNITY
+        root = _ROOT + struct.pack(">7f", x_m, 0, z_m, 0, 0, 0, 1)
+        positions[0] = 0.0, height_m, 0.0
         numbers = np.column_stack([positions, x, -y, -z, w]).astype(">f4")
         bones = [head + row.tobytes() for head, row in zip(_BONE_HEADS, numbers, strict=True)]
         # Relative, because single precision cannot hold fractions of a second of Unix time.
         time_s = _TIME + struct.pack(">f", pose.time_s - self._start_s)
-        return _bundle([_OK, time_s, _ROOT, *bones[:_HALF]]), _bundle([time_s, *bones[_HALF:]])
+        return _bundle([_OK, time_s, root, *bones[:_HALF]]), _bundle([time_s, *bones[_HALF:]])
 
 
 def open_sink(target: Address, context: SinkContext) -> Sink:

@@ -26,7 +26,7 @@ def resolve(host: str, port: int, kind: socket.SocketKind) -> tuple[socket.Addre
 CASTS = ("broadcast", "multicast")
 """Words that permit an address of many machines."""
 
-_FORMATS = ("format=json", "format=binary")
+_FORMATS = ("format=json", "format=binary", "format=binary-v1")
 
 
 class Address(NamedTuple):
@@ -38,7 +38,7 @@ class Address(NamedTuple):
 
 
 class Destination(NamedTuple):
-    """Destination of datagrams: as `Address`, with the format "json" or "binary"."""
+    """Destination of datagrams: as `Address`, with the format "json", "binary" or "binary-v1"."""
 
     host: str
     port: int
@@ -93,7 +93,9 @@ def parse_datagram_address(text: str) -> Address:
 
 
 def parse_destination(text: str) -> Destination:
-    """Parse "HOST:PORT[,format=json|binary][,broadcast|multicast]"; JSON is the default, see `parse_address`.
+    """Parse "HOST:PORT[,format=json|binary|binary-v1][,broadcast|multicast]"; JSON is the default.
+
+    See `parse_address`.
 
     Raises:
         ConfigError: the text has another form.

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from edgepose.errors import EdgeposeError, FileFormatError
 from edgepose.formats.ledger import Ledger
 from edgepose.formats.poses.base import LARGEST_TIME, PoseFormat, is_absurd
-from edgepose.formats.poses.csv_columns import ROTATION_FORMATS, TRANSLATION, rotation_columns
+from edgepose.formats.poses.csv_columns import CONTACT, ROTATION_FORMATS, TRANSLATION, rotation_columns
 from edgepose.formats.tables import Row, Table, encoding_of, name_of, open_table
 from edgepose.pose import PoseSequence, parse_status
 from edgepose.rotations import euler_to_matrix, nearest_rotation, quat_to_matrix, rotvec_to_matrix
@@ -110,6 +110,7 @@ class _Columns(NamedTuple):
         status: status, if there is one.
         rotations: numbers of the 24 joints.
         translation: position of the pelvis, or none.
+        contacts: probabilities of contact, or none.
     """
 
     form: str
@@ -119,6 +120,12 @@ class _Columns(NamedTuple):
     status: int | None
     rotations: list[int]
     translation: list[int]
+    contacts: list[int]
+
+    @property
+    def numbers(self) -> list[int]:
+        """All columns of numbers but frame and time."""
+        return self.rotations + self.translation + self.contacts
 
 
 def _columns(table: Table) -> _Columns:
@@ -132,7 +139,10 @@ def _columns(table: Table) -> _Columns:
         ROTATION_FORMATS, key=lambda form: -len(ROTATION_FORMATS[form])
     ):  # w x y z before x y z
         if at.keys() >= set(columns := rotation_columns(form)):
-            translation = [at[column] for column in TRANSLATION if column in at]
+            translation, contacts = (
+                [at[column] for column in group] if at.keys() >= set(group) else []
+                for group in (TRANSLATION, CONTACT)
+            )
             return _Columns(
                 form,
                 len(table.names),
@@ -140,7 +150,8 @@ def _columns(table: Table) -> _Columns:
                 at["time_s"],
                 at.get("status"),
                 [at[column] for column in columns],
-                translation if len(translation) == len(TRANSLATION) else [],
+                translation,
+                contacts,
             )
     raise FileFormatError(
         "the names of its columns must be frame, time_s, status, pelvis_..., for all 24 joints"
@@ -158,6 +169,8 @@ class _Parser:
         """Start before the first row; bad rows go to the ledger."""
         self.empty = True
         self._columns, self._ledger = columns, ledger
+        # Where translation and contacts begin in a row's numbers.
+        self._starts = np.cumsum([len(columns.rotations), len(columns.translation)])
         self._frame: int | None = None  # of the row before
         self._time_s = -np.inf
 
@@ -177,24 +190,24 @@ class _Parser:
             values.extend(cells)
             held.append(status[0])
             warming_up.append(status[1])
-        table = np.frombuffer(values).reshape(
-            len(frames), len(self._columns.rotations + self._columns.translation)
-        )
+        table = np.frombuffer(values).reshape(len(frames), len(self._columns.numbers))
         good, rotations = self._rotations(np.frombuffer(numbers, np.int64), table)
         if not good.any():
             return None
         self.empty = False
+        _, translation, contacts = np.split(table[good], self._starts, axis=1)
         return PoseSequence(
             np.frombuffer(frames, np.int64)[good],
             np.frombuffer(times)[good],
             rotations,
-            table[good, -3:] if self._columns.translation else None,
+            translation if self._columns.translation else None,
             [names for names, keep in zip(held, good, strict=True) if keep],
             [warm for warm, keep in zip(warming_up, good, strict=True) if keep],
+            contacts=contacts.astype(np.float32) if self._columns.contacts else None,
         )
 
     def _parse(self, cells: list[str]) -> tuple[int, float, tuple[frozenset[str], bool], list[float]]:
-        """Parse a row to frame, time, status, and numbers of rotations and translation.
+        """Parse a row to frame, time, status, and numbers of rotations, translation and contacts.
 
         Raises:
             ValueError: the problem with the row.
@@ -205,7 +218,7 @@ class _Parser:
         time = cells[columns.time]
         try:
             frame, time_s = int(cells[columns.frame]), float(time)
-            values = [float(cells[i]) for i in columns.rotations + columns.translation]
+            values = [float(cells[i]) for i in columns.numbers]
         except ValueError:
             raise ValueError("has a cell that is not a number") from None
         if not (abs(frame) <= LARGEST_TIME and abs(time_s) <= LARGEST_TIME):
@@ -226,6 +239,10 @@ class _Parser:
         """Return which rows (T,) are good, and the rotations (n, 24, 3, 3) of these; values (T, columns)."""
         good: NDArray[np.bool_] = ~np.any(is_absurd(values), axis=1)
         self._ledger.leave_out_unless(good, rows, _ABSURD)
+        contacts = values[:, self._starts[1] :]
+        probable = ~np.any((contacts < 0.0) | (contacts > 1.0), axis=1)
+        self._ledger.leave_out_unless(probable | ~good, rows, _NO_CONTACT)
+        good &= probable
         form = self._columns.form
         count = len(self._columns.rotations)
         numbers = values[good, :count].reshape(-1, len(JOINTS), len(ROTATION_FORMATS[form]))
@@ -239,6 +256,7 @@ class _Parser:
 
 
 _ABSURD = "has a number that is infinite, not a number, or far too large"
+_NO_CONTACT = "has a contact that is not a probability from 0 to 1"
 _NO_ROTATION = dict.fromkeys(ROTATION_FORMATS, "has numbers of {} that are not a rotation") | dict.fromkeys(
     ("axis-angle", "euler"),
     "has an angle of {} beyond a whole turn; angles must be in radians, not in degrees",
@@ -262,6 +280,7 @@ def _to_matrices(form: str, values: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 def _concatenate(blocks: list[PoseSequence]) -> PoseSequence:
     translations = [block.translation for block in blocks if block.translation is not None]
+    contacts = [block.contacts for block in blocks if block.contacts is not None]
     return PoseSequence(
         np.concatenate([block.frames for block in blocks]),
         np.concatenate([block.time_s for block in blocks]),
@@ -269,6 +288,7 @@ def _concatenate(blocks: list[PoseSequence]) -> PoseSequence:
         np.concatenate(translations) if translations else None,
         [names for block in blocks for names in block.held],
         [warm for block in blocks for warm in block.warming_up],
+        contacts=np.concatenate(contacts) if contacts else None,
     )
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from edgepose.pose import CONTACTS
 from edgepose.rotations import matrix_to_euler_zxy, matrix_to_quat, matrix_to_rotvec
 from edgepose.skeleton import JOINTS
 
@@ -21,17 +22,21 @@ ROTATION_FORMATS = {
 TRANSLATION = ("trans_x", "trans_y", "trans_z")
 """Columns of the position of the pelvis, metres."""
 
+CONTACT = tuple(f"contact_{joint}" for joint in CONTACTS)
+"""Columns of the probabilities of contact."""
+
 
 def rotation_columns(rotations: str) -> list[str]:
     """Return the names of the columns of all joints, in order; `rotations` is a key of `ROTATION_FORMATS`."""
     return [f"{joint}_{end}" for joint in JOINTS for end in ROTATION_FORMATS[rotations]]
 
 
-def pose_columns(rotations: str, std: bool, translation: bool = False) -> list[str]:
+def pose_columns(rotations: str, std: bool, translation: bool = False, contacts: bool = False) -> list[str]:
     """Return the names of all columns, in order; `rotations` is a key of `ROTATION_FORMATS`."""
     names = ["frame", "time_s", "status", *rotation_columns(rotations)]
     names += [f"{joint}_std" for joint in JOINTS] if std else []
-    return [*names, *TRANSLATION] if translation else names
+    names += TRANSLATION if translation else ()
+    return [*names, *CONTACT] if contacts else names
 
 
 def numbers(rotations: str, matrices: NDArray[Any]) -> NDArray[Any]:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from edgepose.errors import FileFormatError
 from edgepose.placements import PLACEMENTS
@@ -44,10 +47,10 @@ def fill_missing_frames(poses: PoseSequence, name: str) -> tuple[PoseSequence, i
         slerp(quats[before[between]], quats[after[between]], share[between, None])
     )
 
-    def linear(values: Array, share: Array) -> Array:
+    def linear(values: NDArray[Any], share: Array) -> Array:
         return np.asarray(values[before] + share * (values[after] - values[before]))
 
-    translation = poses.translation
+    translation, contacts = poses.translation, poses.contacts
     everything = frozenset(PLACEMENTS)
     filled = PoseSequence(
         frames,
@@ -57,5 +60,6 @@ def fill_missing_frames(poses: PoseSequence, name: str) -> tuple[PoseSequence, i
         [everything if gap else poses.held[i] for i, gap in zip(before, between, strict=True)],
         [poses.warming_up[i] for i in before],
         poses.about,
+        None if contacts is None else linear(contacts, share[:, None]).astype(np.float32),
     )
     return filled, missing

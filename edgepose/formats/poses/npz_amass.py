@@ -17,7 +17,7 @@ from edgepose.errors import FileFormatError
 from edgepose.formats.joint_tree import LARGEST
 from edgepose.formats.poses.base import LARGEST_TIME, PoseFormat, all_new, is_absurd
 from edgepose.placements import PLACEMENTS
-from edgepose.pose import PoseSequence, held_sensors
+from edgepose.pose import CONTACTS, PoseSequence, held_sensors
 from edgepose.rotations import Z_UP_TO_T, matrix_to_rotvec, rotvec_to_matrix
 from edgepose.skeleton import JOINTS
 from edgepose.utils.safe_npz import BROKEN, check_size, member_names, open_npz
@@ -26,6 +26,18 @@ Array = NDArray[np.float64]
 
 BETAS = 16
 """Shape coefficients of SMPL; all are zero, the average body."""
+
+PELVIS_OFFSETS = {
+    "smpl": (0.0, -0.22, 0.03),
+    "smplh": (0.0, -0.22, 0.03),
+    "smplx": (0.0, -0.35, 0.01),
+}
+"""Position of the pelvis of the average body of each model, metres, to the nearest centimetre.
+
+SMPL's models put the pelvis at `trans` plus this, along the axes of the file's world, because `trans` moves
+the origin of the model, which lies above the pelvis of the T-pose, while the root rotation turns the body
+about its pelvis. Other bodies differ by a few centimetres, which only the licensed models know.
+"""
 
 JOINT_COUNTS = {24: "SMPL", 52: "SMPL-H", 55: "SMPL-X"}
 """Numbers of joints that can be written, and the body models that have them; fingers and face are at rest."""
@@ -40,6 +52,12 @@ _RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
 
 _PARTS = ("root_orient", "pose_body")
 """Arrays that hold the first 22 joints in files without `poses`."""
+
+_OURS = ("pelvis_offset", "time_s", "frame", "held", "filling", "contacts", "about")
+"""Arrays that only edgepose writes."""
+
+_WANTED = ("poses", *_PARTS, "trans", "surface_model_type", *_RATES, *_OURS)
+"""Arrays that are read."""
 
 _BODY = 22
 """Joints that all three models share, in the same order."""
@@ -68,15 +86,46 @@ def read_npz(path: Path) -> tuple[PoseSequence, None]:
     vectors = _numbers(path, arrays, "poses", (count, width))[:, : 3 * joints].reshape(count, joints, 3)
     rotations = np.broadcast_to(np.eye(3), (count, len(JOINTS), 3, 3)).copy()
     rotations[:, :joints] = rotvec_to_matrix(vectors)
-    translation = _numbers(path, arrays, "trans", (count, 3)) if "trans" in arrays else None
-    if translation is not None and not translation.any():
-        translation = None  # AMASS requires the array even if the translation is unknown
+    translation = _pelvis(path, arrays, count, None if in_t else width)
     if not in_t:
         rotations[:, 0] = Z_UP_TO_T @ rotations[:, 0]
         translation = None if translation is None else translation @ Z_UP_TO_T.T
     frames, time_s = _clock(path, arrays, count)
     states = _states(path, arrays, count)
-    return PoseSequence(frames, time_s, rotations, translation, *states, _about(arrays)), None
+    contacts = _contacts(path, arrays, count)
+    return PoseSequence(frames, time_s, rotations, translation, *states, _about(arrays), contacts), None
+
+
+def _pelvis(path: Path, arrays: Mapping[str, NDArray[Any]], count: int, width: int | None) -> Array | None:
+    """Return the positions of the pelvis (T, 3) in the file's world, metres; None if they are unknown.
+
+    Args:
+        path: of the file, for messages.
+        arrays: its arrays.
+        count: T.
+        width: columns of `poses`; None if `trans` is the position of the pelvis.
+    """
+    if "trans" not in arrays:
+        return None
+    trans = _numbers(path, arrays, "trans", (count, 3))
+    if not trans.any():  # AMASS requires the array even if the translation is unknown
+        return None
+    if "pelvis_offset" in arrays:
+        return trans + _numbers(path, arrays, "pelvis_offset", (3,))
+    if width is None or {"frame", "filling"} <= arrays.keys():  # edgepose's, before it wrote `pelvis_offset`
+        return trans
+    model = str(arrays.get("surface_model_type", "smplx" if width == 3 * 55 else "smpl"))
+    return trans + PELVIS_OFFSETS["smplx" if model.startswith("smplx") else "smpl"]
+
+
+def _contacts(path: Path, arrays: Mapping[str, NDArray[Any]], count: int) -> NDArray[np.float32] | None:
+    """Return the probabilities of contact (T, 7); None if they are unknown."""
+    if "contacts" not in arrays:
+        return None
+    contacts = _numbers(path, arrays, "contacts", (count, len(CONTACTS)))
+    if ((contacts < 0.0) | (contacts > 1.0)).any():
+        raise FileFormatError(f"{path}: a number in 'contacts' is not a probability from 0 to 1")
+    return contacts.astype(np.float32)
 
 
 def _join_parts(arrays: dict[str, NDArray[Any]]) -> None:
@@ -90,11 +139,10 @@ def _join_parts(arrays: dict[str, NDArray[Any]]) -> None:
 
 def _load(path: Path) -> tuple[dict[str, NDArray[Any]], bool]:
     """Load the relevant arrays of a file, and whether it is a recording with true poses in T."""
-    wanted = ("poses", *_PARTS, "trans", *_RATES, "time_s", "frame", "held", "filling", "about")
     try:
         names = member_names(path)
         with open_npz(path) as archive:
-            return {key: archive[key] for key in wanted if f"{key}.npy" in names}, _is_recording(names)
+            return {key: archive[key] for key in _WANTED if f"{key}.npy" in names}, _is_recording(names)
     except OSError as error:
         raise FileFormatError(f"cannot read poses from {path}: {error.strerror or error}") from error
     except BROKEN as error:
@@ -198,7 +246,8 @@ def write_npz(
     Raises:
         OSError: the file cannot be written.
     """
-    frames, times, held, filling, positions = [], [], [], [], []
+    frames, times, held, filling, positions, contacts = [], [], [], [], [], []
+    model = JOINT_COUNTS[joints].replace("-", "").lower()
     with zipfile.ZipFile(path, "w") as archive:
         with archive.open("poses.npy", "w", force_zip64=True) as member:
             header = {"descr": "<f4", "fortran_order": False, "shape": (count, 3 * joints)}
@@ -209,20 +258,24 @@ def write_npz(
                 times.append(block.time_s)
                 held.append(held_sensors(block.held))
                 filling.append(np.array(block.warming_up, bool))
-                positions.append(_positions(block))
+                positions.append(_trans(block, model))
+                contacts += [] if block.contacts is None else [block.contacts]
         arrays: dict[str, NDArray[Any]] = {
             "trans": np.concatenate(positions),
             "betas": np.zeros(BETAS),
             "gender": np.array("neutral"),
             "mocap_framerate": np.array(float(rate)),
             "mocap_frame_rate": np.array(float(rate)),
-            "surface_model_type": np.array(JOINT_COUNTS[joints].replace("-", "").lower()),
+            "surface_model_type": np.array(model),
+            "pelvis_offset": np.array(PELVIS_OFFSETS[model]),
             "frame": np.concatenate(frames),
             "time_s": np.concatenate(times),
             "held": np.concatenate(held),
             "filling": np.concatenate(filling),
             "about": np.array(json.dumps(dict(about))),
         }
+        if contacts:
+            arrays["contacts"] = np.concatenate(contacts)
         for key, values in arrays.items():
             with archive.open(f"{key}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, values, allow_pickle=False)
@@ -240,11 +293,11 @@ def _vectors(block: PoseSequence, joints: int) -> NDArray[np.float32]:
     return result.reshape(len(rotations), -1)
 
 
-def _positions(block: PoseSequence) -> NDArray[np.float32]:
-    """Return positions of the pelvis (T, 3), metres, Z up; zeros if unknown."""
+def _trans(block: PoseSequence, model: str) -> NDArray[np.float32]:
+    """Return `trans` (T, 3) of a model, see `PELVIS_OFFSETS`; zeros if the translation is unknown."""
     if block.translation is None:
         return np.zeros((len(block.frames), 3), "<f4")
-    return (block.translation @ Z_UP_TO_T).astype("<f4")
+    return (block.translation @ Z_UP_TO_T - PELVIS_OFFSETS[model]).astype("<f4")
 
 
 FORMAT = PoseFormat((".npz",), read_npz, holds_poses)

@@ -20,7 +20,7 @@ from edgepose.pose import PoseFrame, parse_status
 from edgepose.rotations import matrix_to_euler_zxy
 from edgepose.sinks import pose_file
 from edgepose.sinks.csv import CsvSink, pose_columns
-from edgepose.sinks.udp import UdpSink, decode_binary, encode_binary, encode_json
+from edgepose.sinks.udp import UdpSink, decode, decode_binary, encode_binary, encode_json
 from edgepose.sinks.vmc import VmcSink
 from edgepose.skeleton import JOINTS
 from edgepose.utils.sockets import parse_destination, resolve
@@ -316,6 +316,66 @@ def test_binary_layout_is_the_documented_one():
     np.testing.assert_allclose(np.frombuffer(data, "<f4", 96, 20).reshape(24, 4), q, atol=1e-6)
 
 
+def placed(index: int) -> PoseFrame:
+    contacts = np.linspace(0.0, 1.0, 7, dtype=np.float32)
+    return make_pose(index, "held head")._replace(translation=np.array([1.5, 0.9, -2.25]), contacts=contacts)
+
+
+def test_version_2_adds_the_place():
+    pose = placed(5)
+    data, old = encode_binary(pose), encode_binary(pose._replace(translation=None, contacts=None))
+    assert (len(data), data[:6], data[6:404]) == (444, b"EPOS\x02\x02", old[6:])
+    assert np.frombuffer(data, "<f4", 3, 404).tolist() == [1.5, np.float32(0.9), -2.25]
+    assert np.frombuffer(data, "<f4", 7, 416).tolist() == pose.contacts.tolist()
+    back = decode(data)
+    np.testing.assert_allclose(back.translation, pose.translation, atol=1e-6)
+    assert back.contacts.tolist() == pose.contacts.tolist()
+    without = decode(encode_binary(pose._replace(contacts=None)))
+    assert (without.translation.tolist(), without.contacts) == (back.translation.tolist(), None)
+    assert encode_binary(pose, newest=1) == old
+    assert (decode(old).translation, decode(old).contacts) == (None, None)
+
+
+def test_json_with_the_place():
+    pose = placed(5)
+    data = encode_json(pose)
+    assert data.endswith(b"}\n")
+    message = json.loads(data)
+    assert list(message) == ["frame", "time_s", "status", "pose", "trans", "contacts"]
+    back = decode(data)
+    np.testing.assert_allclose(back.translation, pose.translation, atol=1e-6)
+    np.testing.assert_allclose(back.contacts, pose.contacts, atol=1e-6)
+
+
+@pytest.mark.parametrize(("form", "size"), [("binary", 444), ("binary-v1", 404)])
+def test_version_1_on_request(receiver, form, size):
+    destination = parse_destination(f"127.0.0.1:{receiver.getsockname()[1]},format={form}")
+    with UdpSink(*destination) as sink:
+        sink.write(placed(1))
+        data = receiver.recv(2048)
+    assert (len(data), decode(data).index) == (size, 1)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("trans", [1.0, 2.0]), ("trans", [1.0, 2.0, 1e9]), ("trans", [1.0, 2.0, float("nan")]), ("trans", "here"),
+        ("contacts", [0.5] * 6), ("contacts", [0.5] * 6 + [1.01]), ("contacts", [float("nan")] * 7),
+        ("contacts", [1e300] * 7), ("contacts", {}),
+    ],
+)  # fmt: skip
+def test_a_place_that_is_none_is_refused(key, value):
+    message = {**json.loads(encode_json(placed(5))), key: value}
+    with pytest.raises(EdgeposeError, match="pose datagram"):
+        decode(json.dumps(message).encode())
+    if np.shape(value) in ((3,), (7,)):
+        data, at = bytearray(encode_binary(placed(5))), 404 if key == "trans" else 416
+        with np.errstate(over="ignore"):
+            data[at : at + 4 * len(value)] = np.array(value, "<f4").tobytes()
+        with pytest.raises(EdgeposeError, match="damaged pose datagram: .* of frame 5"):
+            decode(bytes(data))
+
+
 def test_decode_binary_refuses_what_it_does_not_know():
     data = encode_binary(make_pose(0))
     nan = np.float32(np.nan).tobytes()
@@ -325,6 +385,9 @@ def test_decode_binary_refuses_what_it_does_not_know():
         data + b"x",
         b"EPOT" + data[4:],
         b"EPOS\x02" + data[5:],
+        b"EPOS\x03" + data[5:],
+        b"EPOS\x01" + encode_binary(placed(0))[5:],
+        encode_binary(placed(0))[:-4],
         data[:20] + nan + data[24:],
     ):
         with pytest.raises(EdgeposeError, match="datagram"):

@@ -18,7 +18,7 @@ from edgepose.sinks import vmc
 from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.tcp import CLIENTS, TcpSink
 from edgepose.sinks.vmc import VmcSink
-from edgepose.skeleton import JOINTS, default_body, forward_kinematics
+from edgepose.skeleton import JOINTS, default_body, forward_kinematics, standing_pelvis_position
 from edgepose.utils.sockets import parse_address
 
 
@@ -57,14 +57,18 @@ def received(poses: list[PoseFrame], **options) -> list[list[tuple[str, list]]]:
 
 
 def bones(one: PoseFrame, **options) -> dict[str, tuple[np.ndarray, Rotation]]:
-    """Place and rotation of each bone, in Unity's axes."""
+    """Place and rotation of each bone, in Unity's axes; the hips moved along with the root."""
     messages = [message for datagram in received([one], **options) for message in datagram]
+    (root,) = [arguments for address, arguments in messages if address == "/VMC/Ext/Root/Pos"]
+    assert (root[0], root[2], root[4:]) == ("root", 0.0, [0.0, 0.0, 0.0, 1.0])
     found = {
         arguments[0]: (np.array(arguments[1:4]), Rotation.from_quat(arguments[4:]))
         for address, arguments in messages
         if address == "/VMC/Ext/Bone/Pos"
     }
     assert len(found) == sum(address == "/VMC/Ext/Bone/Pos" for address, _ in messages)
+    assert not found["Hips"][0][[0, 2]].any()
+    found["Hips"] = (found["Hips"][0] + root[1:4], found["Hips"][1])
     return found
 
 
@@ -171,6 +175,13 @@ def test_without_a_place_the_hips_are_above_the_ground():
     assert 0.8 < place[1] < 1.1
 
 
+def test_the_root_is_on_the_floor_below_the_wearer():
+    """An avatar that keeps the lengths of its own bones walks by it alone."""
+    first, _ = received([pose(where=np.array([1.0, 0.75, -2.0]))])
+    assert first[2] == ("/VMC/Ext/Root/Pos", ["root", -1.0, 0.0, -2.0, 0.0, 0.0, 0.0, 1.0])
+    assert first[3] == ("/VMC/Ext/Bone/Pos", ["Hips", 0.0, 0.75, 0.0, 0.0, 0.0, 0.0, 1.0])
+
+
 SITTING = {"left_hip": ("x", -90), "right_hip": ("x", -90), "left_knee": ("x", 90), "right_knee": ("x", 90)}
 
 
@@ -198,6 +209,8 @@ def test_vmc_nobody_listens():
 
 
 # --- TCP ----------------------------------------------------------------------------------------------------
+
+UPRIGHT = standing_pelvis_position(default_body().offsets)
 
 
 @pytest.fixture
@@ -235,7 +248,9 @@ def test_a_viewer_comes_late_and_goes(server):
         for (vectors, where), one in zip(read_text(data), poses, strict=True):
             wanted = Rotation.from_matrix(one.rotations).as_rotvec().ravel()
             np.testing.assert_allclose(vectors, wanted, atol=1e-5)
-            np.testing.assert_allclose(where, one.translation if one.index == 1 else [0, 0, 0], atol=1e-5)
+            # 0 is where TransPose's own wearers begin, standing straight.
+            moved = one.translation - UPRIGHT if one.index == 1 else np.zeros(3)
+            np.testing.assert_allclose(where, moved, atol=1e-5)
     for i in range(50):
         sink.write(anything(i))
     assert sink.missed == 0

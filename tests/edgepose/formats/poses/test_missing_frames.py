@@ -92,6 +92,21 @@ def test_lost_rows(tmp_path, ending):
         ]
 
 
+def test_the_place_in_lost_rows(tmp_path):
+    with CsvSink(tmp_path / "a.csv", translation=True, contacts=True) as sink:
+        for i in (0, 1, 2, 4, 8):
+            place = np.array([0.1 * i, 1.0, -0.2 * i]), frozenset[str](), False, np.full(7, i / 8, np.float32)
+            sink.write(PoseFrame(i, i / 60.0, np.tile(np.eye(3), (24, 1, 1)), np.zeros(24), *place))
+    _, _, damage = convert_poses(tmp_path / "a.csv", tmp_path / "a.npz")
+    assert damage.endswith("4 frames are missing between its poses; they are interpolated")
+    poses = read_poses(tmp_path / "a.npz")
+    steps = np.arange(9)
+    np.testing.assert_allclose(
+        poses.translation, np.stack([0.1 * steps, 0 * steps + 1, -0.2 * steps], 1), atol=1e-6
+    )
+    np.testing.assert_allclose(poses.contacts, np.tile(steps[:, None] / 8, 7), atol=1e-6)
+
+
 def test_numbers_far_apart(tmp_path):
     write(tmp_path / "a.csv", [0, 1, 2, 200])
     with pytest.raises(EdgeposeError, match="197 frames are missing between its 4 poses"):

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from edgepose.convert import convert_poses
 from edgepose.errors import EdgeposeError, FileFormatError
 from edgepose.formats.bvh import read_bvh
 from edgepose.formats.joint_tree import forward
@@ -50,6 +51,12 @@ def motion(count: int, moves: bool = True) -> list[PoseFrame]:
     return result
 
 
+def touching(count: int) -> list[PoseFrame]:
+    """The same on its path, with contacts."""
+    shares = np.linspace(0.0, 1.0, 7 * count, dtype=np.float32).reshape(count, 7)
+    return [pose._replace(contacts=share) for pose, share in zip(motion(count), shares, strict=True)]
+
+
 def written(sink, poses: list[PoseFrame]) -> None:
     with sink:
         for pose in poses:
@@ -65,6 +72,11 @@ def same(poses: PoseSequence, wanted: list[PoseFrame], tolerance: float = 2e-6) 
         assert poses.translation is None
     else:
         np.testing.assert_allclose(poses.translation, [pose.translation for pose in wanted], atol=tolerance)
+    if wanted[0].contacts is None:
+        assert poses.contacts is None
+    else:
+        assert poses.contacts.dtype == np.float32
+        np.testing.assert_allclose(poses.contacts, [pose.contacts for pose in wanted], atol=1e-6)
 
 
 def joints(poses: list[PoseFrame], offsets: np.ndarray) -> np.ndarray:
@@ -88,6 +100,26 @@ def test_csv_with_translation(tmp_path, std):
     assert not is_poses(tmp_path / "b.csv")
     with pytest.raises(ValueError, match="pose 0 has no translation"):
         written(CsvSink(tmp_path / "b.csv", translation=True), motion(1, moves=False))
+
+
+@pytest.mark.parametrize("form", ["axis-angle", "quat", "euler"])
+def test_csv_with_contacts(tmp_path, form):
+    poses = touching(7)
+    path = tmp_path / "a.csv"
+    written(CsvSink(path, form, translation=True, contacts=True), poses)
+    same(read_poses(path), poses, 5e-6)
+    header, *rows = path.read_text().splitlines()
+    assert header.split(",")[-10:-6] == ["trans_x", "trans_y", "trans_z", "contact_left_ankle"]
+    assert header.endswith("contact_pelvis,contact_left_wrist,contact_right_wrist")
+    path.write_text("\n".join([header, *rows[:3], rows[3].rpartition(",")[0] + ",1.1", *rows[4:], ""]))
+    kept, problem = salvage_poses(path)
+    assert kept.frames.tolist() == [0, 1, 2, 4, 5, 6]
+    assert "the first: row 5 has a contact that is not a probability from 0 to 1" in problem
+    # Without one of the columns it is a file without contacts.
+    path.write_text("\n".join([header.replace("contact_pelvis", "seat"), *rows, ""]))
+    same(read_poses(path), motion(7), 5e-6)
+    with pytest.raises(ValueError, match="pose 0 has no contacts"):
+        written(CsvSink(tmp_path / "b.csv", contacts=True), motion(1))
 
 
 def test_csv_in_blocks(tmp_path):
@@ -133,8 +165,9 @@ def test_npz_has_the_keys_of_amass_in_a_world_with_z_up(tmp_path):
     assert arrays["betas"].shape == (16,)
     assert str(arrays["gender"]) == "neutral"
     assert arrays["mocap_framerate"] == 60.0
-    # Up is Z, where their x is ours and their y is what lies behind us.
-    np.testing.assert_allclose(arrays["trans"][9], poses[9].translation[[0, 2, 1]] * [1, -1, 1], atol=1e-6)
+    # Up is Z, where their x is ours and their y is what lies behind us. SMPL adds its own pelvis, unturned.
+    wanted = poses[9].translation[[0, 2, 1]] * [1, -1, 1] - AVERAGE_PELVIS
+    np.testing.assert_allclose(arrays["trans"][9], wanted, atol=1e-6)
     upright = Rotation.from_euler("x", 90, degrees=True)
     wanted = (upright * Rotation.from_matrix(poses[9].rotations[0])).as_rotvec()
     np.testing.assert_allclose(arrays["poses"][9, :3], wanted, atol=2e-6)
@@ -146,7 +179,68 @@ def test_npz_has_the_keys_of_amass_in_a_world_with_z_up(tmp_path):
     assert read.rate == 60.0
     rotations = np.stack([pose.rotations for pose in poses])
     np.testing.assert_allclose(read.rotations, forward_kinematics(rotations, np.zeros((24, 3)))[0], atol=1e-5)
+    moved = np.array([pose.translation - poses[0].translation for pose in poses])
+    np.testing.assert_allclose(read.translation - read.translation[0], moved, atol=1e-5)
+
+
+AVERAGE_PELVIS = np.array([0.0, -0.22, 0.03])
+"""Of SMPL's template: below the model's origin, and a little in front of it."""
+
+
+@pytest.mark.parametrize(
+    ("width", "said", "pelvis"),
+    [
+        (72, {}, AVERAGE_PELVIS),
+        (156, {"surface_model_type": "smplh"}, AVERAGE_PELVIS),
+        (165, {"surface_model_type": "smplx"}, [0.0, -0.35, 0.01]),
+        (165, {"surface_model_type": "smplx_locked_head"}, [0.0, -0.35, 0.01]),
+        (165, {}, [0.0, -0.35, 0.01]),
+        (156, {"pelvis_offset": np.array([0.1, 0.2, 0.3])}, [0.1, 0.2, 0.3]),
+    ],
+)
+def test_the_pelvis_of_an_amass_file(tmp_path, width, said, pelvis):
+    """SMPL: the pelvis is at `trans` plus its place in the template, however the body is turned."""
+    rng = np.random.default_rng(0)
+    poses, trans = rng.normal(scale=0.3, size=(5, width)), rng.normal(size=(5, 3))
+    np.savez(tmp_path / "a.npz", poses=poses, trans=trans, mocap_framerate=60.0, **said)
+    x, y, z = (trans + pelvis).T
+    np.testing.assert_allclose(
+        read_poses(tmp_path / "a.npz").translation, np.stack([x, z, -y], 1), atol=1e-12
+    )
+
+
+def test_npz_that_edgepose_wrote_before_the_pelvis_was_told(tmp_path):
+    poses = motion(5)
+    written(NpzSink(tmp_path / "a.npz", 60.0, True), poses)
+    with np.load(tmp_path / "a.npz") as archive:
+        arrays = dict(archive)
+    arrays["trans"] = arrays["trans"] + arrays.pop("pelvis_offset")  # as it was then: the pelvis itself
+    np.savez(tmp_path / "b.npz", **arrays)
+    same(read_poses(tmp_path / "b.npz"), poses)
+
+
+@pytest.mark.parametrize("joints", [24, 52, 55])
+def test_npz_with_place(tmp_path, joints):
+    poses = [pose._replace(rotations=pose.rotations.copy()) for pose in touching(9)]
+    for pose in poses:
+        pose.rotations[22:] = np.eye(3)
+    written(NpzSink(tmp_path / "a.npz", 60.0, True, True, joints), poses)
+    same(read_poses(tmp_path / "a.npz"), poses)
+
+
+@pytest.mark.parametrize("way", [("npz", "csv"), ("bvh", "npz"), ("csv", "bvh"), ("npz", "bvh")])
+def test_convert_keeps_the_place(tmp_path, way):
+    poses, path = touching(30), tmp_path / "a.csv"
+    written(CsvSink(path, translation=True, contacts=True), poses)
+    for i, ending in enumerate(way):
+        source, path = path, tmp_path / f"{i}.{ending}"
+        convert_poses(source, path)
+    read = read_poses(path)
     np.testing.assert_allclose(read.translation, [pose.translation for pose in poses], atol=1e-5)
+    if "bvh" in way:
+        assert read.contacts is None
+    else:
+        np.testing.assert_allclose(read.contacts, [pose.contacts for pose in poses], atol=1e-6)
 
 
 def test_npz_of_others(tmp_path):
@@ -220,6 +314,12 @@ def test_true_poses_of_a_recording_are_in_the_body_frame(tmp_path):
         ({"time_s": None, "mocap_framerate": np.array(0.0)}, "a frame rate of 0 Hz is not possible"),
         ({"frame": np.array([0, 1, 1, 2, 3])}, "do not increase"),
         ({"held": np.zeros((5, 5), bool)}, "'held' is bool"),
+        ({"contacts": np.zeros((5, 6))}, r"'contacts' is float64 \(5, 6\), not numbers \(5, 7\)"),
+        ({"contacts": np.full((5, 7), 1.5)}, "a number in 'contacts' is not a probability from 0 to 1"),
+        (
+            {"trans": np.ones((5, 3)), "pelvis_offset": np.ones(2)},
+            r"'pelvis_offset' is .* not numbers \(3,\)",
+        ),
         ({"poses": np.array([None] * 5)}, "not a complete NPZ file .*pickle"),
     ],
 )
