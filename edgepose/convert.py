@@ -70,6 +70,7 @@ class Options(NamedTuple):
         unit: of lengths in BVH files to read, a key of `UNITS` in `formats.poses.bvh`; None infers it.
         joints: number of joints in NPZ files of poses, a key of `JOINT_COUNTS`.
         names: names of the joints in BVH files to write, a key of `BVH_NAMES`.
+        leg_length_m: length of the wearer's thigh and shank, metres; None for the average at `height_m`.
     """
 
     protocol: str = "auto"
@@ -80,6 +81,7 @@ class Options(NamedTuple):
     unit: str | None = None
     joints: int = 24
     names: str = "smpl"
+    leg_length_m: float | None = None
 
 
 _DEFAULTS = Options()
@@ -305,7 +307,8 @@ def _write_poses(path: Path, poses: PoseSequence, options: Options) -> None:
         return
     sink: Sink
     if path.suffix == ".bvh":
-        sink = BvhSink(path, poses.rate, default_body(options.height_m), options.names)
+        body = default_body(options.height_m, leg_length_m=options.leg_length_m)
+        sink = BvhSink(path, poses.rate, body, options.names)
     else:
         sink = CsvSink(path, translation=poses.translation is not None, contacts=poses.contacts is not None)
     with sink:

@@ -19,6 +19,7 @@ from edgepose.diagnostics.rig_monitor import RigMonitor
 from edgepose.errors import CalibrationError, EdgeposeError, FileFormatError, prefix_errors
 from edgepose.orientation.stage import OrientationStage
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
+from edgepose.pipeline.network import Network
 from edgepose.pipeline.place_stage import PlaceStage
 from edgepose.pipeline.remote_control import Request, Requests
 from edgepose.pipeline.rig_comparison import missing_heading_reset, other_devices
@@ -73,13 +74,12 @@ class OpenWearer:
             self._orient = OrientationStage(config.filter, magnetometer=calibration.north)
         self._sinks: list[Sink] = []
 
-    def open_outputs(self, stack: ExitStack, rate: float, model: str, stopped: Callable[[], bool]) -> None:
+    def open_outputs(self, stack: ExitStack, network: Network, stopped: Callable[[], bool]) -> None:
         """Open the outputs.
 
         Args:
             stack: closes them.
-            rate: poses per second.
-            model: name of the model, for files that hold it.
+            network: the network that makes the poses.
             stopped: whether the run is to end, see `SinkContext`.
 
         Raises:
@@ -87,15 +87,16 @@ class OpenWearer:
         """
         with prefix_errors(self._config.name):
             about = {
-                "model": model,
+                "model": network.config.model,
                 "calibration": str(self._config.calibration),
                 "source": self._config.source.name,
                 "date": datetime.now().astimezone().isoformat(" ", "minutes"),
                 "edgepose": edgepose.__version__,
             }
             self._sinks = open_outputs(
-                *(stack, self._config.outputs, rate, stopped),
+                *(stack, self._config.outputs, network.rate_hz, stopped),
                 translation=not self._config.no_place,
+                contacts=not self._config.no_place and network.has_place,
                 wearer=self._config.name,
                 about=about,
             )

@@ -103,6 +103,13 @@ class Network:
         return self.config.online == "window" and is_windowed(self.info.metadata)
 
     @property
+    def has_place(self) -> bool:
+        """Whether it estimates contacts and the velocity of the pelvis."""
+        from edgepose.inference.archive import has_place
+
+        return has_place(self.info.metadata)
+
+    @property
     def faster(self) -> list[str]:
         """Flags of `edgepose run` that would make it faster."""
         flags = ["--online stream"] if self.windowed else []
@@ -127,7 +134,7 @@ class Network:
         module = archive.load(self.info, self.config.trust)
         precision = quantise_weights(module, self.info, self.config.precision, notify)
         place = not all(wearer.no_place for wearer in wearers)
-        if place and not archive.has_place(self.info.metadata):
+        if place and not self.has_place:
             notify(
                 f"{self.config.model} does not estimate contacts: the lowest foot counts as standing still, "
                 "so the path is less accurate"

@@ -14,6 +14,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.pose import PoseFrame
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.sinks.udp import UdpSink
+from edgepose.skeleton import Body
 
 _log = logging.getLogger(__name__)
 
@@ -26,11 +27,11 @@ class ViewSink(Sink):
 
     live = True
 
-    def __init__(self, height_m: float, wearer: str = "") -> None:
+    def __init__(self, body: Body, wearer: str = "") -> None:
         """Store the settings; `start` starts the viewer.
 
         Args:
-            height_m: stature of the figure, metres.
+            body: body of the figure, whose height and leg length the viewer gets.
             wearer: name before the viewer's messages.
 
         Raises:
@@ -38,7 +39,7 @@ class ViewSink(Sink):
         """
         if find_spec("viser") is None:
             raise EdgeposeError("the viewer needs viser: install it with pip install 'edgepose[view]'")
-        self._height_m, self._wearer = height_m, wearer
+        self._body, self._wearer = body, wearer
         self._viewer: subprocess.Popen[str] | None = None
 
     def start(self) -> None:
@@ -47,8 +48,9 @@ class ViewSink(Sink):
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
         command = [sys.executable, "-m", "edgepose", "view", "--udp", f"127.0.0.1:{port}", "--with-parent"]
+        size = ["--height", str(self._body.height_m), "--leg-length", str(self._body.leg_length_m)]
         self._viewer = subprocess.Popen(
-            [*command, "--height", str(self._height_m)],
+            [*command, *size],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
@@ -86,4 +88,4 @@ def _log_lines(lines: IO[str], wearer: str) -> None:
 
 def open_sink(target: bool, context: SinkContext) -> Sink:
     """Open a `ViewSink`."""
-    return ViewSink(context.height, context.wearer)
+    return ViewSink(context.body, context.wearer)

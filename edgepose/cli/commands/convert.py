@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from edgepose.cli.options.body import leg_length_option
 from edgepose.cli.options.outputs import overwrite_option
 from edgepose.cli.options.source import protocol_option, sensors_option
 from edgepose.cli.terminal.messages import has_terminal, printable, progress_bar, say, show
@@ -55,6 +56,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="The wearer's height, metres, for the bones of BVH files.",
 )
+@leg_length_option
 @click.option(
     "--unit",
     type=click.Choice(list(UNITS)),
@@ -92,6 +94,7 @@ def convert(
     out: Path,
     filter: str,
     height: float,
+    leg_length: float | None,
     unit: str | None,
     joints: str,
     names: str,
@@ -127,7 +130,7 @@ def convert(
     if skip_existing and overwrite:
         raise click.UsageError("--skip-existing keeps what --overwrite replaces: give one of them")
     # Checked here, so that a mistake in them is reported once and not for each recording.
-    default_body(height)
+    default_body(height, leg_length_m=leg_length)
     if sensors is not None:
         read_map(sensors)
     planned = plan(inputs, to, out)
@@ -135,8 +138,8 @@ def convert(
     todo = [job for job in planned if job not in done]
     _check_targets(todo, to, overwrite)
     try:
-        options = Options(protocol, sensors, filter, height, overwrite, unit, int(joints), names)
-        for result in _with_progress(convert_all(todo, options, jobs), len(todo)):
+        flags = protocol, sensors, filter, height, overwrite, unit, int(joints), names, leg_length
+        for result in _with_progress(convert_all(todo, Options(*flags), jobs), len(todo)):
             done[result.job] = result
     finally:
         show(_table([done[job] for job in planned if job in done]))

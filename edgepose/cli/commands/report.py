@@ -8,6 +8,7 @@ from pathlib import Path
 
 import click
 
+from edgepose.cli.options.body import leg_length_option
 from edgepose.cli.options.outputs import overwrite_option
 from edgepose.cli.terminal.messages import show
 from edgepose.sinks.output_files import check_output
@@ -27,8 +28,9 @@ from edgepose.sinks.output_files import check_output
     show_default=True,
     help="The wearer's height, metres, for the figures and for finding steps.",
 )
+@leg_length_option
 @overwrite_option
-def report(poses: Path, out: Path | None, height: float, overwrite: bool) -> None:
+def report(poses: Path, out: Path | None, height: float, leg_length: float | None, overwrite: bool) -> None:
     """Make one HTML page about the poses of a file (CSV, BVH, or NPZ with the keys of AMASS): figures, steps
     and cadence, joint angles over time, ranges of motion, and how often each sensor was silent.
 
@@ -49,7 +51,7 @@ def report(poses: Path, out: Path | None, height: float, overwrite: bool) -> Non
     if os.path.realpath(path) == os.path.realpath(poses):
         raise click.UsageError(f"--out would overwrite {poses}; name another file")
     check_output(path, "the report", (".html", ".htm"), overwrite)
-    body = default_body(height)
+    body = default_body(height, leg_length_m=leg_length)
     sequence = read_poses(poses)
     made = datetime.fromtimestamp(poses.stat().st_mtime).astimezone() if poses.is_file() else None
     date = "" if made is None else made.isoformat(" ", "minutes")

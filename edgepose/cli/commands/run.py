@@ -63,7 +63,7 @@ def run(wearers: list[WearerConfig], settings: NetworkConfig) -> None:
         engine, precision = network.load(wearers, say)
         stop = stack.enter_context(StopSignal())
         for wearer in opened:
-            wearer.open_outputs(stack, network.rate_hz, network.config.model, lambda: stop.asked)
+            wearer.open_outputs(stack, network, lambda: stop.asked)
         say(_headline(network, precision, wearers, keys.listening))
         pipelines = run_wearers(opened, engine, network, live, lambda: stop.asked, _progress(network))
     end_status()

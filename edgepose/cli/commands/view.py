@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from edgepose.cli.options.body import leg_length_option
 from edgepose.cli.terminal.messages import say
 from edgepose.cli.terminal.stop_signal import StopSignal
 from edgepose.errors import EdgeposeError
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     "--port", type=click.IntRange(1, 65535), default=8080, show_default=True, help="TCP port of the page."
 )
 @click.option("--height", type=float, default=1.75, show_default=True, help="Height of the figure, metres.")
+@leg_length_option
 @click.option(
     "--with-parent", is_flag=True, hidden=True, help="Exit when the program that started this one exits."
 )
@@ -45,6 +47,7 @@ def view(
     host: str,
     port: int,
     height: float,
+    leg_length: float | None,
     with_parent: bool,
 ) -> None:
     """Show poses as a 3-D figure in the browser until Ctrl-C: those of a file (CSV, BVH, or NPZ with the keys
@@ -68,7 +71,7 @@ def view(
     from edgepose.formats.poses.registry import read_poses
     from edgepose.skeleton import default_body
 
-    body = default_body(height)
+    body = default_body(height, leg_length_m=leg_length)
     parent = os.getppid()
     with ExitStack() as stack:
         stop = stack.enter_context(StopSignal())

@@ -215,7 +215,13 @@ def test_a_socket_hears_wishes_and_counts_the_rest():
     with Control("127.0.0.1", 0) as control, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.connect(control._socket.getsockname())
         assert control.requests() == []
-        for datagram in (b"rezero", b"origin", b"hello", os.urandom(2000), OSC + b",f\0\0" + struct.pack(">f", 1.5)):
+        for datagram in (
+            b"rezero",
+            b"origin",
+            b"hello",
+            os.urandom(2000),
+            OSC + b",f\0\0" + struct.pack(">f", 1.5),
+        ):
             sender.send(datagram)
         heard, until = [], time.monotonic() + 10
         while len(heard) < 3 and time.monotonic() < until:
