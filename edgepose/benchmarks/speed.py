@@ -35,11 +35,13 @@ from edgepose.inference.features import INPUTS
 from edgepose.inference.quantisation import PRECISIONS, quantise_weights
 from edgepose.orientation import OrientationEstimator
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
+from edgepose.pipeline.place_stage import PlaceStage
 from edgepose.pipeline.run import run
 from edgepose.pipeline.wearer_pipeline import WearerPipeline, pose_frame
 from edgepose.placements import PLACEMENTS
 from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.udp import UdpSink, encode_binary, encode_json
+from edgepose.skeleton import default_body
 from edgepose.sources import Batch
 from firmware_protocols.registry import PROTOCOLS, Decoder
 from firmware_protocols.sample import Sample
@@ -119,6 +121,7 @@ def step_costs(engine: Engine, folder: Path) -> dict[str, float]:
     """
     decoder, clock = PROTOCOLS["native"].decoder(), FrameSynchronizer(RATE)
     headings, orienter = HeadingRezero(_calibration()), OrientationEstimator("kalman")
+    place = PlaceStage(default_body())
 
     def to_frames(samples: list[ImuSample]) -> list[ImuFrame]:
         clock.push(samples, samples[-1].time_s)
@@ -135,8 +138,9 @@ def step_costs(engine: Engine, folder: Path) -> dict[str, float]:
     _, costs["filter, where sensors send none"] = _timed(orienter.orient, samples)
     batches, costs["frames"] = _timed(to_frames, samples)
     bodies, costs["calibration"] = _timed(calibrated, [frame for frames in batches for frame in frames])
-    outputs, costs["network"] = _timed(lambda body: engine.push(*body), bodies)
-    poses = [pose_frame(output) for batch in outputs for output in batch]
+    batches_of_poses, costs["network"] = _timed(lambda body: engine.push(*body), bodies)
+    outputs = [output for batch in batches_of_poses for output in batch]
+    poses, costs["place"] = _timed(lambda output: place.add_to(pose_frame(output), output), outputs)
     _, costs["UDP binary, not yet sent"] = _timed(encode_binary, poses)
     _, costs["UDP JSON, not yet sent"] = _timed(encode_json, poses)
     with CsvSink(folder / "poses.csv") as sink:
@@ -181,7 +185,12 @@ def whole_walk(engine: Engine, paced: bool) -> Latency:
         listener.bind(("127.0.0.1", 0))
         with UdpSink("127.0.0.1", listener.getsockname()[1], "binary") as sink:
             summary = run(
-                WearerPipeline(FrameSynchronizer(RATE), HeadingRezero(_calibration()), [sink]),
+                WearerPipeline(
+                    FrameSynchronizer(RATE),
+                    HeadingRezero(_calibration()),
+                    [sink],
+                    place=PlaceStage(default_body()),
+                ),
                 source(),
                 engine,
             )
@@ -258,7 +267,8 @@ def load_engine(info: archive.ArchiveInfo, trust: bool, precision: str, mode: st
     module = archive.load(info, trust)
     quantise_weights(module, info, precision)
     kind = StreamEngine if mode == "stream" else WindowEngine
-    engine = kind(module, info.metadata["past"], info.metadata["future"])
+    place = archive.has_place(info.metadata)
+    engine = kind(module, info.metadata["past"], info.metadata["future"], place=place)
     gc.collect()
     gc.freeze()
     return engine

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 leg_length_option = click.option(
     "--leg-length",
     type=float,
-    metavar="METRES",
     help="Length of the wearer's thigh and shank, metres: standing, from the bony point at the side of the "
     "hip, where the leg turns, straight down to the ankle bone.  [default: the average for --height]",
 )

@@ -87,8 +87,8 @@ def output_options(command: Command) -> Command:
         type=float,
         default=1.75,
         show_default=True,
-        help="The wearer's height, metres: for the way that their steps cover, and for the bones of --bvh, "
-        "--osc and --view.",
+        help="The wearer's height, metres: for the length of their steps, and for the bones of --bvh, --osc "
+        "and --view.",
     )
     other_sinks_option = click.option(
         "--sink",

@@ -22,7 +22,7 @@ def test_every_step_and_way_is_measured(tmp_path, write_archive):
     assert done.returncode == 0, done.stderr
     assert done.stderr == "measuring small\n"
     (model,) = json.loads(done.stdout)["models"]
-    assert {"decode", "frames", "calibration", "network", "CSV"} < set(model["steps_us"])
+    assert {"decode", "frames", "calibration", "network", "place", "CSV"} < set(model["steps_us"])
     assert all(cost > 0 for cost in model["steps_us"].values())
     ways = [(way["mode"], way["precision"]) for way in model["ways"]]
     assert ways == [
