@@ -43,7 +43,7 @@ class PlaceStage:
         self._requests, self._notify = requests, notify
         self._reset_at_s = inf
         self._place: Place | None = None
-        self._way = _Way()
+        self._way = Way()
 
     @property
     def way_m(self) -> float:
@@ -67,7 +67,7 @@ class PlaceStage:
             self._notify("place reset: the wearer is back at the origin, on the ground")
 
 
-class _Way:
+class Way:
     """Length of a horizontal path without its sway: that of the polygon whose corners are `STEP_M` apart."""
 
     def __init__(self) -> None:

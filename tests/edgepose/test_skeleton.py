@@ -7,8 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edgepose.errors import EdgeposeError
+from edgepose.placements import PLACEMENTS
 from edgepose.rotations import nearest_rotation, rotvec_to_matrix
-from edgepose.skeleton import JOINTS, PARENTS, default_body, forward_kinematics, local_from_global
+from edgepose.skeleton import (
+    JOINTS,
+    PARENTS,
+    default_body,
+    forward_kinematics,
+    local_from_global,
+    standing_pelvis_position,
+)
 
 SEXES = ("neutral", "male", "female")
 
@@ -164,6 +172,41 @@ def test_default_body_refuses_statures_of_nobody(height):
 def test_default_body_refuses_an_unknown_sex():
     with pytest.raises(EdgeposeError, match=r"'robot'.*neutral, male, female"):
         default_body(1.75, "robot")
+
+
+@pytest.mark.parametrize("leg_length_m", [0.75, 0.8464, 0.95])
+def test_legs_of_a_measured_length(leg_length_m):
+    """The wearer is as tall as before, and the arms are as long."""
+    plain, body = default_body(1.75), default_body(1.75, leg_length_m=leg_length_m)
+    assert body.leg_length_m == pytest.approx(leg_length_m)
+    assert body.height_m == 1.75
+    straight = np.tile(np.eye(3), (24, 1, 1))
+    (_, before), (_, after) = (
+        forward_kinematics(straight, offsets, standing_pelvis_position(offsets))
+        for offsets in (plain.offsets, body.offsets)
+    )
+    head, ankle = JOINTS.index("head"), JOINTS.index("left_ankle")
+    assert after[head, 1] == pytest.approx(before[head, 1])
+    assert after[ankle, 1] == pytest.approx(before[ankle, 1])
+    others = [j for j in range(1, 24) if j not in (3, 4, 5, 6, 7, 8, 9, 12, 15)]
+    np.testing.assert_array_equal(body.offsets[others], plain.offsets[others])
+    shin, ratio = PLACEMENTS.index("right_lower_leg"), leg_length_m / plain.leg_length_m
+    np.testing.assert_allclose(body.sensors[shin], ratio * plain.sensors[shin])
+    assert (body.sensors[PLACEMENTS.index("head")] == plain.sensors[PLACEMENTS.index("head")]).all()
+
+
+def test_the_leg_length_of_a_body_gives_that_body():
+    body = default_body(1.62, "female")
+    again = default_body(1.62, "female", body.leg_length_m)
+    np.testing.assert_array_equal(again.offsets, body.offsets)
+    np.testing.assert_array_equal(again.sensors, body.sensors)
+
+
+@pytest.mark.parametrize("leg_length", [0.0, -0.8, 0.7, 1.0, 85.0, float("nan"), float("inf")])
+def test_legs_of_nobody_of_that_height_are_refused(leg_length):
+    expected = r"leg length .* m does not fit a height of 1.75 m, for which it is 0.72 to 0.97 m: .* metres"
+    with pytest.raises(EdgeposeError, match=expected):
+        default_body(1.75, leg_length_m=leg_length)
 
 
 def test_the_table_is_small_and_names_its_source():

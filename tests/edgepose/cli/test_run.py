@@ -186,7 +186,32 @@ def test_standard_output_without_past_and_future(command, wearer, tmp_path):
     frames, _, status, _ = whole(file)
     assert len(frames) == 180
     assert status == ["ok"] * 180
-    assert len(numbers(file)[1]) == 3 + 72
+    assert len(numbers(file)[1]) == 3 + 72 + 3 + 7  # rotations, translation, contacts
+
+
+def test_a_run_with_and_without_the_place(command, wearer, tmp_path):
+    """Without it there is nothing of it in any output, and no way; the poses are the same."""
+    rows, told = {}, {}
+    for flags in ((), ("--no-place",)):
+        file = tmp_path / f"{len(flags)}.csv"
+        with Listener() as listener:
+            result = command(
+                *("run", "--file", wearer.short, "--calibration", wearer.calibration, "--model", "rnn"),
+                *("--std", "--csv", file, "--udp", listener.address, *flags),
+            )
+        assert result.returncode == 0, result.stderr
+        rows[flags], told[flags] = numbers(file), result.stderr
+        datagrams = [json.loads(datagram) for datagram in listener.datagrams]
+        assert {"trans" in pose for pose in datagrams} == {not flags}
+        assert {"contacts" in pose for pose in datagrams} == {not flags}
+    whole, plain = rows.values()
+    width = len(plain[0])
+    assert plain[0][-1] == "right_hand_std"
+    assert whole[0][width] == "trans_x"
+    assert [row[:width] for row in whole] == plain
+    assert "way " not in told["--no-place",]
+    (way_m,) = re.findall(r"^way      (\d+\.\d) m walked$", told[()], re.MULTILINE)
+    assert 1.0 < float(way_m) < 4.0
 
 
 def test_a_clock_that_began_anew_is_told(command, wearer, tmp_path):

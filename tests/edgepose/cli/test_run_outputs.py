@@ -116,6 +116,7 @@ def test_an_interrupted_run_leaves_whole_files(wearer, tmp_path, numbers):
         (["--bvh", "a.bvh,names=maya"], 2, "possible are names=smpl|mixamo|unity|motionbuilder|rokoko"),
         (["--tcp", "192.0.2.1:8888"], 1, "cannot listen for viewers at 192.0.2.1 port 8888"),
         (["--bvh", "a.bvh", "--height", "175"], 1, "height 175 m is not between"),
+        (["--bvh", "a.bvh", "--leg-length", "85"], 1, "leg length 85 m does not fit a height of 1.75 m"),
         (["--bvh", "RECORDING"], 2, "--bvh would overwrite"),
     ],
 )

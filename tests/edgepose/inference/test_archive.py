@@ -17,6 +17,8 @@ from edgepose.cli import cli
 from edgepose.errors import EdgeposeError
 from edgepose.inference import archive
 from edgepose.inference.engine import WindowEngine
+from edgepose.pose import CONTACTS
+from edgepose_export.networks.shape import NetworkShape
 
 
 @pytest.fixture(autouse=True)
@@ -303,3 +305,16 @@ def test_models_command(tmp_path, made):
     steering = json.dumps(metadata_of(made) | {"name": "\x1b[2J"})
     odd = with_metadata(made, tmp_path / "odd.pt", steering)
     assert "\x1b" not in run(cli, ["models", str(odd)], color=True).output
+
+
+# --- the place ----------------------------------------------------------------------------------------------
+
+
+def test_contacts_that_an_archive_estimates(tmp_path, write_archive):
+    shape = NetworkShape("rnn", 8, "global-6d", "passed", place=True)
+    path = write_archive(tmp_path / "place.pt", shape)
+    assert archive.has_place(archive.read_info(path).metadata)
+    assert not archive.has_place(archive.read_info(write_archive(tmp_path / "plain.pt")).metadata)
+    for place in (None, 7, {}, {"contacts": ["left_ankle"]}, {"contacts": [*CONTACTS, "head"]}):
+        text = json.dumps(metadata_of(path) | {"place": place})
+        fails(with_metadata(path, tmp_path / "other.pt", text), "made for other contacts")

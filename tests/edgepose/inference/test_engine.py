@@ -3,6 +3,8 @@ import pytest
 import torch
 
 from edgepose.inference.engine import EngineInput, EngineOutput, MultiWearerEngine, StreamEngine, WindowEngine
+from edgepose.inference.quantisation import pack_weights
+from edgepose_export.archive.torchscript import script
 from edgepose_export.networks.shape import NetworkShape
 
 BIRNN = NetworkShape("birnn", 8, "global-6d", "passed")
@@ -124,6 +126,59 @@ def test_frames_together_of_a_field(tiny, wearers):
         np.testing.assert_allclose(a.rotations, b.rotations, atol=2e-5)
 
 
+@pytest.mark.parametrize("precision", ["f32", "fp16", "int8"])
+@pytest.mark.parametrize("kind", ["birnn", "rnn"])
+def test_the_place_beside_the_same_poses(parts, wearers, kind, precision):
+    """In every engine and precision, to the last bit; without the wish for it there is none."""
+    module = script(*parts(BIRNN._replace(kind=kind, place=True)))
+    if precision != "f32":
+        pack_weights(module, precision)
+    orientation, acceleration = (x[0] for x in wearers(1, 11))
+    future = 2 if kind == "birnn" else 0
+    engines = {
+        "stream": lambda place: StreamEngine(module, 3, future, place=place),
+        "many": lambda place: StreamEngine(module, 3, future, 4, place=place),
+        "wearers": lambda place: Alone(MultiWearerEngine(module, 3, future, 1, place=place)),
+    }
+    if kind == "birnn":
+        engines["window"] = lambda place: WindowEngine(module, 3, future, place=place)
+    places = {}
+    for name, make in engines.items():
+        with_place, without = (run(make(place), orientation, acceleration)[0] for place in (True, False))
+        assert [output.frame for output in with_place] == list(range(11))
+        for a, b in zip(with_place, without, strict=True):
+            np.testing.assert_array_equal(a.rotations, b.rotations)
+            np.testing.assert_array_equal(a.std, b.std)
+            assert (a.place.shape, a.place.dtype, b.place) == ((10,), np.float32, None)
+        places[name] = np.array([output.place for output in with_place])
+    np.testing.assert_array_equal(places["wearers"], places["stream"])
+    if precision != "int8":  # its scale is that of all that is computed at once
+        tolerance = 2e-5 if precision == "f32" else 2e-3
+        np.testing.assert_allclose(places["many"], places["stream"], atol=tolerance)
+    assert places["stream"].std(axis=0).min() > 1e-4
+    # They are those of their frames, not of later ones.
+    with torch.no_grad():
+        state, expected = module.start(1, future), []
+        for o, a in zip(orientation, acceleration, strict=True):
+            _, _, place, state = module.stream_place(o[None], a[None], state)
+            expected += place[0]
+        expected += module.drain_place(state)[2][0]
+    np.testing.assert_array_equal(places["stream"], np.array(expected))
+
+
+class Alone:
+    """An engine of several wearers, with one."""
+
+    def __init__(self, engine):
+        self.engine = engine
+
+    def push(self, *body):
+        return self.engine.push({0: EngineInput(*body)})[0]
+
+    def finish(self):
+        return self.engine.finish(0)
+
+
 def together(engine, spans, orientation, acceleration):
     """Outputs of wearers whose frames go in together; each has spans of steps in which it takes part."""
     outputs = [[] for _ in spans]
@@ -173,6 +228,18 @@ def test_wearers_together_get_the_poses_that_each_gets_alone(tiny, wearers, shap
         for a, b in zip(own, alone, strict=True):
             np.testing.assert_allclose(a.rotations, b.rotations, atol=1e-5)
             np.testing.assert_allclose(a.std, b.std, atol=1e-5)
+
+
+def test_wearers_together_get_the_places_that_each_gets_alone(tiny, wearers):
+    spans = [[(0, 9)], [(5, 9)], [(0, 2), (6, 9)]]
+    module, (orientation, acceleration) = tiny(BIRNN._replace(place=True)), wearers(3, 9)
+    outputs, seen = together(MultiWearerEngine(module, 4, 3, 3, place=True), spans, orientation, acceleration)
+    for wearer, own in enumerate(outputs):
+        frames = slice(0, seen[wearer])
+        engine = StreamEngine(module, 4, 3, place=True)
+        alone, _, _ = run(engine, orientation[wearer, frames], acceleration[wearer, frames])
+        for a, b in zip(own, alone, strict=True):
+            np.testing.assert_allclose(a.place, b.place, atol=1e-5)
 
 
 def test_a_step_is_one_pass_of_the_network_for_all(tiny, wearers):

@@ -64,7 +64,8 @@ def words(*files: Path) -> list[object]:
 
 def test_files_are_named_against_the_folder_of_the_rig_file(rig, tmp_path):
     own = {"file": "walk.csv", "calibration": "../calib.json", "sensors": "/map.toml", "csv": "-"}
-    (flags,) = read_rigs([rig(**own, protocol="mine.toml", npz="out/a.npz", height=2, std=True, no_mag=True)])
+    more = {"height": 2, "std": True, "no_mag": True, "leg_length": 1, "no_place": True}
+    (flags,) = read_rigs([rig(**own, protocol="mine.toml", npz="out/a.npz", **more)])
     assert flags.name == "anna"
     assert flags.source.file == tmp_path / "walk.csv"
     assert flags.source.sensors == Path("/map.toml")
@@ -72,8 +73,11 @@ def test_files_are_named_against_the_folder_of_the_rig_file(rig, tmp_path):
     assert flags.calibration == tmp_path / "../calib.json"
     assert (flags.outputs.csv, flags.outputs.npz) == ("-", str(tmp_path / "out/a.npz"))
     assert (flags.outputs.height, flags.outputs.std, flags.no_mag) == (2.0, True, True)
+    assert (flags.outputs.leg_length, flags.outputs.body.leg_length_m, flags.no_place) == (1.0, 1.0, True)
     # What is not there is as on the command line.
     assert (flags.filter, flags.outputs.rotations, flags.source.realtime) == ("none", "axis-angle", False)
+    (flags,) = read_rigs([rig("ben")])
+    assert (flags.outputs.leg_length, flags.no_place) == (None, False)
 
 
 def test_addresses_and_lines_are_read_as_flags(rig):
@@ -105,6 +109,8 @@ def test_addresses_and_lines_are_read_as_flags(rig):
         ({"baud": True}, "baud must be a whole number, not True"),
         ({"baud": 0}, "baud: 0 is not in the range x>=1"),
         ({"height": "tall"}, "height must be a number, not 'tall'"),
+        ({"leg-length": "long"}, "leg-length must be a number, not 'long'"),
+        ({"no-place": 1}, "no-place must be true or false, not 1"),
         ({"csv": ["a.csv"]}, "csv must be text in quotes, not ['a.csv']"),
         ({"protocol": "nonsense"}, "protocol: unknown protocol 'nonsense'"),
         ({"filter": "best"}, "filter: 'best' is not one of"),
@@ -278,6 +284,7 @@ def test_wearers_get_the_poses_that_each_gets_alone(
     result = command("run", *words(*rigs), "--model", model, "--trust", "--precision", "f32")
     assert result.returncode == 0, result.stderr
     assert f"running 3 wearers with {model} ({kind}, stream) in f32" in result.stderr
+    assert result.stderr.count(f"{model} does not estimate contacts: the lowest foot counts as standing") == 1
     lengths = []
     for name, file in files.items():
         headings = HeadingRezero(load_calibration(wearer.calibration))
@@ -291,9 +298,11 @@ def test_wearers_get_the_poses_that_each_gets_alone(
         np.testing.assert_array_equal(ours.frames, theirs.frames)
         np.testing.assert_array_equal(ours.time_s, theirs.time_s)
         assert ours.status == theirs.status
+        assert ours.translation is not None
         np.testing.assert_allclose(ours.rotations, theirs.rotations, atol=1e-5)
         lengths.append(len(ours.frames))
         assert f"{name}: poses    {len(ours.frames)} in " in result.stderr
+        assert re.search(rf"^{name}: way      \d+\.\d m walked$", result.stderr, re.MULTILINE)
     assert lengths == [180, 90, 1]
 
 
