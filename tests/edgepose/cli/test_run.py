@@ -35,11 +35,11 @@ from edgepose.skeleton import JOINTS, PARENTS
 from firmware_protocols import native_can
 from firmware_protocols.native import encode
 from firmware_protocols.native_packet import Packet
-from tests.support import limits
-from tests.support.datagrams import Listener
+from tests.support import limits, processes
+from tests.support.datagrams import Listener, free_address
 from tests.support.ports import Port, Sender
 from tests.support.processes import end, simulated, start
-from tests.support.terminals import rest_of
+from tests.support.terminals import own_terminal, rest_of
 
 BONES = [18, 19, 4, 5, 15, 0]  # those with the sensors, in the order of PLACEMENTS
 
@@ -531,6 +531,46 @@ def test_live_from_the_simulator_until_sigterm(wearer, tmp_path):
     # Live times are Unix times: there are frames of the time in which the recording was played.
     started, ended = (float(words[1]) for words in said)
     assert ((time_s > started) & (time_s < ended)).any()
+
+
+def test_the_place_is_reset_by_key_text_and_osc(wearer, tmp_path):
+    """The wearer runs on; each request puts them back above the origin."""
+    file, control = tmp_path / "poses.csv", free_address(socket.SOCK_DGRAM)
+    host, _, number = control.partition(":")
+    outside, inside = pty.openpty()
+    command = ["run", "--model", "rnn", "--csv", file, "--calibration", wearer.calibration]
+    with Rig(wearer.short) as rig, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.connect((host, int(number)))
+        requests = (
+            lambda: os.write(outside, b"O"),
+            lambda: sender.send(b"origin"),
+            lambda: sender.send(b"/edgepose/origin\0\0\0\0,\0\0\0"),
+            lambda: os.write(outside, b"\3"),
+        )
+        process = processes.Popen(
+            [sys.executable, "-m", "edgepose", *map(str, command), "--port", rig.port, "--control", control],
+            stdin=inside, stdout=inside, stderr=inside, preexec_fn=own_terminal,
+        )  # fmt: skip
+        os.close(inside)
+        screen = b""
+        try:
+            for times, ask in enumerate(requests):
+                parts = [screen]
+                while len(parts) <= times or b" poses, " not in parts[-1]:
+                    screen += os.read(outside, 4096)
+                    parts = screen.split(b"place reset: the wearer is back at the origin")
+                ask()
+            screen += rest_of(outside)
+            assert process.wait(60) == 0
+        finally:
+            process.kill()
+            process.wait()
+            os.close(outside)
+    assert b"Ctrl-C ends the run, r re-zeroes headings, o resets the place" in b" ".join(screen.split())
+    assert b"datagrams without" not in screen
+    path = read_poses(file).translation[:, [0, 2]]
+    assert (path == 0.0).all(axis=1).sum() == 4  # the start, and after each request
+    assert np.linalg.norm(path, axis=1).max() > 0.5
 
 
 def slcan(packet: Packet) -> bytes:
