@@ -13,11 +13,11 @@ from edgepose.skeleton import JOINTS, PARENTS, forward_kinematics
 Array = NDArray[np.float64]
 
 RADII = {
-    "hip": 0.08, "spine1": 0.115, "knee": 0.068, "spine2": 0.115, "ankle": 0.05, "spine3": 0.12, "foot": 0.04,
-    "neck": 0.055, "collar": 0.075, "head": 0.05, "shoulder": 0.06, "elbow": 0.047, "wrist": 0.038,
-    "hand": 0.035,
+    "pelvis": 0.115, "hip": 0.08, "spine1": 0.115, "knee": 0.068, "spine2": 0.115, "ankle": 0.05,
+    "spine3": 0.12, "foot": 0.04, "neck": 0.055, "collar": 0.075, "head": 0.05, "shoulder": 0.06,
+    "elbow": 0.047, "wrist": 0.038, "hand": 0.035,
 }  # fmt: skip
-"""Radius of the bone that ends at a joint, metres, the same on the left and right."""
+"""Radius of the bone that ends at a joint, and of the ball of the pelvis, metres."""
 
 TIPS = {10: (0.0, 0.0, 0.06), 11: (0.0, 0.0, 0.06), 22: (0.07, 0.0, 0.0), 23: (-0.07, 0.0, 0.0)}
 """Ends of feet and hands: joint, and position in its frame, metres."""
@@ -55,15 +55,16 @@ def _side(joint: int) -> str:
     return side if side in ("left", "right") else "trunk"
 
 
-def _radius(joint: int) -> float:
+def radius(joint: int) -> float:
+    """Return the radius of the bone that ends at a joint, metres."""
     return RADII[JOINTS[joint].rpartition("_")[2]]
 
 
 def build(offsets: ArrayLike) -> tuple[BodyMesh, BodyMesh]:
     """Return the cylinders and balls of a body with `offsets` (24, 3), metres."""
     offsets = np.asarray(offsets, float)
-    bones = [(PARENTS[j], np.zeros(3), offsets[j], _radius(j), _side(j)) for j in range(1, len(JOINTS))]
-    bones += [(j, np.zeros(3), np.array(tip), _radius(j), _side(j)) for j, tip in TIPS.items()]
+    bones = [(PARENTS[j], np.zeros(3), offsets[j], radius(j), _side(j)) for j in range(1, len(JOINTS))]
+    bones += [(j, np.zeros(3), np.array(tip), radius(j), _side(j)) for j, tip in TIPS.items()]
     along = np.stack([end - start for _, start, end, _, _ in bones])
     lengths = np.linalg.norm(along, axis=1)
     # The nudge gives bones without length, or against Z, some direction.
@@ -78,7 +79,7 @@ def build(offsets: ArrayLike) -> tuple[BodyMesh, BodyMesh]:
         [side for *_, side in bones],
     )
     balls = [(joint, end, (radius,) * 3, side) for joint, _, end, radius, side in bones]
-    balls += [(0, np.zeros(3), (RADII["spine1"],) * 3, "trunk")]
+    balls += [(0, np.zeros(3), (RADII["pelvis"],) * 3, "trunk")]
     balls += [(15, np.array(HEAD), HEAD_SIZE, "trunk"), (15, np.array(NOSE), NOSE_SIZE, "trunk")]
     return cylinders, BodyMesh(
         np.array([joint for joint, *_ in balls]),

@@ -6,7 +6,6 @@ The scene and its controls are viser's, which serves its own page; nothing is lo
 from __future__ import annotations
 
 import io
-import re
 import select
 import socket
 import time
@@ -19,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
-from edgepose.placements import PLACEMENTS
-from edgepose.pose import PoseFrame, PoseSequence, held_sensors, longest_holds
-from edgepose.sinks.udp import decode
-from edgepose.skeleton import Body, forward_kinematics
-from edgepose.viewer.body_mesh import build, ground
+from edgepose.pose import CONTACTS, PoseSequence, held_sensors
+from edgepose.skeleton import JOINTS, Body, forward_kinematics
+from edgepose.viewer.body_mesh import RADII, build, ground, radius
 from edgepose.viewer.camera import FollowingCameras, place_first_camera
+from edgepose.viewer.path import FloorPath
 from edgepose.viewer.same_origin import same_origin_only
+from edgepose.viewer.stream import WINDOW_S, UdpPoseStream, plain, sensor_table
 
 Array = NDArray[np.float64]
 
@@ -33,16 +32,31 @@ POSE = {"left": "#1F8FDB", "trunk": "#17588A", "right": "#082C47"}
 REFERENCE = {"left": "#B0B0B0", "trunk": "#808080", "right": "#585858"}
 """Colours; sides differ in lightness, which every eye sees. The lights of the scene brighten them."""
 
+CONTACT = "#E69F00"
+"""Colour of the joints that rest on something."""
+
+TOUCHING = 0.5
+"""Probability of contact above which a joint is marked."""
+
 FRAME_S = 1.0 / 60.0
 """Time between two pictures, seconds."""
 
 TABLE_S = 0.25
 """Time between two updates of the text beside the figure, seconds."""
 
-WINDOW_S = 5.0
-"""Time over which rates and gaps are computed, seconds."""
+POINTS_PER_S = 20
+"""Poses per second of a file that its path goes through."""
 
 SPEEDS = ("0.25", "0.5", "1", "2", "4")
+
+
+_TOUCHING_JOINTS = [JOINTS.index(name) for name in CONTACTS]
+_MARK_SIZES = 1.2 * np.array([radius(joint) for joint in _TOUCHING_JOINTS])
+_HIDDEN = 1e-6
+"""Size of the marks of joints that rest on nothing."""
+
+SOLE_M = np.array([0.0, RADII["foot"], 0.0])
+"""From a joint on the floor up to where it is drawn, so that its solids lie on the floor."""
 
 
 class SkeletonView:
@@ -54,59 +68,55 @@ class SkeletonView:
         """Put a body in its zero pose into the scene of a viser server."""
         import trimesh
 
-        self._offsets = body.offsets
-        self._solids = build(body.offsets)
-        meshes = (
-            trimesh.creation.cylinder(radius=1.0, height=1.0, sections=20),
-            trimesh.creation.icosphere(subdivisions=2),
-        )
-        self._handles = []
-        for kind, solids, mesh in zip(("bones", "joints"), self._solids, meshes, strict=True):
-            count = len(solids.joints)
-            handle = server.scene.add_batched_meshes_simple(
+        def add(kind: str, mesh: Any, sizes: Array, colours: list[tuple[int, ...]]) -> Any:
+            return server.scene.add_batched_meshes_simple(
                 f"/{name}/{kind}",
                 np.asarray(mesh.vertices, np.float32),
                 np.asarray(mesh.faces, np.uint32),
-                np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
-                np.zeros((count, 3)),
-                batched_scales=solids.sizes,
-                batched_colors=np.array([_rgb(colours[side]) for side in solids.sides], np.uint8),
+                np.tile([1.0, 0.0, 0.0, 0.0], (len(sizes), 1)),
+                np.zeros((len(sizes), 3)),
+                batched_scales=sizes,
+                batched_colors=np.array(colours, np.uint8),
                 opacity=opacity,
                 lod="off",
             )
-            self._handles.append((solids, handle))
 
-    def show(self, rotations: Array, position: Array | None) -> Array:
+        self._offsets = body.offsets
+        ball = trimesh.creation.icosphere(subdivisions=2)
+        cylinder = trimesh.creation.cylinder(radius=1.0, height=1.0, sections=20)
+        self._handles = [
+            (solids, add(kind, mesh, solids.sizes, [_rgb(colours[side]) for side in solids.sides]))
+            for kind, mesh, solids in zip(
+                ("bones", "joints"), (cylinder, ball), build(body.offsets), strict=True
+            )
+        ]
+        self._marks = add("contacts", ball, np.full((len(CONTACTS), 3), _HIDDEN), [_rgb(CONTACT)] * 7)
+        self._marked = False
+
+    def show(self, rotations: Array, position: Array | None, contacts: NDArray[Any] | None = None) -> Array:
         """Pose the body, and return the position (3,) of its pelvis, metres.
 
         Args:
             rotations: (24, 3, 3) local rotations.
             position: (3,) of the pelvis, metres; None puts the body on the ground.
+            contacts: (7,) probabilities that the joints `CONTACTS` rest on something; None marks no joint.
         """
         global_rotations, joints = forward_kinematics(rotations, self._offsets, position)
         if position is None:
             joints = joints - [0.0, ground(rotations, self._offsets), 0.0]
         for solids, handle in self._handles:
             handle.batched_wxyzs, handle.batched_positions = solids.posed(global_rotations, joints)
+        touching = np.zeros(len(CONTACTS), bool) if contacts is None else contacts > TOUCHING
+        if touching.any() or self._marked:
+            sizes = np.where(touching, _MARK_SIZES, _HIDDEN)
+            self._marks.batched_scales = np.tile(sizes[:, None], 3)
+            self._marks.batched_positions = joints[_TOUCHING_JOINTS]
+            self._marked = bool(touching.any())
         return np.asarray(joints[0])
 
 
 def _rgb(colour: str) -> tuple[int, ...]:
     return tuple(bytes.fromhex(colour[1:]))
-
-
-def sensor_table(held: NDArray[np.bool_], rate: float) -> str:
-    """Format a Markdown table of the sensors in the last poses: held (N, 6), oldest first.
-
-    A held sensor has sent nothing new for a pose, so the table shows rates up to that of the poses.
-    """
-    lines = ["| sensor | new/s | longest gap | now |", "|---|--:|--:|---|"]
-    for name, column, longest in zip(PLACEMENTS, held.T, longest_holds(held), strict=True):
-        new = rate * float((~column).mean()) if len(column) else 0.0
-        gap = longest / rate
-        now = "held" if len(column) and column[-1] else "ok"
-        lines.append(f"| {name.replace('_', ' ')} | {new:.0f} | {f'{gap:.2f} s' if gap else '-'} | {now} |")
-    return "\n".join(lines)
 
 
 class Viewer:
@@ -147,6 +157,7 @@ class Viewer:
         )
         place_first_camera(self._server)
         self.figure = SkeletonView(self._server, "pose", body, POSE, None)
+        self._path = FloorPath(self._server, "path", _rgb(POSE["trunk"]))
         self._updated_s = 0.0  # when the text was updated
 
     def close(self) -> None:
@@ -170,6 +181,8 @@ class Viewer:
         cameras = FollowingCameras(self._server)
         text = self._server.gui.add_markdown("")
         track = _Track(self.figure, poses, self._body)
+        if track.positions is not None:
+            self._path.extend(track.positions[:: max(1, round(poses.rate / POINTS_PER_S))])
         second = None
         if reference is not None:
             figure = SkeletonView(self._server, "reference", self._body, REFERENCE, 0.4)
@@ -215,8 +228,16 @@ class Viewer:
             now = time.monotonic()
             newest = stream.take(receiver, now)
             if newest is not None:
+                place = newest.translation
                 with self._server.atomic():
-                    cameras.follow(self.figure.show(newest.rotations.astype(float), newest.translation))
+                    shown = self.figure.show(
+                        newest.rotations.astype(float),
+                        None if place is None else place + SOLE_M,
+                        newest.contacts,
+                    )
+                    cameras.follow(shown)
+                    if place is not None:
+                        self._path.extend([place])
             if now - self._updated_s >= TABLE_S:
                 self._updated_s = now
                 text.content = stream.text(now)
@@ -260,69 +281,13 @@ class _Track:
 
     def __init__(self, figure: SkeletonView, poses: PoseSequence, body: Body) -> None:
         self.poses = poses
+        self.positions = _grounded_positions(poses, body)
         self._figure = figure
-        self._positions = _grounded_positions(poses, body)
 
     def show(self, i: int) -> Array:
-        position = None if self._positions is None else self._positions[i]
-        return self._figure.show(self.poses.rotations[i], position)
-
-
-class UdpPoseStream:
-    """Receives poses as datagrams, with statistics of the last seconds."""
-
-    def __init__(self) -> None:
-        """Start with no poses."""
-        self.poses, self.lost, self.bad = 0, 0, 0
-        self._last: PoseFrame | None = None
-        self._recent: deque[tuple[float, frozenset[str]]] = deque()
-        self._newest_s = 0.0
-
-    def take(self, receiver: socket.socket, now: float) -> PoseFrame | None:
-        """Return the newest pose waiting at a non-blocking socket; `now` is on a monotonic clock, seconds."""
-        newest = None
-        for _ in range(1000):  # limited, so that a flood of datagrams cannot stop the picture
-            try:
-                datagram = receiver.recv(65536)
-            except OSError:
-                break
-            try:
-                newest = self._add(decode(datagram), now) or newest
-            except EdgeposeError:
-                self.bad += 1
-        while self._recent and self._recent[0][0] < now - WINDOW_S:
-            self._recent.popleft()
-        return newest
-
-    def _add(self, pose: PoseFrame, now: float) -> PoseFrame | None:
-        if self._last is not None:
-            step = pose.index - self._last.index
-            if -60 < step <= 0:  # late or duplicated; further back is a new run
-                return None
-            self.lost += max(0, step - 1)
-        self.poses += 1
-        self._last, self._newest_s = pose, now
-        self._recent.append((now, pose.held))
-        return pose
-
-    def text(self, now: float) -> str:
-        """Return Markdown about the poses so far."""
-        if self._last is None:
-            bad = f"; {self.bad} datagrams were not poses" if self.bad else ""
-            return f"waiting for poses{bad}"
-        span = min(WINDOW_S, max(1.0, now - self._recent[0][0])) if self._recent else WINDOW_S
-        rate = len(self._recent) / span
-        held = held_sensors([held for _, held in self._recent])
-        silent = now - self._newest_s
-        state = plain(self._last.status) if silent < 1.0 else f"nothing for {silent:.0f} s"
-        counts = [f"{rate:.0f} poses/s", f"{self.poses} poses", f"{self.lost} lost"]
-        counts += [f"{self.bad} bad"] if self.bad else []
-        return f"{', '.join(counts)}\n\n**{state}**\n\n{sensor_table(held, rate or 60.0)}"
-
-
-def plain(status: str) -> str:
-    """Remove from a status, which anyone may have sent, everything that a browser could interpret."""
-    return re.sub(r"[^A-Za-z0-9_ ;]", "?", status[:200])
+        position = None if self.positions is None else self.positions[i]
+        contacts = None if self.poses.contacts is None else self.poses.contacts[i]
+        return self._figure.show(self.poses.rotations[i], position, contacts)
 
 
 def _nearest_reference(reference: PoseSequence, poses: PoseSequence, i: int) -> int:
@@ -333,9 +298,14 @@ def _nearest_reference(reference: PoseSequence, poses: PoseSequence, i: int) -> 
 
 
 def _grounded_positions(poses: PoseSequence, body: Body) -> Array | None:
-    """Return pelvis positions (T, 3), metres, lowest point of all on the ground; None if unknown."""
+    """Return pelvis positions (T, 3), metres, on the ground, starting above the origin; None if unknown.
+
+    Without contacts it is not known where the ground is, so the lowest point of all poses is put there.
+    """
     if poses.translation is None:
         return None
+    if poses.contacts is not None:
+        return poses.translation - poses.translation[0] * [1.0, 0.0, 1.0] + SOLE_M
     some = slice(None, None, max(1, len(poses.frames) // 1000))
     lowest = ground(poses.rotations[some], body.offsets, poses.translation[some])
     return poses.translation - [poses.translation[0, 0], lowest, poses.translation[0, 2]]

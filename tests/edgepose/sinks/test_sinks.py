@@ -359,7 +359,8 @@ def test_version_1_on_request(receiver, form, size):
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("trans", [1.0, 2.0]), ("trans", [1.0, 2.0, 1e9]), ("trans", [1.0, 2.0, float("nan")]), ("trans", "here"),
+        ("trans", [1.0, 2.0]), ("trans", [1.0, 2.0, 1e9]), ("trans", [1.0, 2.0, float("nan")]),
+        ("trans", "here"),
         ("contacts", [0.5] * 6), ("contacts", [0.5] * 6 + [1.01]), ("contacts", [float("nan")] * 7),
         ("contacts", [1e300] * 7), ("contacts", {}),
     ],
@@ -372,7 +373,7 @@ def test_a_place_that_is_none_is_refused(key, value):
         data, at = bytearray(encode_binary(placed(5))), 404 if key == "trans" else 416
         with np.errstate(over="ignore"):
             data[at : at + 4 * len(value)] = np.array(value, "<f4").tobytes()
-        with pytest.raises(EdgeposeError, match="damaged pose datagram: .* of frame 5"):
+        with pytest.raises(EdgeposeError, match=r"damaged pose datagram: .* of frame 5"):
             decode(bytes(data))
 
 

@@ -40,7 +40,8 @@ from edgepose.sinks.udp import UdpSink, decode, encode_binary, encode_json
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics
 from edgepose.viewer.body_mesh import TIPS, build, ground
 from edgepose.viewer.camera import wanted_shift
-from edgepose.viewer.viewer import UdpPoseStream, Viewer, plain, sensor_table
+from edgepose.viewer.stream import UdpPoseStream, plain, sensor_table
+from edgepose.viewer.viewer import Viewer
 from tests.support import processes
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "chrome"))), None)
