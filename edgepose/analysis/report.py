@@ -26,6 +26,7 @@ from edgepose.analysis.joint_angles import (
     joint_angles,
     walking_bouts,
 )
+from edgepose.analysis.way import draw_way, seen_from_above, way_of
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseSequence, held_sensors, longest_holds
 from edgepose.skeleton import Body
@@ -78,7 +79,8 @@ def write_report(
         _origin(poses, name, date),
         _image(_strip(poses, times, body), "Figures at instants of the recording"),
         "<h2>Steps</h2>",
-        *_steps(bouts, times, poses.rate),
+        *_steps(bouts, times, poses),
+        *_way(poses, bouts, body),
         "<h2>Angles over time</h2>",
         _image(_plots(times, angles, held, bouts), "Joint angles over time"),
         "<p class='note'>Light: left, dark: right. Grey: walking. Dotted, on hatching: not measured, because "
@@ -209,11 +211,11 @@ def _ranges(angles: dict[str, Array], held: dict[str, Flags]) -> str:
     return f"{table}<p class='note'>{note}</p>"
 
 
-def _steps(bouts: Sequence[WalkingBout], times: Array, rate: float) -> list[str]:
-    """Tabulate step count, cadence and step times over all bouts of walking."""
+def _steps(bouts: Sequence[WalkingBout], times: Array, poses: PoseSequence) -> list[str]:
+    """Tabulate step count, cadence, and times and lengths of steps over all bouts of walking."""
     if not bouts:
         return ["<p>No walking was found.</p>"]
-    step_s = np.concatenate([np.diff(bout.frames) for bout in bouts]) / rate
+    step_s = np.concatenate([np.diff(bout.frames) for bout in bouts]) / poses.rate
     # A step of the left foot ends with the left foot in front.
     left = np.concatenate([bout.left[1:] for bout in bouts])
     seconds = sum(times[bout.frames[-1]] - times[bout.frames[0]] for bout in bouts)
@@ -224,7 +226,37 @@ def _steps(bouts: Sequence[WalkingBout], times: Array, rate: float) -> list[str]
         ("time of a left step", f"{step_s[left].mean():.2f} s"),
         ("time of a right step", f"{step_s[~left].mean():.2f} s"),
     ]
+    if poses.translation is not None:
+        moves = [np.diff(seen_from_above(poses.translation[bout.frames]), axis=0) for bout in bouts]
+        step_m = np.linalg.norm(np.concatenate(moves), axis=1)
+        rows += [
+            ("length of a left step", f"{step_m[left].mean():.2f} m"),
+            ("length of a right step", f"{step_m[~left].mean():.2f} m"),
+        ]
     return [_table(("walking", ""), rows)]
+
+
+def _way(poses: PoseSequence, bouts: Sequence[WalkingBout], body: Body) -> list[str]:
+    """Tabulate and draw the way; empty if the translation is unknown."""
+    if poses.translation is None:
+        return []
+    way = way_of(poses.translation, poses.rate)
+    walking = [way.speed[bout.frames[0] : bout.frames[-1] + 1] for bout in bouts]
+    low, high = poses.translation[:, 1].min(), poses.translation[:, 1].max()
+    rows = [
+        ("length", f"{way.length_m:.1f} m"),
+        ("from start to end", f"{way.apart_m:.1f} m"),
+        *([("speed of walking", f"{np.concatenate(walking).mean():.2f} m/s")] if bouts else []),
+        ("highest speed", f"{way.speed.max():.2f} m/s"),
+        ("height of the pelvis", f"{low:.2f} to {high:.2f} m"),
+    ]
+    note = "Lengths and speeds are those of the path averaged over half a second."
+    return [
+        "<h2>Way</h2>",
+        _table(("way of the pelvis", ""), rows),
+        _image(draw_way(poses, body), "Path seen from above"),
+        f"<p class='note'>{note}</p>",
+    ]
 
 
 def _sensors(poses: PoseSequence) -> list[str]:

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 import edgepose
 from edgepose.analysis.joint_angles import ANGLES, LIMBS, joint_angles, walking_bouts
 from edgepose.analysis.report import POINTS, extremes, write_report
+from edgepose.analysis.way import way_of
 from edgepose.cli import cli
 from edgepose.convert import Job, convert
 from edgepose.errors import EdgeposeError
@@ -206,6 +207,51 @@ def test_page_of_a_walk(command, tmp_path):
     assert rows["head"][2] == f"{6 / rate:.2f} s"
     assert rows["pelvis"][0] == "0"
     assert "In 4 poses the window was filling." in page.words
+
+
+def test_the_way_there_and_back():
+    """At 1.2 m/s, with hips that sway by 3 cm in every stride of a second."""
+    times = np.arange(0.0, 10.0, 1 / 60.0)
+    forward = 1.2 * np.minimum(times, 10.0 - times)
+    places = np.stack([0.03 * np.sin(2 * np.pi * times), np.full(600, 0.95), forward], axis=1)
+    way = way_of(places, 60.0)
+    assert way.length_m == pytest.approx(12.0, rel=0.03)
+    assert way.apart_m == pytest.approx(0.0, abs=0.05)
+    assert np.median(way.speed) == pytest.approx(1.2, rel=0.01)
+    assert way.speed.max() < 1.3
+    still = way_of(np.tile([3.0, 0.95, -2.0], (50, 1)), 60.0)
+    assert (still.length_m, still.apart_m, still.speed.max()) == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
+    assert way_of(places[:1], 60.0).length_m == 0.0
+    assert way_of(places[:2], 60.0).length_m == pytest.approx(0.02, rel=0.1)
+
+
+@pytest.mark.parametrize("contacts", [False, True])
+def test_page_with_a_way(tmp_path, contacts):
+    """Straight to the left at 1.5 m/s, whatever the legs do."""
+    local, rate = motion(WALK)
+    touching = np.zeros(7, np.float32) if contacts else None
+    with CsvSink(tmp_path / "a.csv", translation=True, contacts=contacts) as sink:
+        for i, rotations in enumerate(local):
+            place = np.array([1.5 * i / rate, 0.9 + 0.1 * (i % 2), 0.0])
+            state = frozenset[str](), False, touching
+            sink.write(PoseFrame(i, i / rate, rotations, np.zeros(24), place, *state))
+    write_report(tmp_path / "a.html", read_poses(tmp_path / "a.csv"), default_body(), "a")
+    page = Page((tmp_path / "a.html").read_text(encoding="utf-8"))
+    rows = {row[0]: row[1:] for row in page.rows}
+    seconds = (len(local) - 1) / rate
+    assert rows["length"] == rows["from start to end"] == [f"{1.5 * seconds:.1f} m"]
+    assert rows["speed of walking"] == rows["highest speed"] == ["1.50 m/s"]
+    assert rows["height of the pelvis"] == ["0.90 to 1.00 m"]
+    for side in ("left", "right"):
+        step_s = float(rows[f"time of a {side} step"][0].split()[0])
+        step_m = float(rows[f"length of a {side} step"][0].split()[0])
+        assert step_m == pytest.approx(1.5 * step_s, abs=0.015)
+    assert [image.shape[1] for image in page.images] == [1600, 990, 990]
+    # One line along the middle, from the bottom to the top, where "to the left" points.
+    blue = page.images[1][..., 2] - page.images[1][..., 0] > 0.3
+    row, column = np.nonzero(blue[60:])
+    assert np.ptp(row) > 200
+    assert np.ptp(column) < 20
 
 
 def test_values_that_were_not_measured(tmp_path):

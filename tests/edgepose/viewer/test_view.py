@@ -18,6 +18,7 @@ import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import click
 import matplotlib.image
@@ -32,14 +33,15 @@ from edgepose.cli import cli
 from edgepose.config import OutputConfig
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.registry import read_poses
-from edgepose.pose import PoseFrame, held_sensors, parse_status
+from edgepose.pose import CONTACTS, PoseFrame, held_sensors, parse_status
 from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.open import open_outputs
 from edgepose.sinks.udp import UdpSink, decode, encode_binary, encode_json
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics
 from edgepose.viewer.body_mesh import TIPS, build, ground
-from edgepose.viewer.camera import wanted_shift
+from edgepose.viewer.camera import sees, wanted_shift
+from edgepose.viewer.path import PIECES
 from edgepose.viewer.stream import UdpPoseStream, plain, sensor_table
 from edgepose.viewer.viewer import Viewer
 from tests.support import processes
@@ -343,6 +345,56 @@ def test_where_cameras_go():
     np.testing.assert_allclose(wanted_shift(np.array([3.0, 0.95, -2.0])), [3.0, 0.0, -2.0])
     np.testing.assert_allclose(wanted_shift(np.array([0.0, 0.5, 0.0])), 0.0)
     np.testing.assert_allclose(wanted_shift(np.array([0.0, -1.7, 0.0])), [0.0, -2.0, 0.0], atol=1e-12)
+
+
+class Camera(NamedTuple):
+    """As viser knows it: looks along its own z, with y downwards."""
+
+    position: tuple[float, float, float]
+    wxyz: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 0.0)  # looks along -Z of the scene, upright
+    fov: float = np.radians(60.0)
+    aspect: float = 1.5
+
+
+@pytest.mark.parametrize(
+    ("pelvis", "seen"),
+    [
+        ((0.0, 1.0, 0.0), True),
+        ((1.2, 1.0, 0.0), True),
+        ((-2.1, 1.0, 0.0), False),  # leaves to the side
+        ((0.0, 2.5, 0.0), False),  # above
+        ((0.0, 1.0, 2.5), False),  # runs into the camera
+        ((0.0, 1.0, 5.0), False),  # is behind it
+        ((0.0, 1.0, -9.0), False),  # is too far to be seen
+    ],
+)
+def test_who_is_in_the_picture(pelvis, seen):
+    assert sees(Camera((0.0, 1.0, 3.0)), np.array(pelvis)) is seen
+
+
+def test_path_and_contacts_of_a_figure():
+    with contextlib.closing(Viewer("127.0.0.1", free_port(), default_body(), next_free=True)) as viewer:
+        path = viewer._path
+        for i in range(1000):  # 9.99 m to the left, as poses come
+            path.extend([np.array([0.01 * i, 0.9, 0.0])])
+        path.extend(np.array([[0.0, 0.9, 5.0], [0.0, 0.9, 5.2]]))  # its place was reset
+        segments = np.concatenate([piece.points for piece in path._pieces])
+        assert np.abs(segments[..., 1]).max() < 0.01
+        lengths = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
+        assert lengths.max() == pytest.approx(0.2, abs=1e-6)
+        assert lengths.sum() == pytest.approx(10.2, abs=0.1)
+        path.extend(np.array([[0.1 * i, 0.9, 5.2] for i in range(10_000)]))
+        assert len(path._pieces) == PIECES  # what is long ago is forgotten
+        marks = viewer.figure._marks
+        one = standing()
+        shown = viewer.figure.show(one.rotations.astype(float), np.array([1.0, 0.9, 2.0]), np.eye(7)[3])
+        assert shown.tolist() == [1.0, 0.9, 2.0]
+        assert (np.asarray(marks.batched_scales)[:, 0] > 0.01).tolist() == [False] * 3 + [True] + [False] * 3
+        _, joints = forward_kinematics(one.rotations, default_body().offsets, shown)
+        right_foot = JOINTS.index(CONTACTS[3])
+        np.testing.assert_allclose(marks.batched_positions[3], joints[right_foot], atol=1e-6)
+        viewer.figure.show(one.rotations.astype(float), None)
+        assert np.max(marks.batched_scales) < 0.01
 
 
 def test_poses_of_a_bvh_file(tmp_path):
