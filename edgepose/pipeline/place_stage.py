@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import hypot, inf
-
-import numpy as np
-from numpy.typing import NDArray
+from math import inf
 
 from edgepose.inference.engine import EngineOutput
-from edgepose.place import Place, PlaceTracker
-from edgepose.placements import PLACEMENTS
+from edgepose.place import Place, PlaceTracker, Way
 from edgepose.pose import PoseFrame
 from edgepose.skeleton import Body
 
-Array = NDArray[np.float64]
 
-STEP_M = 0.25
-"""Least change of place that counts as walking, metres: a body that stands or sits sways by less."""
+LOWER_BODY = frozenset({"left_lower_leg", "right_lower_leg", "pelvis"})
+"""Sensors of which one must measure for the place to be followed."""
 
 
 class PlaceStage:
     """Adds translation and contacts to the poses of one wearer.
 
-    While all sensors are silent nothing is known, and the wearer stays where they were.
+    While the whole lower body is silent, the wearer stays where they were: the network would go on walking as
+    in the last frame that it saw.
     """
 
     def __init__(
@@ -47,13 +43,13 @@ class PlaceStage:
 
     @property
     def way_m(self) -> float:
-        """Way walked so far, metres, without what is less than `STEP_M`."""
+        """Way walked so far, metres, see `Way`."""
         return self._way.length_m
 
     def add_to(self, pose: PoseFrame, output: EngineOutput) -> PoseFrame:
         """Return a pose with translation and contacts, given the network's output for it."""
         self._reset_if_due(pose.time_s)
-        if self._place is None or len(pose.held) < len(PLACEMENTS):
+        if self._place is None or not pose.held >= LOWER_BODY:
             self._place = self._tracker.update(pose.time_s, pose.rotations, output.place)
             self._way.add(self._place.translation)
         return pose._replace(translation=self._place.translation, contacts=self._place.contacts)
@@ -65,28 +61,3 @@ class PlaceStage:
             self._tracker.reset()
             self._way.interrupt()
             self._notify("place reset: the wearer is back at the origin, on the ground")
-
-
-class Way:
-    """Length of a horizontal path without its sway: that of the polygon whose corners are `STEP_M` apart."""
-
-    def __init__(self) -> None:
-        self._to_corner_m, self._beyond_m = 0.0, 0.0
-        self._corner: tuple[float, float] | None = None
-
-    @property
-    def length_m(self) -> float:
-        return self._to_corner_m + self._beyond_m
-
-    def add(self, position: Array) -> None:
-        """Go on to a position (3,), metres."""
-        x, _, z = position.tolist()
-        self._corner = self._corner or (x, z)
-        self._beyond_m = hypot(x - self._corner[0], z - self._corner[1])
-        if self._beyond_m >= STEP_M:
-            self.interrupt()
-            self._corner = x, z
-
-    def interrupt(self) -> None:
-        """Go on from wherever the next position is."""
-        self._to_corner_m, self._beyond_m, self._corner = self.length_m, 0.0, None

@@ -16,10 +16,11 @@ from edgepose.imu import ImuSample
 from edgepose.inference.engine import Engine, MultiWearerEngine, StreamEngine
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.multi_wearer import Wearer, run_together
-from edgepose.pipeline.place_stage import STEP_M, PlaceStage, Way
+from edgepose.pipeline.place_stage import LOWER_BODY, PlaceStage
 from edgepose.pipeline.run import run
 from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
 from edgepose.place import PlaceTracker
+from edgepose.place.way import STEP_M, Way
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseFrame
 from edgepose.rotations import quat_multiply
@@ -214,6 +215,18 @@ def paused(samples: list[ImuSample], seconds: float) -> list[ImuSample]:
     return [s._replace(time_s=s.time_s + seconds * (s.time_s > middle_s)) for s in samples]
 
 
+def still(samples: list[ImuSample], seconds: float, names: list[str]) -> list[ImuSample]:
+    """What sensors measure that stay as they are in the middle, in a pause of `paused`."""
+    middle_s = samples[0].time_s + 1.5
+    last = {s.sensor: s for s in samples if s.time_s <= middle_s}
+    count = round(100 * seconds)
+    return [
+        last[PLACEMENTS.index(name)]._replace(time_s=middle_s + k / 100)
+        for k in range(1, count)
+        for name in names
+    ]
+
+
 def silent(samples: list[ImuSample], name: str) -> list[ImuSample]:
     start_s, index = samples[0].time_s, PLACEMENTS.index(name)
     return [s for s in samples if s.sensor != index or s.time_s - start_s < 1.0]
@@ -266,17 +279,22 @@ def test_a_restart_of_the_clock_changes_no_place(follow, samples, tiny):
     assert np.linalg.norm(sink.translations[gap + 1] - sink.translations[gap]) < 0.3
 
 
-def test_while_nothing_is_measured_the_wearer_stays(follow, samples):
-    """The network goes on running with its last inputs."""
-    sink, _ = follow(paused(samples, 30.0), PlaceStage(BODY))
+@pytest.mark.parametrize("others", [False, True])
+def test_while_no_leg_is_measured_the_wearer_stays(follow, samples, others):
+    """For 30 s of silence, or while the upper body goes on; the network runs on with its last inputs."""
+    pause = paused(samples, 30.0 if not others else 5.0)
+    if others:
+        pause += still(samples, 5.0, ["left_forearm", "right_forearm", "head"])
+        pause.sort(key=lambda sample: sample.time_s)
+    sink, _ = follow(pause, PlaceStage(BODY))
     check_path(sink.translations)
-    held = np.array([len(pose.held) == 6 for pose in sink.poses])
-    assert held.sum() > 1700
-    still = sink.translations[held]
-    assert (still == still[0]).all()
+    held = np.array([pose.held >= LOWER_BODY for pose in sink.poses])
+    assert held.sum() > (280 if others else 1700)
+    places = sink.translations[held]
+    assert (places == places[0]).all()
     assert all(pose.contacts is not None for pose in sink.poses)
     after = sink.translations[np.flatnonzero(held)[-1] + 1 :]
-    assert np.linalg.norm(after[0] - still[-1]) < 0.3
+    assert np.linalg.norm(after[0] - places[-1]) < 0.3
     assert np.linalg.norm((after[-1] - after[0])[[0, 2]]) > 1.0
 
 
