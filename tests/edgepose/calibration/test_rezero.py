@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import socket
@@ -19,7 +20,7 @@ from edgepose.calibration.rezero import BLEND_S, HOLD_S, START_HOLD_S, HeadingRe
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuFrame
 from edgepose.pipeline.dropout_monitor import QUIET_S, SILENT_S, DropoutMonitor
-from edgepose.pipeline.remote_control import Control, parse
+from edgepose.pipeline.remote_control import Control, Requests, key_requests, parse
 from edgepose.placements import PLACEMENTS
 
 RNG = np.random.default_rng(11)
@@ -235,6 +236,25 @@ def test_a_socket_hears_wishes_and_counts_the_rest():
         Control("192.0.2.1", 9)
     with pytest.raises(EdgeposeError, match="cannot find 'no such host' to listen on"):
         Control("no such host", 9)
+
+
+def test_each_action_has_its_own_requests():
+    """Those of one wait while another is asked for."""
+    pressed = iter(["or", "", "O"])
+    (by_key,) = key_requests(1, lambda: next(pressed, ""))
+    with contextlib.ExitStack() as stack, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        requests = Requests(stack, ("127.0.0.1", 0), by_key)
+        sender.connect(requests._control._socket.getsockname())
+        for datagram in (b"origin", b"rezero"):
+            sender.send(datagram)
+        headings, places, until = [], [], time.monotonic() + 10
+        while len(headings) < 2 and time.monotonic() < until:
+            headings += requests.poll("rezero")
+        while len(places) < 3 and time.monotonic() < until:
+            places += requests.poll("origin")
+        assert sorted(headings) == [0.0, 3.0]
+        assert places == [0.0, 0.0, 0.0]
+        assert requests.poll("rezero") == requests.poll("origin") == requests.summary_lines() == []
 
 
 # --- silence ------------------------------------------------------------------------------------------------

@@ -180,11 +180,13 @@ def test_poses_on_standard_input(tmp_path):
 def test_bones_of_the_wearer(command, tmp_path):
     write(tmp_path / "a.csv")
     out = tmp_path / "out"
-    result = command("convert", tmp_path / "a.csv", "--to", "bvh", "--out", out, "--height", 1.5)
+    words = ["--height", 1.5, "--leg-length", 0.75]
+    result = command("convert", tmp_path / "a.csv", "--to", "bvh", "--out", out, *words)
     assert result.returncode == 0, result.stderr
     tree = read_bvh(out / "a.bvh")
     order = [tree.names.index(name) for name in JOINTS]
-    np.testing.assert_allclose(tree.offsets[order][1:] / 100, default_body(1.5).offsets[1:], atol=1e-6)
+    body = default_body(1.5, leg_length_m=0.75)
+    np.testing.assert_allclose(tree.offsets[order][1:] / 100, body.offsets[1:], atol=1e-6)
     result = command("convert", tmp_path / "a.csv", "--to", "bvh", "--out", out, "--height", 150)
     assert result.returncode == 1
     assert result.stderr.startswith("edgepose: height 150 m is not between")

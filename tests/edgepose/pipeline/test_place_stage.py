@@ -132,6 +132,14 @@ def test_a_replay_gives_the_place_of_the_live_run(wearer, model, samples):
             np.testing.assert_array_equal(a.contacts, b.contacts)
 
 
+def test_a_pipeline_without_the_place(wearer, model, samples):
+    pipeline = edgepose.Pipeline(load_calibration(wearer.calibration), model, place=False)
+    poses = list(pipeline.poses([(samples[299].time_s, samples[:300])]))
+    assert {(pose.translation, pose.contacts) for pose in poses} == {(None, None)}
+    with pytest.raises(edgepose.EdgeposeError, match="leg length 2 m does not fit"):
+        edgepose.Pipeline(load_calibration(wearer.calibration), model, leg_length=2.0)
+
+
 def parts(samples: list[ImuSample], size: int) -> Iterator[list[ImuSample]]:
     return (samples[i : i + size] for i in range(0, len(samples), size))
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from edgepose.cli.options.body import BodyFlags
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS, SITES
 from edgepose.sip.bodies import WORDS, scaled, sensor_points, shaped_body
@@ -76,6 +77,16 @@ def test_all_sensors_lie_on_their_bones():
     thigh = list(SITES).index("left_upper_leg")
     np.testing.assert_allclose(points.points[thigh], body.offsets[4] / 2.0)
     assert np.linalg.norm(points.points, axis=1).max() < 0.35
+
+
+def test_the_flags_of_a_body_with_measured_legs():
+    flags = BodyFlags("smpl", 1.9, 0.95, "male", 95.0, ("long-legged",), 1.1)
+    body = flags.build()
+    assert body.leg_length_m == pytest.approx(1.1 * 0.95)
+    plain = flags._replace(leg_length=None).build()
+    assert stature(body) == pytest.approx(stature(plain), abs=1e-3)
+    with pytest.raises(EdgeposeError, match=r"leg length 0.5 m does not fit a height of 1.9 m"):
+        flags._replace(leg_length=0.5).build()
 
 
 @pytest.mark.parametrize(

@@ -512,6 +512,7 @@ def test_a_viewer_ends_with_a_run_that_is_killed(wearer, tmp_path):
         ("nothing.csv", 1, "cannot read poses from nothing.csv"),
         ("poses.csv --reference notes.md", 1, "notes.md is not a file of poses"),
         ("poses.csv --height 175", 1, "height 175 m is not between"),
+        ("poses.csv --leg-length 1.2", 1, "leg length 1.2 m does not fit a height of 1.75 m"),
         ("poses.csv --host no-such-host.invalid", 1, "cannot show poses at no-such-host.invalid port 8080"),
         ("--udp 127.0.0.1", 1, "no port in '127.0.0.1'"),
         ("--udp no-such-host.invalid:9", 1, "cannot listen for poses at no-such-host.invalid:9"),
