@@ -536,7 +536,7 @@ def javascript_receiver(folder: Path, port: int) -> list[str]:
 
 def c_receiver(folder: Path, port: int) -> list[str]:
     code = documented_receiver("c", port)
-    assert len(code.splitlines()) <= 26
+    assert len(code.splitlines()) <= 29
     (folder / "receiver.c").write_text(code)
     subprocess.run(
         ["cc", "-Wall", "-Wextra", "-Werror", "-o", folder / "receiver", folder / "receiver.c"], check=True
@@ -544,35 +544,45 @@ def c_receiver(folder: Path, port: int) -> list[str]:
     return [str(folder / "receiver")]
 
 
+def found_in(text: str) -> list[float]:
+    return [float(number) for number in re.findall(r"-?\d+\.?\d*(?:e-?\d+)?", text)]
+
+
 @pytest.mark.parametrize(
     ("command", "formats"),
     [
-        (python_receiver, ("json", "binary")),
-        (javascript_receiver, ("json", "binary")),
-        (c_receiver, ("binary",)),
+        (python_receiver, ("json", "binary", "binary-v1")),
+        (javascript_receiver, ("json", "binary", "binary-v1")),
+        (c_receiver, ("binary", "binary-v1")),
     ],
 )
 def test_receivers_of_the_documentation(receiver, tmp_path, command, formats):
     port = receiver.getsockname()[1]
     receiver.close()
     process = subprocess.Popen(command(tmp_path, port), stdout=subprocess.PIPE, text=True)
-    vectors = Rotation.from_matrix([make_pose(number).rotations[0] for number in (4, 5)])
+    numbers = {"json": 4, "binary": 5, "binary-v1": 6}
+    vectors = Rotation.from_matrix([make_pose(number).rotations[0] for number in numbers.values()])
     wanted = {"json": vectors[0].as_rotvec(), "binary": vectors[1].as_quat(canonical=True)[[3, 0, 1, 2]]}
+    wanted["binary-v1"] = vectors[2].as_quat(canonical=True)[[3, 0, 1, 2]]
+    poses = {form: placed(number) for form, number in numbers.items()}
     try:
         for form in formats:
-            number = {"json": 4, "binary": 5}[form]
+            number = numbers[form]
             with UdpSink("127.0.0.1", port, form) as sink:
                 for _ in range(200):  # It takes a moment to bind; what is sent before is lost.
-                    sink.write(make_pose(number))
+                    sink.write(poses[form])
                     if select.select([process.stdout], [], [], 0.05)[0]:
                         break
             # The pipe of the first kind may hold several lines of one pose.
             while not (line := process.stdout.readline()).startswith(f"{number} "):
                 assert line
-            what, _, numbers = line.partition({"json": "axis-angle", "binary": "quaternion"}[form])
+            what, _, rotation = line.partition("axis-angle" if form == "json" else "quaternion")
+            _, _, place = what.partition(" at ")
             assert "pelvis" in what
-            found = [float(text) for text in re.findall(r"-?\d+\.?\d*(?:e-?\d+)?", numbers)]
-            np.testing.assert_allclose(found, wanted[form], atol=2e-6)
+            np.testing.assert_allclose(found_in(rotation), wanted[form], atol=2e-6)
+            np.testing.assert_allclose(
+                found_in(place), [] if form == "binary-v1" else [1.5, 0.9, -2.25], atol=1e-6
+            )
     finally:
         process.kill()
         process.communicate()
