@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable
 from typing import Any
 
@@ -21,7 +20,7 @@ HEIGHT_M = 0.004
 """Height of the line above the floor, so that both are seen."""
 
 SEGMENTS, PIECES = 100, 60
-"""Segments of a piece of the line, and pieces that are kept: the last 300 m. A browser gets whole pieces."""
+"""Segments of a piece of the line, which is sent as a whole, and pieces that are kept: the last 300 m."""
 
 
 class FloorPath:
@@ -31,37 +30,41 @@ class FloorPath:
         """Start without points in the scene of a viser server."""
         self._server, self._name, self._colour = server, name, colour
         self._last: Array | None = None
-        self._segments: list[Array] = []  # of the newest piece, not all of them full
-        self._pieces: deque[Any] = deque()
-        self._count = 0
+        self._count = 0  # segments so far
+        self._newest = np.zeros((SEGMENTS, 2, 3), np.float32)  # the piece that grows
+        self._pieces: list[Any] = []
 
     def extend(self, positions: Iterable[Array]) -> None:
         """Lead the line on to further positions (3,) of the pelvis, metres."""
         drawn = True
         for position in positions:
             point = np.array([position[0], HEIGHT_M, position[2]])
-            if self._last is None:
-                self._last = point
-            length = np.linalg.norm(point - self._last)
+            length = STEP_M if self._last is None else np.linalg.norm(point - self._last)
             if length < STEP_M:
                 continue
-            if length < JUMP_M:
-                self._segments.append(np.stack([self._last, point]))
-                drawn = False
+            if self._last is not None and length < JUMP_M:
+                self._append(self._last, point)
+                drawn = self._count % SEGMENTS == 0
+                if drawn:
+                    self._draw()
             self._last = point
-            if len(self._segments) == SEGMENTS:
-                self._draw()
-                self._count, self._segments, drawn = self._count + 1, [], True
         if not drawn:
             self._draw()
 
+    def _append(self, start: Array, end: Array) -> None:
+        i = self._count % SEGMENTS
+        if i == 0:
+            self._newest[...] = start  # segments without length are not seen
+        self._newest[i] = start, end
+        self._count += 1
+
     def _draw(self) -> None:
-        """Draw the newest piece, in the place of its shorter self."""
-        piece = self._server.scene.add_line_segments(
-            f"/{self._name}/{self._count}", np.stack(self._segments), self._colour, thickness=0.02
+        """Draw the newest piece, after some time in the place of the oldest one."""
+        slot = (self._count - 1) // SEGMENTS % PIECES
+        if slot < len(self._pieces):
+            self._pieces[slot].points = self._newest.copy()
+            return
+        name = f"/{self._name}/{slot}"
+        self._pieces.append(
+            self._server.scene.add_line_segments(name, self._newest.copy(), self._colour, thickness=0.02)
         )
-        if self._pieces and self._pieces[-1].name == piece.name:
-            self._pieces.pop()
-        self._pieces.append(piece)
-        if len(self._pieces) > PIECES:
-            self._pieces.popleft().remove()

@@ -180,13 +180,12 @@ class Viewer:
         line = _TimeLine(self._server.gui, float(times[-1]))
         cameras = FollowingCameras(self._server)
         text = self._server.gui.add_markdown("")
-        track = _Track(self.figure, poses, self._body)
-        if track.positions is not None:
-            self._path.extend(track.positions[:: max(1, round(poses.rate / POINTS_PER_S))])
+        track = _Track(self.figure, self._path, poses, self._body)
         second = None
         if reference is not None:
             figure = SkeletonView(self._server, "reference", self._body, REFERENCE, 0.4)
-            second = _Track(figure, reference, self._body)
+            path = FloorPath(self._server, "reference-path", _rgb(REFERENCE["trunk"]))
+            second = _Track(figure, path, reference, self._body)
         held = held_sensors(poses.held)
         window = max(1, round(WINDOW_S * poses.rate))
         shown = -1
@@ -277,15 +276,17 @@ class _TimeLine:
 
 
 class _Track:
-    """A figure and its poses."""
+    """A figure, its poses, and their whole path."""
 
-    def __init__(self, figure: SkeletonView, poses: PoseSequence, body: Body) -> None:
+    def __init__(self, figure: SkeletonView, path: FloorPath, poses: PoseSequence, body: Body) -> None:
         self.poses = poses
-        self.positions = _grounded_positions(poses, body)
         self._figure = figure
+        self._positions = _grounded_positions(poses, body)
+        if self._positions is not None:
+            path.extend(self._positions[:: max(1, round(poses.rate / POINTS_PER_S))])
 
     def show(self, i: int) -> Array:
-        position = None if self.positions is None else self.positions[i]
+        position = None if self._positions is None else self._positions[i]
         contacts = None if self.poses.contacts is None else self.poses.contacts[i]
         return self._figure.show(self.poses.rotations[i], position, contacts)
 

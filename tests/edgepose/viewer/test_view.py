@@ -41,7 +41,7 @@ from edgepose.sinks.udp import UdpSink, decode, encode_binary, encode_json
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics
 from edgepose.viewer.body_mesh import TIPS, build, ground
 from edgepose.viewer.camera import sees, wanted_shift
-from edgepose.viewer.path import PIECES
+from edgepose.viewer.path import PIECES, SEGMENTS
 from edgepose.viewer.stream import UdpPoseStream, plain, sensor_table
 from edgepose.viewer.viewer import Viewer
 from tests.support import processes
@@ -384,7 +384,10 @@ def test_path_and_contacts_of_a_figure():
         assert lengths.max() == pytest.approx(0.2, abs=1e-6)
         assert lengths.sum() == pytest.approx(10.2, abs=0.1)
         path.extend(np.array([[0.1 * i, 0.9, 5.2] for i in range(10_000)]))
-        assert len(path._pieces) == PIECES  # what is long ago is forgotten
+        segments = np.concatenate([piece.points for piece in path._pieces])
+        assert len(segments) == SEGMENTS * PIECES  # what is long ago is forgotten
+        assert segments[..., 0].max() == pytest.approx(999.9, abs=1e-3)
+        assert segments[..., 0].min() > 999.9 - 0.1 * SEGMENTS * PIECES - 1
         marks = viewer.figure._marks
         one = standing()
         shown = viewer.figure.show(one.rotations.astype(float), np.array([1.0, 0.9, 2.0]), np.eye(7)[3])
