@@ -47,8 +47,9 @@ OWN_SHAPE = 0.03
 
 ACC_NOISE, ACC_BIAS, ACC_SCALE = 0.1, 0.05, 0.01
 """Standard deviations of the accelerometers' noise per frame, bias per axis (both m/s^2), scale per axis."""
-TURN_NOISE_DEG, TURN_BIAS_DEG = 0.3, 1.5
-"""Standard deviations of the orientations' noise per frame and of calibration errors, deg per axis."""
+TURN_NOISE_DEG, TURN_DRIFT_DEG, TURN_BIAS_DEG = 0.3, 0.5, 1.5
+"""Standard deviations of the orientations' noise per frame, of their lasting error in the inertial frame, and of
+the calibration's error, deg per axis. The calibration's does not tilt gravity: its axes are the bone's."""
 
 
 Method = Callable[[Measurements], Array]
@@ -68,14 +69,19 @@ def sensors_of(local: Array, translation: Array, body: Body, rng: np.random.Gene
     shape = (1, len(BONES), 3)
     force = force * (1.0 + ACC_SCALE * rng.normal(size=shape)) + ACC_BIAS * rng.normal(size=shape)
     force += ACC_NOISE * rng.normal(size=force.shape)
-    errors_deg = TURN_BIAS_DEG * rng.normal(size=shape) + TURN_NOISE_DEG * rng.normal(size=force.shape)
-    bones = bones @ rot.rotvec_to_matrix(np.deg2rad(errors_deg))
-    acceleration = np.einsum("tsij,tsj->tsi", bones, force) + gravity
+    measured = _turned(TURN_DRIFT_DEG, shape, rng) @ bones @ _turned(TURN_NOISE_DEG, force.shape, rng)
+    acceleration = np.einsum("tsij,tsj->tsi", measured, force) + gravity
+    bones = measured @ _turned(TURN_BIAS_DEG, shape, rng)
     frames = len(local)
     valid = np.ones((frames, len(BONES)), bool)
     valid[[0, -1]] = False
     times = np.arange(frames) / RATE
     return Measurements(PLACEMENTS, times, RATE, bones, acceleration, valid, np.zeros_like(valid))
+
+
+def _turned(deviation_deg: float, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
+    """Return random rotations (..., 3, 3) whose vectors, of that shape, have a standard deviation per axis."""
+    return rot.rotvec_to_matrix(np.deg2rad(deviation_deg) * rng.normal(size=shape))
 
 
 def own_body(rng: np.random.Generator) -> Body:
@@ -154,7 +160,8 @@ def takes(data: Path, part: str, every: int, body: Body) -> Iterator[Sample]:
     for number, path in enumerate(take_paths(data, part)[::every]):
         with np.load(path, allow_pickle=False) as file:
             pose = rot.rotvec_to_matrix(file["poses"].reshape(-1, 24, 3).astype(float))
-            translation = file["trans"].astype(float)
+            # The recordings are of the default body; longer legs take longer steps.
+            translation = file["trans"].astype(float) * (body.leg_length_m / default_body().leg_length_m)
         yield Sample(sensors_of(pose, translation, body, np.random.default_rng(number)), pose)
 
 

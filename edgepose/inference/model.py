@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +15,20 @@ from edgepose.inference.quantisation import quantise_weights
 
 FRAMES_PER_STEP = 64
 """Frames that the network processes at once in a whole recording."""
+
+
+class Estimate(NamedTuple):
+    """What a network says about the T frames of a whole recording.
+
+    Attributes:
+        rotations: (T, 24, 3, 3) local rotations, joint 0 relative to the body frame.
+        std: (T, 24) standard deviations of the joints it estimates, radians; 0 for the others.
+        place: (T, 10) contacts and velocity, see `EngineOutput.place`; None if the archive has none.
+    """
+
+    rotations: NDArray[np.float32]
+    std: NDArray[np.float32]
+    place: NDArray[np.float32] | None
 
 
 class Model:
@@ -75,6 +89,10 @@ class Model:
         Raises:
             ModelError: the arrays have other shapes, or numbers in them or in the poses are not finite.
         """
+        return self.estimate(orientation, acceleration).rotations
+
+    def estimate(self, orientation: ArrayLike, acceleration: ArrayLike) -> Estimate:
+        """Estimate poses, their deviations and the place in a whole recording; see `poses`."""
         bones, force = np.asarray(orientation, np.float32), np.asarray(acceleration, np.float32)
         frames = len(bones)
         if bones.shape != (frames, 6, 3, 3) or force.shape != (frames, 6, 3):
@@ -89,9 +107,11 @@ class Model:
         outputs += engine.finish()
         for each in outputs:
             check_finite(each)
-        return (
-            np.stack([each.rotations for each in outputs]) if outputs else np.empty((0, 24, 3, 3), np.float32)
-        )
+        if not outputs:
+            return Estimate(np.empty((0, 24, 3, 3), np.float32), np.empty((0, 24), np.float32), None)
+        rotations, std = (np.stack(column) for column in zip(*(each[1:3] for each in outputs), strict=True))
+        places = [each.place for each in outputs if each.place is not None]
+        return Estimate(rotations, std, np.stack(places) if places else None)
 
 
 def load_model(name: str | Path, *, trust: bool = False, precision: str = "auto") -> Model:

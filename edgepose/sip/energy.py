@@ -15,19 +15,24 @@ from edgepose.sip.kinematics import (
     pose_sensors,
     position_jacobian,
 )
+from edgepose.sip.network_prior import NetworkPrior
 from edgepose.sip.parameterisation import PoseParameterisation, coordinates
 
 Array = NDArray[np.float64]
 
 
 class Weights(NamedTuple):
-    """Weights of the energy's terms; the defaults are those of SIP's table 1."""
+    """Weights of the energy's terms; the defaults are those of SIP's table 1, for the statistical prior."""
 
     ori: float = 1.0
     acc: float = 0.05
     anthro: float = 1.0
     mahal: float = 0.003
     limits: float = 0.1
+
+
+WITH_NETWORK = Weights(acc=0.1, mahal=3e-4)
+"""Weights with a network's poses as the prior, tuned on takes for validation."""
 
 
 class Problem(NamedTuple):
@@ -41,6 +46,7 @@ class Problem(NamedTuple):
         valid: (T, N) float, 1 where the acceleration counts; in the first and last frame it never does.
         rate: frames a second.
         weights: of the terms.
+        network: poses that a network expects, the prior instead of the rig's.
     """
 
     rig: PoseParameterisation
@@ -50,6 +56,7 @@ class Problem(NamedTuple):
     valid: Array
     rate: float
     weights: Weights
+    network: NetworkPrior | None = None
 
 
 class Costs(NamedTuple):
@@ -73,7 +80,7 @@ class Evaluation(NamedTuple):
         states: sensors of the posed body, from which derivatives are computed.
         orientation_residual: (T, N, 3) rad (SIP eq. 11).
         acceleration_residual: (T, N, 3) m/s^2 (SIP eq. 16), see `project`.
-        prior_residual: (T, P - 3) L (x - mean) (SIP eq. 30).
+        prior_residual: (T, P - 3) L (x - mean) (SIP eq. 30); with a network (T, 3 J), see `network_residual`.
         limit_residual: (T, P - 3) excess of each parameter over its limits, rad (SIP eq. 19).
         costs: of all residuals.
     """
@@ -114,7 +121,10 @@ def evaluate(problem: Problem, parameters: Array) -> Evaluation:
         second_difference(states.position, problem.rate) - problem.acceleration, problem.valid
     )
     inner = parameters[:, 3:]
-    prior = (inner - rig.mean) @ rig.root.T
+    if problem.network is None:
+        prior = (inner - rig.mean) @ rig.root.T
+    else:
+        prior = _network_residual(problem.network, states)
     limits = np.minimum(inner - rig.lower, 0.0) + np.maximum(inner - rig.upper, 0.0)
     sensors = orientation.shape[1]
     costs = Costs(
@@ -134,18 +144,41 @@ def frame_system(problem: Problem, evaluation: Evaluation) -> tuple[Array, Array
     rig, weights = problem.rig, problem.weights
     # e(x + d) = log(exp(J d) R_est R^-1), exactly; SIP eq. 24 approximates the inverse Jacobian by identity.
     rotations = rot.inverse_left_jacobian(evaluation.orientation_residual) @ _rows(
-        orientation_jacobian(evaluation.states, problem.body)
+        orientation_jacobian(evaluation.states, problem.body.bones)
     )
     jacobian = _on_rig(rig, rotations)
     scaled = weights.ori / rotations.shape[1] * np.swapaxes(jacobian, 1, 2)
     matrix = scaled @ jacobian
     gradient = (scaled @ evaluation.orientation_residual.reshape(len(jacobian), -1, 1))[..., 0]
     mahal, limits = weights.anthro * weights.mahal, weights.anthro * weights.limits
-    matrix[:, 3:, 3:] += mahal * rig.root.T @ rig.root
-    gradient[:, 3:] += mahal * evaluation.prior_residual @ rig.root + limits * evaluation.limit_residual
+    if problem.network is None:
+        matrix[:, 3:, 3:] += mahal * rig.root.T @ rig.root
+        gradient[:, 3:] += mahal * evaluation.prior_residual @ rig.root
+    else:
+        jacobian = _network_jacobian(rig, problem.network, evaluation)
+        scaled = mahal * np.swapaxes(jacobian, 1, 2)
+        matrix += scaled @ jacobian
+        gradient += (scaled @ evaluation.prior_residual[..., None])[..., 0]
+    gradient[:, 3:] += limits * evaluation.limit_residual
     inner = np.arange(3, matrix.shape[1])
     matrix[:, inner, inner] += limits * (evaluation.limit_residual != 0.0)
     return matrix, gradient
+
+
+def _network_residual(network: NetworkPrior, states: SensorStates) -> Array:
+    """Return the angles (T, 3 J) from the network's bones to the posed body's, in standard deviations."""
+    angles = rot.matrix_to_rotvec(states.bones[:, network.joints] @ rot.transpose(network.orientation))
+    return (angles * network.precision[..., None]).reshape(len(angles), -1)
+
+
+def _network_jacobian(rig: PoseParameterisation, network: NetworkPrior, evaluation: Evaluation) -> Array:
+    """Return the Jacobian (T, 3 J, P) of `_network_residual`."""
+    precision = network.precision[..., None]
+    angles = evaluation.prior_residual.reshape(*precision.shape[:2], 3) / precision
+    rotations = rot.inverse_left_jacobian(angles) @ _rows(
+        orientation_jacobian(evaluation.states, network.joints)
+    )
+    return _on_rig(rig, precision[..., None] * rotations)
 
 
 def sensor_movement(problem: Problem, evaluation: Evaluation) -> Array:

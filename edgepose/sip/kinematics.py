@@ -53,12 +53,14 @@ class SensorStates(NamedTuple):
         position: (T, N, 3) sensors, from the pelvis, metres.
         joints: (T, 24, 3) positions of joints from the pelvis, metres.
         axes: (T, 24, 3, 3) rotation in T, rad, per change of each joint's exponential coordinates.
+        bones: (T, 24, 3, 3) R_TB of all bones.
     """
 
     orientation: Array
     position: Array
     joints: Array
     axes: Array
+    bones: Array
 
 
 def pose_sensors(angles: Array, body: SensorPoints) -> SensorStates:
@@ -67,13 +69,14 @@ def pose_sensors(angles: Array, body: SensorPoints) -> SensorStates:
     axes = rot.left_jacobian(angles)
     # A joint's axes rotate with its parent; the pelvis has none.
     axes[:, 1:] = rotations[:, list(PARENTS[1:])] @ axes[:, 1:]
-    bones = rotations[:, body.bones]
-    return SensorStates(bones, joints[:, body.bones] + (bones @ body.points[..., None])[..., 0], joints, axes)
+    carrying = rotations[:, body.bones]
+    position = joints[:, body.bones] + (carrying @ body.points[..., None])[..., 0]
+    return SensorStates(carrying, position, joints, axes, rotations)
 
 
-def orientation_jacobian(posed: SensorStates, body: SensorPoints) -> Array:
-    """Return the rotation of each sensor in T per change of the pose: (T, N, 3, 24, 3), rad (SIP eq. 24)."""
-    mask = TURNS[body.bones].astype(float)
+def orientation_jacobian(posed: SensorStates, bones: NDArray[np.int_]) -> Array:
+    """Return the rotation of bones (N,) in T per change of the pose: (T, N, 3, 24, 3), rad (SIP eq. 24)."""
+    mask = TURNS[bones].astype(float)
     return np.moveaxis(posed.axes, 1, 2)[:, None] * mask[:, None, :, None]
 
 

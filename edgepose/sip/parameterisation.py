@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from edgepose import rotations as rot
 from edgepose.sip.kinematics import JOINT_COUNT, TURNS
 from edgepose.sip.prior import Prior
 from edgepose.skeleton import JOINTS
@@ -71,6 +72,15 @@ def smpl_rig(prior: Prior, bones: ArrayLike) -> PoseParameterisation:
     )
 
 
+def network_rig(prior: Prior, bones: ArrayLike) -> PoseParameterisation:
+    """Return `smpl_rig` for a network's poses as the prior.
+
+    Joints that no sensor sees are at rest, as in the network's poses. The statistical prior gives only limits.
+    """
+    rig = smpl_rig(prior, bones)
+    return rig._replace(regression=np.zeros_like(rig.regression), rest=np.zeros_like(rig.rest))
+
+
 _HINGES: Sequence[tuple[str, str]] = (
     ("spine2", "xyz"), ("head", "xy"),
     ("left_hip", "xyz"), ("left_knee", "x"), ("left_ankle", "x"),
@@ -110,3 +120,8 @@ def coordinates(rig: PoseParameterisation, parameters: Array) -> Array:
     """Return exponential coordinates (T, 24, 3) for parameters (T, P); the rest as the prior expects."""
     expected = rig.rest + (parameters[:, 3:] - rig.mean) @ rig.regression.T
     return (parameters @ rig.basis.T + expected).reshape(-1, JOINT_COUNT, 3)
+
+
+def parameters_of(rig: PoseParameterisation, rotations: Array) -> Array:
+    """Return the parameters (T, P) nearest to local rotations (T, 24, 3, 3)."""
+    return rot.matrix_to_rotvec(rotations).reshape(len(rotations), WIDTH) @ rig.basis

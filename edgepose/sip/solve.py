@@ -17,7 +17,8 @@ from edgepose.sip.energy import Problem, Weights, second_difference
 from edgepose.sip.kinematics import SensorPoints
 from edgepose.sip.levenberg_marquardt import SIP_EVALUATIONS, Minimum, inertial_poser, orientation_poser
 from edgepose.sip.measurements import Measurements
-from edgepose.sip.parameterisation import PoseParameterisation, coordinates
+from edgepose.sip.network_prior import NetworkPrior
+from edgepose.sip.parameterisation import PoseParameterisation, coordinates, parameters_of
 
 Array = NDArray[np.float64]
 
@@ -40,6 +41,7 @@ class Settings(NamedTuple):
         body: positions of the sensors on it.
         weights: of the energy's terms.
         evaluations: largest number of evaluations of SIP's cost.
+        network: poses that a network expects at all frames: SIP's start, and its prior instead of the rig's.
     """
 
     method: Method
@@ -47,6 +49,7 @@ class Settings(NamedTuple):
     body: SensorPoints
     weights: Weights
     evaluations: int = SIP_EVALUATIONS
+    network: NetworkPrior | None = None
 
 
 class Solution(NamedTuple):
@@ -156,13 +159,15 @@ def solve_chunk(
     evaluations: int = SIP_EVALUATIONS,
     on_step: Callable[[int, float], None] = lambda count, cost: None,
 ) -> Solution:
-    """Solve all frames of a problem: SOP, then SIP from its result."""
-    minimum = orientation_poser(problem, on_step)
-    done = minimum.evaluations
+    """Solve all frames of a problem: SIP from the network's poses, or SOP and then SIP from its result."""
+    done = 0
+    if problem.network is None:
+        minimum = orientation_poser(problem, on_step)
+        start, done = minimum.parameters, minimum.evaluations
+    else:
+        start = parameters_of(problem.rig, problem.network.rotations)
     if method == "sip":
-        minimum = inertial_poser(
-            problem, minimum.parameters, evaluations, lambda count, cost: on_step(done + count, cost)
-        )
+        minimum = inertial_poser(problem, start, evaluations, lambda count, cost: on_step(done + count, cost))
         done += minimum.evaluations
     return _solution(problem, minimum, done)
 
@@ -178,6 +183,7 @@ def _problem(measurements: Measurements, part: slice, settings: Settings) -> Pro
         valid,
         measurements.rate,
         settings.weights,
+        None if settings.network is None else settings.network.part(part),
     )
 
 

@@ -1,10 +1,18 @@
-"""Path of the pelvis, from the acceleration that the poses leave unexplained and from the supporting foot."""
+"""Path of the pelvis over a whole recording, from its acceleration, from contacts and from the ground.
+
+Assumptions: what is in contact stands still; the ground is level except for steps; the wearer starts on it.
+"""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edgepose import rotations as rot
+from edgepose.pose import CONTACTS
+from edgepose.sip.ground import ankle_heights, ground_correction
 from edgepose.sip.solve import Solution
 from edgepose.skeleton import JOINTS, forward_kinematics, standing_pelvis_position
 
@@ -14,60 +22,124 @@ ACCELERATION_ERROR = 1.0
 """Spread (m/s^2) of errors of the pelvis acceleration that last for a second: bias, scale, tilt, poses."""
 
 SLIP = 0.3
-"""Spread (m/s) of the lower ankle's speed while a foot supports the wearer."""
+"""Spread (m/s) of the speed of a joint in contact, in the estimated poses."""
+
+VELOCITY_ERROR = 2.0
+"""Spread (m/s) of errors of the network's velocity that last for a second."""
 
 FLIGHT = -4.0
 """Vertical acceleration (m/s^2) below which no foot supports the wearer; free fall is -9.81."""
 
-_ANKLES = [JOINTS.index("left_ankle"), JOINTS.index("right_ankle")]
 _FLYING = 1e-3  # weight of the lower foot in flight
 _ROUNDS = 6  # of reweighting
+_POINTS = [JOINTS.index(name) for name in CONTACTS]
+_ANKLES = [CONTACTS.index("left_ankle"), CONTACTS.index("right_ankle")]
 
 
-def pelvis_path(solution: Solution, offsets: Array, rate: float) -> Array:
-    """Estimate the path (T, 3) in T, metres, that best fits the acceleration and the supporting foot.
+class Support(NamedTuple):
+    """What is known of the velocity between frames, apart from accelerations.
 
-    Integrated twice, an error of the acceleration grows without bound. The lower foot stands still except in
-    flight, which gives the speed. The path still drifts, by a tenth of its length, and it knows no ground. It
-    starts above the origin, at the pelvis height of someone who stands straight.
+    Attributes:
+        weight: (T - 1, K) of the assumption that each of K points stands still, s^2/m^2.
+        velocity: (T - 1, K, 3) of the pelvis under this assumption, m/s.
+        free_weight: weight of `free`, s^2/m^2.
+        free: (T - 1, 3) velocity of the pelvis without assumption, m/s.
+    """
+
+    weight: Array
+    velocity: Array
+    free_weight: float
+    free: Array
+
+
+class PelvisPath(NamedTuple):
+    """Path of the pelvis.
+
+    Attributes:
+        translation: (T, 3) position in T, metres; Y is the height above the ground of the start.
+        contacts: (T, 7) probabilities of the contacts `edgepose.pose.CONTACTS`; None without a network.
+    """
+
+    translation: Array
+    contacts: NDArray[np.float32] | None
+
+
+def pelvis_path(solution: Solution, offsets: Array, rate: float, place: Array | None = None) -> PelvisPath:
+    """Estimate the path that best fits accelerations, contacts and level ground.
+
+    It starts above the origin.
 
     Args:
         solution: poses, and the acceleration of the pelvis.
         offsets: (24, 3) of the body, metres.
         rate: frames a second.
+        place: (T, 10) contacts and velocity from a network, see `edgepose.inference.engine.EngineOutput`; None
+            takes contacts from the poses.
     """
-    acceleration = solution.acceleration
-    frames = len(acceleration)
+    frames = len(solution.acceleration)
+    contacts = None if place is None else place[:, : len(CONTACTS)].astype(np.float32)
     if frames < 3:
-        return np.tile(standing_pelvis_position(offsets), (frames, 1))
+        return PelvisPath(np.tile(standing_pelvis_position(offsets), (frames, 1)), contacts)
+    joints = forward_kinematics(solution.rotations, offsets)[1] - offsets[0]
+    support = _support_of_poses(joints, solution.acceleration, rate)
+    speed, standing = _speed(solution.acceleration, support, rate)
+    if place is not None:
+        # In a network's poses feet are fixed to the shanks, so a standing toe seems to rise and sink. Heights
+        # come from the ankles alone.
+        support = _with_network(support, solution.rotations[:, 0], place)
+        speed[:, [0, 2]] = _speed(solution.acceleration, support, rate)[0][:, [0, 2]]
+    start = standing_pelvis_position(offsets)
+    path = start + np.concatenate([np.zeros((1, 3)), np.cumsum(speed, axis=0) / rate])
+    heights = ankle_heights(path, joints, offsets)
+    path[:, 1] += ground_correction(heights, standing[:, _ANKLES], rate)
+    return PelvisPath(path, contacts)
+
+
+def _support_of_poses(joints: Array, acceleration: Array, rate: float) -> Support:
+    """Assume that the lower ankle stands still except in flight."""
+    velocity = -rate * np.diff(joints[:, _POINTS], axis=0)
+    ankles = joints[:, [_POINTS[i] for i in _ANKLES], 1]
+    lower = np.argmin(ankles[1:] + ankles[:-1], axis=1)
+    in_flight = np.fmin(acceleration[1:, 1], acceleration[:-1, 1]) < FLIGHT
+    weight = np.zeros(velocity.shape[:2])
+    weight[np.arange(len(lower)), np.array(_ANKLES)[lower]] = np.where(in_flight, _FLYING, 1.0) / SLIP**2
+    return Support(weight, velocity, 0.0, np.zeros((len(lower), 3)))
+
+
+def _with_network(support: Support, pelvis: Array, place: Array) -> Support:
+    """Add a network's contacts and velocity; the pelvis is R_TB (T, 3, 3)."""
+    probability = np.minimum(place[1:, : len(CONTACTS)], place[:-1, : len(CONTACTS)])
+    share = np.clip(5.0 * probability - 3.0, 0.0, 1.0)
+    level = rot.rotation_about_axis("y", rot.yaw_of_matrix(pelvis))
+    free = (level @ place[:, len(CONTACTS) :, None])[..., 0]
+    middle = 0.5 * (free[1:] + free[:-1])
+    weight = support.weight + share / SLIP**2
+    return Support(weight, support.velocity, 1.0 / VELOCITY_ERROR**2, middle)
+
+
+def _speed(acceleration: Array, support: Support, rate: float) -> tuple[Array, Array]:
+    """Return the velocity (T - 1, 3) between frames, m/s, and how far points stand still (T - 1, K), 0 to 1.
+
+    By least squares: v[t] - v[t-1] is the acceleration over a frame, v follows from the points that stand
+    still. Errors last for many frames, so each single frame's counts `rate` times less.
+    """
     from scipy.linalg import solveh_banded
 
-    # Velocities v between frames, by least squares: v[t] - v[t-1] is the acceleration over a frame, v follows
-    # from the supporting foot. Errors last for many frames, so each single frame's counts `rate` times less.
-    in_flight = np.fmin(acceleration[1:, 1], acceleration[:-1, 1]) < FLIGHT
-    support_weight = np.where(in_flight, _FLYING, 1.0) / SLIP**2 / rate
-    support = _support_speed(solution.rotations, offsets, rate)
-    acceleration_weight = np.where(np.isfinite(acceleration[1:-1, 0]), rate / ACCELERATION_ERROR**2, 0.0)
-    gained = acceleration_weight[:, None] * np.nan_to_num(acceleration[1:-1]) / rate
-    trust = np.ones(frames - 1)
+    known = np.isfinite(acceleration[1:-1, 0])
+    stiffness = np.where(known, rate / ACCELERATION_ERROR**2, 0.0)
+    gained = stiffness[:, None] * np.nan_to_num(acceleration[1:-1]) / rate
+    trust = np.ones_like(support.weight)
     for _ in range(_ROUNDS):
-        diagonal = support_weight * trust
-        right = diagonal[:, None] * support
-        diagonal[1:] += acceleration_weight
-        diagonal[:-1] += acceleration_weight
+        weight = support.weight * trust / rate
+        # The last term only keeps the equations solvable where nothing is known.
+        diagonal = weight.sum(axis=1) + support.free_weight / rate + 1e-9
+        right = np.einsum("tk,tki->ti", weight, support.velocity) + support.free_weight / rate * support.free
+        diagonal[1:] += stiffness
+        diagonal[:-1] += stiffness
         right[1:] += gained
         right[:-1] -= gained
-        speed = solveh_banded(np.stack([diagonal, np.append(-acceleration_weight, 0.0)]), right, lower=True)
-        # While the weight shifts from foot to foot, the lower one may be the one that swings.
-        slips = np.linalg.norm(speed - support, axis=1) / (2.0 * SLIP)
+        speed = solveh_banded(np.stack([diagonal, np.append(-stiffness, 0.0)]), right, lower=True)
+        # A point that moves anyway does not stand still: the weight shifts from foot to foot.
+        slips = np.linalg.norm(speed[:, None] - support.velocity, axis=2) / (2.0 * SLIP)
         trust = 1.0 / (1.0 + slips**2) ** 2
-    return standing_pelvis_position(offsets) + np.concatenate(
-        [np.zeros((1, 3)), np.cumsum(speed, axis=0) / rate]
-    )
-
-
-def _support_speed(rotations: Array, offsets: Array, rate: float) -> Array:
-    """Return the velocity (T - 1, 3) of the pelvis between frames if the lower ankle stands still, m/s."""
-    ankles = forward_kinematics(rotations, offsets)[1][:, _ANKLES]
-    lower = np.argmin(ankles[1:, :, 1] + ankles[:-1, :, 1], axis=1)
-    return -rate * np.diff(ankles, axis=0)[np.arange(len(lower)), lower]
+    return speed, trust * np.minimum(support.weight * SLIP**2, 1.0)

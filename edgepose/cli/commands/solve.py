@@ -1,4 +1,4 @@
-"""`edgepose solve`: find the poses of a whole recording, without a network."""
+"""`edgepose solve`: find the poses of a whole recording at once."""
 
 from __future__ import annotations
 
@@ -21,20 +21,28 @@ from edgepose.errors import EdgeposeError
 from edgepose.sinks.registry import SINKS
 
 if TYPE_CHECKING:
-    from edgepose.rotations import Array
+    from edgepose.imu import Recording
     from edgepose.sinks.base import Sink
-    from edgepose.sip.energy import Weights
-    from edgepose.sip.measurements import Measurements
-    from edgepose.sip.solve import Method, OnProgress, Solution
+    from edgepose.sip.measurements import Measurements, SensorMount
+    from edgepose.sip.network_prior import NetworkPrior
+    from edgepose.sip.solve import Method, OnProgress, Settings, Solution
+    from edgepose.sip.translation import PelvisPath
+    from edgepose.skeleton import Body
+
+MODEL = "birnn"
+"""Network whose poses are the prior unless --prior names another."""
+
+STATISTICS = "default"
+"""Name of the shipped statistical prior."""
 
 PLAIN_EVERY_S = 10.0
 """Time between two lines of progress where there is no terminal, seconds."""
 
 
-def _weights(ctx: click.Context, param: click.Parameter, value: str) -> Weights:
+def _weights(ctx: click.Context, param: click.Parameter, value: str) -> dict[str, float]:
     from edgepose.sip.energy import Weights
 
-    weights = Weights()
+    weights: dict[str, float] = {}
     for part in value.split(",") if value else ():
         name, _, number = part.strip().partition("=")
         try:
@@ -45,7 +53,7 @@ def _weights(ctx: click.Context, param: click.Parameter, value: str) -> Weights:
             raise click.BadParameter(
                 f"{part!r} is not NAME=NUMBER with one of {', '.join(Weights._fields)} and a number from 0 on"
             )
-        weights = weights._replace(**{name: weight})
+        weights[name] = weight
     return weights
 
 
@@ -54,12 +62,17 @@ class SolverFlags:
     """How poses are found; the fields are flags of `edgepose solve`."""
 
     method: Method
-    weights: Weights
-    prior: Path | None
+    weights: dict[str, float]
+    prior: str | None
     hold_from: RecordingTime | None
     rate: float
     evaluations: int
     jobs: int
+
+    @property
+    def statistics(self) -> bool:
+        """Whether --prior names a statistical prior."""
+        return self.prior is not None and (self.prior == STATISTICS or self.prior.endswith(".npz"))
 
 
 def _solver_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -71,12 +84,15 @@ def _solver_options(command: Callable[..., Any]) -> Callable[..., Any]:
             default="",
             metavar="NAME=NUMBER[,...]",
             help="Weights of the energy's terms.  "
-            "[default: ori=1, acc=0.05, anthro=1, mahal=0.003, limits=0.1]",
+            "[default: ori=1, acc=0.1, anthro=1, mahal=0.0003, limits=0.1; acc=0.05, mahal=0.003 with a "
+            "statistical prior]",
         ),
         click.option(
             "--prior",
-            type=click.Path(path_type=Path),
-            help="Prior over poses, a file written by `edgepose learn-prior`.  [default: the shipped one]",
+            metavar="MODEL|default|FILE.npz",
+            help="Prior over poses. MODEL: the poses of a network, shipped or an archive, where the six sensors "
+            "are worn. default: the mean and covariance of all poses. FILE.npz: those of your own motion "
+            "capture, from `edgepose learn-prior`.  [default: birnn with the six sensors, else default]",
         ),
         click.option(
             "--hold-from",
@@ -147,9 +163,10 @@ def solve(
 ) -> None:
     """Find the poses of a whole recording at once: Sparse Inertial Poser.
 
-    It needs no network and no training. It finds poses that explain the measurements and that people are
-    likely to take, from any 3 to 17 sensors named by segment, and the path of the pelvis. Ctrl-C keeps the
-    poses found so far.
+    It finds the poses nearest to a network's that explain the measured orientations and accelerations, and
+    the path of the pelvis. Without one of the six sensors, or with --prior default, it needs no network: then
+    it finds poses that people are likely to take, from any 3 to 17 sensors named by segment. Ctrl-C keeps
+    the poses found so far.
 
     \b
     Examples:
@@ -161,18 +178,15 @@ def solve(
 
     from edgepose.sinks.open import open_outputs
     from edgepose.sip import residuals
-    from edgepose.sip.bodies import sensor_points
-    from edgepose.sip.parameterisation import hinge_rig, smpl_rig
-    from edgepose.sip.prior import load_prior
-    from edgepose.sip.solve import Settings
+    from edgepose.sip.measurements import measure
     from edgepose.sip.solve import solve as solve_all
     from edgepose.sip.translation import pelvis_path
 
-    wearer_body, prior = body.build(), load_prior(solver.prior)
-    measurements, damage = _measure(recording, calibration_path, solver)
-    skeleton = hinge_rig(prior) if body.hinges else smpl_rig(prior, measurements.bones)
-    points = sensor_points(wearer_body, measurements.names)
-    settings = Settings(solver.method, skeleton, points, solver.weights, solver.evaluations)
+    wearer_body = body.build()
+    data, mounts = _read(recording, calibration_path, solver)
+    measurements = measure(data, mounts, solver.rate)
+    network = _network(solver, body.hinges, data, mounts, measurements)
+    settings = _settings(solver, body.hinges, wearer_body, measurements, network)
     interrupted = False
     with ExitStack() as stack:
         # Opened before the work, so that a wrong name is reported at once.
@@ -183,7 +197,9 @@ def solve(
         if not solutions:
             raise KeyboardInterrupt
         solution = residuals.concatenate(solutions)
-        _write(sinks, solution, measurements, pelvis_path(solution, points.offsets, solver.rate))
+        place = None if network is None else network.place
+        path = pelvis_path(solution, settings.body.offsets, solver.rate, place)
+        _write(sinks, solution, measurements, path)
         for sink in sinks:
             sink.close()
     _report(solution, measurements)
@@ -191,8 +207,8 @@ def solve(
         residuals.plot(plot, solution, measurements, outputs.overwrite)
     if interrupted:
         raise KeyboardInterrupt
-    if damage:
-        raise EdgeposeError(damage)
+    if data.damage:
+        raise EdgeposeError(data.damage)
 
 
 def _check_outputs(outputs: OutputConfig, plot: Path | None, inputs: Mapping[str, Path | None]) -> None:
@@ -218,15 +234,16 @@ def _check_outputs(outputs: OutputConfig, plot: Path | None, inputs: Mapping[str
         check_picture(plot, "--plot", outputs.overwrite)
 
 
-def _measure(path: Path, calibration_path: Path, solver: SolverFlags) -> tuple[Measurements, str | None]:
-    """Read a recording, and return its measurements and its damage.
+def _read(
+    path: Path, calibration_path: Path, solver: SolverFlags
+) -> tuple[Recording, dict[str, SensorMount]]:
+    """Read a recording and the mounting of its sensors.
 
     Raises:
         EdgeposeError: the recording or the calibration cannot be read, or the method needs other sensors.
     """
     from edgepose.calibration import load_calibration
     from edgepose.sip.inputs import mounted, read
-    from edgepose.sip.measurements import measure
 
     calibration = load_calibration(calibration_path)
     data = read(path, calibration)
@@ -234,8 +251,71 @@ def _measure(path: Path, calibration_path: Path, solver: SolverFlags) -> tuple[M
         raise EdgeposeError(f"{path}: no sensor has accelerations, which sip needs; use --method sop")
     first_s = min(float(sensor.time_s[0]) for sensor in data.sensors.values())
     hold_from_s = None if solver.hold_from is None else solver.hold_from.on_clock(first_s)
-    mounts = mounted(path, data, calibration, hold_from_s)
-    return measure(data, mounts, solver.rate), data.damage
+    return data, mounted(path, data, calibration, hold_from_s)
+
+
+def _network(
+    solver: SolverFlags,
+    hinges: bool,
+    data: Recording,
+    mounts: dict[str, SensorMount],
+    measurements: Measurements,
+) -> NetworkPrior | None:
+    """Return a network's poses for the prior; None where a statistical prior is wanted or has to do.
+
+    Raises:
+        EdgeposeError: --prior names a network that cannot be used with these sensors, or does not exist.
+    """
+    from edgepose.sip.measurements import measure
+    from edgepose.sip.network_prior import missing_for_network, network_prior
+
+    name, plain = solver.prior, "sop" if solver.method == "sop" else "--body hinges"
+    if solver.statistics or (name is None and (hinges or solver.method == "sop")):
+        return None
+    if hinges or solver.method == "sop":
+        raise EdgeposeError(f"{plain} takes no network as its prior: leave out --prior {name}")
+    missing = missing_for_network(measurements)
+    if missing and name is not None:
+        raise EdgeposeError(
+            f"--prior {name} needs the accelerations of {', '.join(missing)}; use --prior default"
+        )
+    if missing:
+        say(f"no accelerations of {', '.join(missing)}: the prior is the statistical one, not a network")
+        return None
+
+    from edgepose.inference.model import load_model
+
+    model = load_model(name or MODEL, precision="f32")
+    if has_terminal():
+        status(f"running {name or MODEL} over the recording")
+    same = model.rate_hz == solver.rate
+    frames = measurements if same else measure(data, mounts, model.rate_hz)
+    return network_prior(model, frames, measurements.time_s)
+
+
+def _settings(
+    solver: SolverFlags, hinges: bool, body: Body, measurements: Measurements, network: NetworkPrior | None
+) -> Settings:
+    """Return the settings of the solver.
+
+    Raises:
+        EdgeposeError: --prior is not a prior of poses.
+    """
+    from edgepose.sip.bodies import sensor_points
+    from edgepose.sip.energy import WITH_NETWORK, Weights
+    from edgepose.sip.parameterisation import hinge_rig, network_rig, smpl_rig
+    from edgepose.sip.prior import load_prior
+    from edgepose.sip.solve import Settings
+
+    own = solver.statistics and solver.prior != STATISTICS
+    prior = load_prior(solver.prior if own else None)
+    if hinges:
+        rig = hinge_rig(prior)
+    else:
+        rig = (smpl_rig if network is None else network_rig)(prior, measurements.bones)
+    weights = (Weights() if network is None else WITH_NETWORK)._replace(**solver.weights)
+    points = sensor_points(body, measurements.names)
+    return Settings(solver.method, rig, points, weights, solver.evaluations, network)
 
 
 def _report(solution: Solution, measurements: Measurements) -> None:
@@ -262,15 +342,17 @@ def _collect(solutions: Iterable[Solution]) -> tuple[list[Solution], bool]:
     return done, False
 
 
-def _write(sinks: list[Sink], solution: Solution, measurements: Measurements, path: Array) -> None:
+def _write(sinks: list[Sink], solution: Solution, measurements: Measurements, path: PelvisPath) -> None:
     import numpy as np
 
     from edgepose.pose import PoseFrame
 
     rotations, std = solution.rotations.astype(np.float32), np.zeros(24, np.float32)
-    for i, (matrices, position) in enumerate(zip(rotations, path, strict=True)):
+    for i, (matrices, position) in enumerate(zip(rotations, path.translation, strict=True)):
         held = frozenset(n for n, h in zip(measurements.names, measurements.held[i], strict=True) if h)
         pose = PoseFrame(i, float(measurements.time_s[i]), matrices, std, position, held)
+        if path.contacts is not None:
+            pose = pose._replace(contacts=path.contacts[i])
         for sink in sinks:
             sink.write(pose)
 
