@@ -3,11 +3,14 @@
     OMP_NUM_THREADS=1 python tools/bench_solve.py speed --plot speed.png
     OMP_NUM_THREADS=1 python tools/bench_solve.py table --data recordings/ --part cmu-walk-run
     OMP_NUM_THREADS=1 python tools/bench_solve.py table --published DIP_IMU/s_09
+    OMP_NUM_THREADS=1 python tools/bench_solve.py place --data recordings/ --part cmu-walk-run
+    OMP_NUM_THREADS=1 python tools/bench_solve.py real
 
 `speed` solves synthetic motion of 500 to 8000 frames and measures CPU seconds of one core. `table` is SIP's
 table 2 on held-out motion capture (recordings of `edgepose synthesize`), with the shipped networks on the
 same sensors. The wearer's body differs from the default, and the sensors have noise and bias. With
---published the table is for real sensors, from DIP-IMU or TotalCapture, and the default body.
+--published the table is for real sensors, from DIP-IMU or TotalCapture, and the default body. `place` measures
+the paths on the same takes, `real` the real wearers of tests/data/real.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ import resource
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,13 +28,17 @@ from numpy.typing import NDArray
 from edgepose import rotations as rot
 from edgepose.analysis import metrics
 from edgepose.calibration import GRAVITY
+from edgepose.inference.model import Model
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.sip.bodies import scaled, sensor_points, shaped_body
-from edgepose.sip.energy import Weights, second_difference
+from edgepose.sip.energy import WITH_NETWORK, Weights, second_difference
 from edgepose.sip.measurements import Measurements
-from edgepose.sip.parameterisation import PoseParameterisation, hinge_rig, smpl_rig
+from edgepose.sip.network_prior import network_prior
+from edgepose.sip.parameterisation import PoseParameterisation, hinge_rig, network_rig, smpl_rig
 from edgepose.sip.prior import Prior, load_prior
-from edgepose.sip.solve import Settings, solve
+from edgepose.sip.residuals import concatenate
+from edgepose.sip.solve import Settings, Solution, solve
+from edgepose.sip.translation import pelvis_path
 from edgepose.skeleton import Body, default_body, forward_kinematics
 
 Array = NDArray[np.float64]
@@ -48,8 +55,8 @@ OWN_SHAPE = 0.03
 ACC_NOISE, ACC_BIAS, ACC_SCALE = 0.1, 0.05, 0.01
 """Standard deviations of the accelerometers' noise per frame, bias per axis (both m/s^2), scale per axis."""
 TURN_NOISE_DEG, TURN_DRIFT_DEG, TURN_BIAS_DEG = 0.3, 0.5, 1.5
-"""Standard deviations of the orientations' noise per frame, of their lasting error in the inertial frame, and of
-the calibration's error, deg per axis. The calibration's does not tilt gravity: its axes are the bone's."""
+"""Standard deviations of the orientations' noise per frame, of their lasting error in the inertial frame, and
+of the calibration's error, deg per axis. The calibration's error does not tilt gravity: it is the bone's."""
 
 
 Method = Callable[[Measurements], Array]
@@ -147,10 +154,11 @@ def _draw(path: Path, rows: Array) -> None:
 
 
 class Sample(NamedTuple):
-    """A take: measurements, and the true local rotations (T, 24, 3, 3)."""
+    """A take: measurements, the true local rotations (T, 24, 3, 3), and the pelvis' path (T, 3) if known."""
 
     measurements: Measurements
     pose: Array
+    path: Array | None = None
 
 
 def takes(data: Path, part: str, every: int, body: Body) -> Iterator[Sample]:
@@ -162,7 +170,7 @@ def takes(data: Path, part: str, every: int, body: Body) -> Iterator[Sample]:
             pose = rot.rotvec_to_matrix(file["poses"].reshape(-1, 24, 3).astype(float))
             # The recordings are of the default body; longer legs take longer steps.
             translation = file["trans"].astype(float) * (body.leg_length_m / default_body().leg_length_m)
-        yield Sample(sensors_of(pose, translation, body, np.random.default_rng(number)), pose)
+        yield Sample(sensors_of(pose, translation, body, np.random.default_rng(number)), pose, translation)
 
 
 def published(folder: Path) -> Iterator[Sample]:
@@ -185,6 +193,19 @@ def solver(method: str, rig: PoseParameterisation, body: Body, weights: Weights)
     """Return SIP or SOP as a method."""
     settings = Settings(method, rig, sensor_points(body, PLACEMENTS), weights)
     return lambda measurements: np.concatenate([p.rotations for p in solve(measurements, settings)])
+
+
+def with_network(name: str, body: Body) -> Callable[[Measurements], tuple[Solution, Array | None]]:
+    """Return SIP with a network's poses as the prior, as a function that also returns the network's place."""
+    rig, points = network_rig(load_prior(), BONES), sensor_points(body, PLACEMENTS)
+    model = Model(name, precision="f32")
+
+    def run(measurements: Measurements) -> tuple[Solution, Array | None]:
+        expected = network_prior(model, measurements, measurements.time_s)
+        settings = Settings("sip", rig, points, WITH_NETWORK, network=expected)
+        return concatenate(list(solve(measurements, settings))), expected.place
+
+    return run
 
 
 def network(name: str, mode: str) -> Method:
@@ -211,6 +232,11 @@ def network(name: str, mode: str) -> Method:
 def methods(prior: Prior, body: Body, described: Body, weights: Weights) -> dict[str, Method]:
     """Return the rows of the table, for a wearer's body and the described body."""
     smpl = smpl_rig(prior, BONES)
+    guided = {
+        (name, label): with_network(name, wearer)
+        for name in ("birnn", "rnn")
+        for label, wearer in (("SIP", body), ("SIP-BW", described), ("SIP-110", scaled(body, 1.1)))
+    }
     return {
         "SOP": solver("sop", smpl, body, weights),
         "SIP-M": solver("sip", hinge_rig(prior), body, weights),
@@ -218,6 +244,10 @@ def methods(prior: Prior, body: Body, described: Body, weights: Weights) -> dict
         "SIP-BW": solver("sip", smpl, described, weights),
         "SIP-110": solver("sip", smpl, scaled(body, 1.1), weights),
         "SIP-120": solver("sip", smpl, scaled(body, 1.2), weights),
+        **{
+            f"{label}, prior {name}": lambda measurements, run=run: run(measurements)[0].rotations
+            for (name, label), run in guided.items()
+        },
         "rnn, online": network("rnn", "stream"),
         "birnn, online, 5 future frames": network("birnn", "stream"),
         "birnn, whole take": network("birnn", "offline"),
@@ -247,6 +277,100 @@ def table(samples: Iterable[Sample], body: Body, rows: dict[str, Method]) -> Non
     )
 
 
+WAYS_M = (3.0, 7.0)
+"""Lengths of the windows of a path in which its error is measured, metres."""
+
+
+def place_errors(found: Array, true: Array) -> dict[str, Array]:
+    """Return errors of a path (T, 3): % of the way, after 10 s in cm, of the height relative to the start in cm."""
+    steps = np.linalg.norm(np.diff(true[:, [0, 2]], axis=0), axis=1)
+    way, error = np.concatenate([[0.0], np.cumsum(steps)]), found - true
+    columns = {}
+    for length in WAYS_M:
+        ends = np.searchsorted(way, way + length)
+        starts = np.flatnonzero(ends < len(way))[::10]
+        moved = (error[ends[starts]] - error[starts])[:, [0, 2]]
+        columns[f"% of {length:g} m"] = 100.0 * np.linalg.norm(moved, axis=1) / length
+    frames = round(10.0 * RATE)
+    moved = (error[frames:] - error[:-frames])[::10, [0, 2]] if len(error) > frames else np.empty((0, 2))
+    columns["10 s, cm"] = 100.0 * np.linalg.norm(moved, axis=1)
+    columns["height, cm"] = 100.0 * np.abs(error[:, 1] - np.median(error[:30, 1]))
+    return columns
+
+
+def place_table(samples: Iterable[Sample], body: Body) -> None:
+    """Print mean errors of the paths: by birnn's contacts, by those of its poses, by those of SIP alone."""
+    guided = with_network("birnn", body)
+    plain = _plain(body)
+    values: dict[str, dict[str, list[Array]]] = {}
+    for sample in samples:
+        assert sample.path is not None, "recordings of edgepose synthesize have paths"
+        solution, place = guided(sample.measurements)
+        alone = plain(sample.measurements)
+        runs = {
+            "SIP, prior birnn": (solution, place),
+            "without its contacts": (solution, None),
+            "SIP": (alone, None),
+        }
+        for name, (poses, contacts) in runs.items():
+            path = pelvis_path(poses, body.offsets, RATE, contacts).translation
+            for key, column in place_errors(path, sample.path).items():
+                values.setdefault(name, {}).setdefault(key, []).append(column)
+    for name, columns in values.items():
+        joined = {key: np.concatenate(column) for key, column in columns.items()}
+        cells = [f"{key} {column.mean():.1f}" for key, column in joined.items() if len(column)]
+        print(f"{name:22}", ", ".join(cells), f"(largest {joined['height, cm'].max():.0f})")
+
+
+def real() -> None:
+    """Print the errors of the walker's unmeasured bones, and the path of walker and sitter; see `evaluate --real`."""
+    from edgepose_export.evaluation import real_wearers as wearers
+
+    body, methods = default_body(), ("rnn", "birnn", "SIP", "SIP, prior rnn", "SIP, prior birnn")
+    walker = wearers.read_walker(wearers.FOLDER)
+    measured = _real_measurements(wearers.FILES[0], wearers.WALKER)
+    poses = {name: Model(name).poses(*walker.take[1:3]).astype(float) for name in methods[:2]}
+    solved = {"SIP": (_plain(body)(measured), None)}
+    solved |= {f"SIP, prior {name}": with_network(name, body)(measured) for name in methods[:2]}
+    nearest = np.searchsorted(measured.time_s[:-1], walker.time_s - 0.5 / RATE)
+    poses |= {name: solution.rotations[nearest] for name, (solution, _) in solved.items()}
+    for part, span in wearers.WALKER.parts.items():
+        rows = {name: wearers.walker_columns(walker, poses[name], span) for name in methods}
+        print(wearers.format_table(f"walker, {part}: error, deg", rows))
+    for name, file, about in (
+        ("walker", wearers.FILES[0], wearers.WALKER),
+        ("sitter", wearers.FILES[2], wearers.SITTER),
+    ):
+        measured = _real_measurements(file, about)
+        solution, place = with_network("birnn", body)(measured)
+        path = pelvis_path(solution, body.offsets, RATE, place).translation
+        parts = {**about.parts, **({"walk": wearers.STRAIGHT_WALK} if name == "sitter" else {})}
+        for part, (start, end) in parts.items():
+            inside = path[(measured.time_s >= start) & (measured.time_s < end)]
+            way = np.linalg.norm((inside[-1] - inside[0])[[0, 2]])
+            heights = (
+                f"{inside[:, 1].mean():.3f} m high, from {inside[:, 1].min():.3f} to {inside[:, 1].max():.3f}"
+            )
+            print(f"{name}, {part}: pelvis {heights}; {way:.2f} m away from the start of this part")
+
+
+def _plain(body: Body) -> Callable[[Measurements], Solution]:
+    """Return SIP with the statistical prior."""
+    settings = Settings("sip", smpl_rig(load_prior(), BONES), sensor_points(body, PLACEMENTS), Weights())
+    return lambda measurements: concatenate(list(solve(measurements, settings)))
+
+
+def _real_measurements(file: str, about: Any) -> Measurements:
+    """Return what `edgepose solve` makes of a real wearer's recording."""
+    from edgepose.formats.recordings.registry import read_recording
+    from edgepose.sip.measurements import measure, mounts
+    from edgepose_export.evaluation import real_wearers as wearers
+
+    path = wearers.FOLDER / file
+    calibration, _ = wearers.calibrated(path, about, RATE)
+    return measure(read_recording(path), mounts(calibration), RATE)
+
+
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description="speed, memory and accuracy of edgepose solve")
@@ -257,8 +381,12 @@ def main() -> None:
     source = good.add_mutually_exclusive_group(required=True)
     source.add_argument("--data", type=Path, help="folder written by edgepose synthesize")
     source.add_argument("--published", type=Path, help="folder of DIP-IMU or TotalCapture")
-    good.add_argument("--part", default="cmu-walk-run", help="part of the split")
-    good.add_argument("--every", type=int, default=1, metavar="N", help="use every Nth take only")
+    paths = commands.add_parser("place", help="paths on held-out motion capture")
+    paths.add_argument("--data", type=Path, required=True, help="folder written by edgepose synthesize")
+    commands.add_parser("real", help="poses and paths of real wearers")
+    for parser in (good, paths):
+        parser.add_argument("--part", default="cmu-walk-run", help="part of the split")
+        parser.add_argument("--every", type=int, default=1, metavar="N", help="use every Nth take only")
     good.add_argument(
         "--prior", type=Path, help="file written by edgepose learn-prior, instead of the shipped prior"
     )
@@ -266,6 +394,11 @@ def main() -> None:
     flags = parser.parse_args()
     if flags.command == "speed":
         speed(flags.plot)
+    elif flags.command == "real":
+        real()
+    elif flags.command == "place":
+        body = own_body(np.random.default_rng(0))
+        place_table(takes(flags.data, flags.part, flags.every, body), body)
     else:
         weights, prior = Weights(mahal=flags.mahal), load_prior(flags.prior)
         print(f"prior of {prior.about}; {weights}")

@@ -31,7 +31,7 @@ class Weights(NamedTuple):
     limits: float = 0.1
 
 
-WITH_NETWORK = Weights(acc=0.1, mahal=3e-4)
+WITH_NETWORK = Weights(acc=0.02, mahal=3e-4)
 """Weights with a network's poses as the prior, tuned on takes for validation."""
 
 

@@ -9,8 +9,11 @@ from edgepose.skeleton import JOINTS, forward_kinematics
 
 Array = NDArray[np.float64]
 
-STEP = 0.10
+STEP = 0.13
 """Smallest step of the ground from one stance to the next, metres; less is an error of the poses."""
+
+DRIFT = 0.4
+"""Largest vertical velocity, m/s, of a path that drifts; the ground does not change so slowly."""
 
 STANCE_S = 0.1
 """Shortest stance, seconds."""
@@ -18,10 +21,12 @@ STANCE_S = 0.1
 HEIGHT_ERROR = 0.03
 """Spread (m) of the errors of a standing ankle's height."""
 
-CLIMB_ERROR = 0.1
+ACCELERATION_ERROR = 0.5
+"""Spread (m/s^2) of errors of the vertical acceleration that last for a second."""
+
+CLIMB_ERROR = 1.0
 """Spread (m/s) of errors of the vertical velocity that last for a second."""
 
-_RECENT = 4  # stances whose drift is averaged
 _ANKLES = [JOINTS.index("left_ankle"), JOINTS.index("right_ankle")]
 
 
@@ -37,32 +42,49 @@ def ankle_heights(path: Array, joints: Array, offsets: Array) -> Array:
     return path[:, 1:2] + joints[:, _ANKLES, 1] - (straight[_ANKLES] - straight.min())
 
 
-def ground_correction(heights: Array, standing: Array, rate: float) -> Array:
-    """Return what to add to the heights (T,) so that standing ankles are on the ground, metres.
+def grounded(path: Array, heights: Array, acceleration: Array, standing: Array, rate: float) -> Array:
+    """Return the height of the pelvis (T,) with which standing ankles are on the ground, metres.
 
-    The ground is level, except where the path climbs a step. The correction changes slowly between stances.
+    By least squares: its second difference is the acceleration, ankles that stand are as high as the ground,
+    and between stances it moves like the path.
 
     Args:
-        heights: (T, 2) of the ankles, see `ankle_heights`.
+        path: (T,) estimated height of the pelvis, which drifts.
+        heights: (T, 2) of the ankles with this path, see `ankle_heights`.
+        acceleration: (T,) upward acceleration of the pelvis, m/s^2; NaN where it is unknown.
         standing: (T - 1, 2) 0 to 1, whether each ankle stands still between frames.
         rate: frames a second.
     """
     from scipy.linalg import solveh_banded
 
+    frames = len(path)
     stances = _stances(standing, rate)
-    wanted, weight = np.zeros(len(heights)), np.zeros(len(heights))
-    for (frames, foot), level in zip(stances, _levels(heights, stances), strict=True):
-        share = standing[frames, foot] / HEIGHT_ERROR**2 / rate
-        wanted[frames] += share * (level - heights[frames, foot])
-        weight[frames] += share
     if not stances:
-        return wanted
-    stiffness = np.full(len(heights) - 1, rate / CLIMB_ERROR**2)
-    diagonal = weight + 1e-9
-    diagonal[1:] += stiffness
-    diagonal[:-1] += stiffness
-    correction: Array = solveh_banded(np.stack([diagonal, np.append(-stiffness, 0.0)]), wanted, lower=True)
-    return correction
+        return path
+    # The unknown is the correction of the path.
+    weight, right = np.full(frames, 1e-9), np.zeros(frames)
+    for (rows, foot), level in zip(stances, _levels(heights, stances, rate), strict=True):
+        share = standing[rows, foot] / HEIGHT_ERROR**2
+        weight[rows] += share
+        right[rows] += share * (level - heights[rows, foot])
+    band = np.zeros((3, frames))
+    band[0] = weight
+    climb = rate**2 / CLIMB_ERROR**2
+    band[0, 1:] += climb
+    band[0, :-1] += climb
+    band[1, :-1] -= climb
+    change = rate**2 * (path[2:] - 2.0 * path[1:-1] + path[:-2])
+    known = np.isfinite(acceleration[1:-1])
+    stiffness = np.where(known, rate**4 / ACCELERATION_ERROR**2, 0.0)
+    force = stiffness * np.where(known, acceleration[1:-1] - change, 0.0) / rate**2
+    for place, factor in enumerate((1.0, -2.0, 1.0)):
+        rows = slice(place, frames - 2 + place)
+        band[0, rows] += factor**2 * stiffness
+        right[rows] += factor * force
+    band[1, :-2] -= 2.0 * stiffness
+    band[1, 1:-1] -= 2.0 * stiffness
+    band[2, :-2] += stiffness
+    return path + np.asarray(solveh_banded(band, right, lower=True))
 
 
 def _stances(standing: Array, rate: float) -> list[tuple[slice, int]]:
@@ -76,17 +98,19 @@ def _stances(standing: Array, rate: float) -> list[tuple[slice, int]]:
     return sorted(stances, key=lambda stance: stance[0].start)
 
 
-def _levels(heights: Array, stances: list[tuple[slice, int]]) -> list[float]:
+def _levels(heights: Array, stances: list[tuple[slice, int]], rate: float) -> list[float]:
     """Return the ground's height at each stance: that of the one before, of an earlier one, or a new one."""
     levels: list[float] = []
-    drifts: list[float] = []
+    drift, end = 0.0, 0
     for frames, foot in stances:
         height = float(np.mean(heights[frames, foot]))
-        drift = float(np.mean(drifts[-_RECENT:])) if drifts else height
+        if not levels:
+            drift = height
         ground, last = height - drift, levels[-1] if levels else 0.0
-        if abs(ground - last) >= STEP:
+        least = STEP + DRIFT * max(frames.start - end, 0) / rate
+        if abs(ground - last) >= least:
             nearest = min(levels, key=lambda level: abs(ground - level))
             last = nearest if abs(ground - nearest) < STEP / 2.0 else ground
         levels.append(last)
-        drifts.append(height - last)
+        drift, end = drift + 0.5 * (height - last - drift), max(end, frames.stop)
     return levels

@@ -75,7 +75,7 @@ def smpl_rig(prior: Prior, bones: ArrayLike) -> PoseParameterisation:
 def network_rig(prior: Prior, bones: ArrayLike) -> PoseParameterisation:
     """Return `smpl_rig` for a network's poses as the prior.
 
-    Joints that no sensor sees are at rest, as in the network's poses. The statistical prior gives only limits.
+    Joints that no sensor sees are at rest, as in the network's poses. Only the prior's limits count.
     """
     rig = smpl_rig(prior, bones)
     return rig._replace(regression=np.zeros_like(rig.regression), rest=np.zeros_like(rig.rest))

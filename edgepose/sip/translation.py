@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from edgepose import rotations as rot
 from edgepose.pose import CONTACTS
-from edgepose.sip.ground import ankle_heights, ground_correction
+from edgepose.sip.ground import ankle_heights, grounded
 from edgepose.sip.solve import Solution
 from edgepose.skeleton import JOINTS, forward_kinematics, standing_pelvis_position
 
@@ -30,9 +30,11 @@ VELOCITY_ERROR = 2.0
 FLIGHT = -4.0
 """Vertical acceleration (m/s^2) below which no foot supports the wearer; free fall is -9.81."""
 
+_HINT = 0.1  # weight of the lower ankle where a network estimates contacts
 _FLYING = 1e-3  # weight of the lower foot in flight
 _ROUNDS = 6  # of reweighting
 _POINTS = [JOINTS.index(name) for name in CONTACTS]
+_TOES = [CONTACTS.index("left_foot"), CONTACTS.index("right_foot")]
 _ANKLES = [CONTACTS.index("left_ankle"), CONTACTS.index("right_ankle")]
 
 
@@ -73,8 +75,8 @@ def pelvis_path(solution: Solution, offsets: Array, rate: float, place: Array | 
         solution: poses, and the acceleration of the pelvis.
         offsets: (24, 3) of the body, metres.
         rate: frames a second.
-        place: (T, 10) contacts and velocity from a network, see `edgepose.inference.engine.EngineOutput`; None
-            takes contacts from the poses.
+        place: (T, 10) contacts and velocity from a network, see `edgepose.inference.engine.EngineOutput`;
+            None takes contacts from the poses.
     """
     frames = len(solution.acceleration)
     contacts = None if place is None else place[:, : len(CONTACTS)].astype(np.float32)
@@ -82,16 +84,22 @@ def pelvis_path(solution: Solution, offsets: Array, rate: float, place: Array | 
         return PelvisPath(np.tile(standing_pelvis_position(offsets), (frames, 1)), contacts)
     joints = forward_kinematics(solution.rotations, offsets)[1] - offsets[0]
     support = _support_of_poses(joints, solution.acceleration, rate)
-    speed, standing = _speed(solution.acceleration, support, rate)
-    if place is not None:
-        # In a network's poses feet are fixed to the shanks, so a standing toe seems to rise and sink. Heights
-        # come from the ankles alone.
-        support = _with_network(support, solution.rotations[:, 0], place)
-        speed[:, [0, 2]] = _speed(solution.acceleration, support, rate)[0][:, [0, 2]]
+    if place is None:
+        speed, still = _speed(solution.acceleration, support, rate)
+        standing = still[:, _ANKLES]
+    else:
+        share = _shares(place)
+        support = _with_network(support, share, solution.rotations[:, 0], place)
+        speed, _ = _speed(solution.acceleration, support, rate)
+        # A network's feet are fixed to the shanks, so toes that stand seem to rise and sink.
+        weight = support.weight.copy()
+        weight[:, _TOES] = 0.0
+        speed[:, 1] = _speed(solution.acceleration, support._replace(weight=weight), rate)[0][:, 1]
+        standing = np.maximum(share[:, _ANKLES], share[:, _TOES])
     start = standing_pelvis_position(offsets)
     path = start + np.concatenate([np.zeros((1, 3)), np.cumsum(speed, axis=0) / rate])
     heights = ankle_heights(path, joints, offsets)
-    path[:, 1] += ground_correction(heights, standing[:, _ANKLES], rate)
+    path[:, 1] = grounded(path[:, 1], heights, solution.acceleration[:, 1], standing, rate)
     return PelvisPath(path, contacts)
 
 
@@ -106,15 +114,26 @@ def _support_of_poses(joints: Array, acceleration: Array, rate: float) -> Suppor
     return Support(weight, velocity, 0.0, np.zeros((len(lower), 3)))
 
 
-def _with_network(support: Support, pelvis: Array, place: Array) -> Support:
-    """Add a network's contacts and velocity; the pelvis is R_TB (T, 3, 3)."""
+def _shares(place: Array) -> Array:
+    """Return how far each point is in contact between frames (T - 1, 7), 0 to 1, from a network's place."""
     probability = np.minimum(place[1:, : len(CONTACTS)], place[:-1, : len(CONTACTS)])
-    share = np.clip(5.0 * probability - 3.0, 0.0, 1.0)
+    share: Array = np.clip(5.0 * probability - 3.0, 0.0, 1.0)
+    return share
+
+
+def _with_network(support: Support, share: Array, pelvis: Array, place: Array) -> Support:
+    """Return a support by a network's contacts and velocity, with that of the poses as a hint.
+
+    Args:
+        support: of the poses.
+        share: (T - 1, 7) contacts.
+        pelvis: (T, 3, 3) R_TB.
+        place: (T, 10) with the velocity.
+    """
     level = rot.rotation_about_axis("y", rot.yaw_of_matrix(pelvis))
     free = (level @ place[:, len(CONTACTS) :, None])[..., 0]
-    middle = 0.5 * (free[1:] + free[:-1])
-    weight = support.weight + share / SLIP**2
-    return Support(weight, support.velocity, 1.0 / VELOCITY_ERROR**2, middle)
+    weight = _HINT * support.weight + share / SLIP**2
+    return Support(weight, support.velocity, 1.0 / VELOCITY_ERROR**2, 0.5 * (free[1:] + free[:-1]))
 
 
 def _speed(acceleration: Array, support: Support, rate: float) -> tuple[Array, Array]:

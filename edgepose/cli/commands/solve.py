@@ -84,14 +84,14 @@ def _solver_options(command: Callable[..., Any]) -> Callable[..., Any]:
             default="",
             metavar="NAME=NUMBER[,...]",
             help="Weights of the energy's terms.  "
-            "[default: ori=1, acc=0.1, anthro=1, mahal=0.0003, limits=0.1; acc=0.05, mahal=0.003 with a "
-            "statistical prior]",
+            "[default: ori=1, acc=0.02, anthro=1, mahal=0.0003, limits=0.1; acc=0.05, mahal=0.003 with "
+            "a statistical prior]",
         ),
         click.option(
             "--prior",
             metavar="MODEL|default|FILE.npz",
-            help="Prior over poses. MODEL: the poses of a network, shipped or an archive, where the six sensors "
-            "are worn. default: the mean and covariance of all poses. FILE.npz: those of your own motion "
+            help="Prior over poses. MODEL: the poses of a network, shipped or an archive, for the six "
+            "sensors. default: the mean and covariance of all poses. FILE.npz: those of your own motion "
             "capture, from `edgepose learn-prior`.  [default: birnn with the six sensors, else default]",
         ),
         click.option(

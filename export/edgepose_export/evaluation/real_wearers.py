@@ -127,7 +127,7 @@ def read_walker(folder: Path, rate: float = RATE) -> Wearer:
     Raises:
         EdgeposeError: a recording is missing or cannot be read, or lacks a sensor or the N-pose.
     """
-    calibration, wearer = _calibrated(folder / FILES[0], WALKER, rate)
+    calibration, wearer = calibrated(folder / FILES[0], WALKER, rate)
     path = folder / FILES[1]
     further = read_sensors(path, tuple(SITES))
     names = [name for bones in TRUE_BONES.values() for name in bones]
@@ -150,10 +150,10 @@ def read_sitter(folder: Path, rate: float = RATE) -> Wearer:
     Raises:
         EdgeposeError: the recording is missing or cannot be read, or lacks a sensor or the N-pose.
     """
-    return _calibrated(folder / FILES[2], SITTER, rate)[1]
+    return calibrated(folder / FILES[2], SITTER, rate)[1]
 
 
-def _calibrated(path: Path, about: _Recording, rate: float) -> tuple[Calibration, Wearer]:
+def calibrated(path: Path, about: _Recording, rate: float) -> tuple[Calibration, Wearer]:
     """Calibrate a recording as `edgepose calibrate` does, and run it up to the network as `run` does."""
     recording = read_recording(path)
     last_s = min(float(data.time_s[-1]) for data in recording.sensors.values())
