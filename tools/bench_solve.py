@@ -3,14 +3,11 @@
     OMP_NUM_THREADS=1 python tools/bench_solve.py speed --plot speed.png
     OMP_NUM_THREADS=1 python tools/bench_solve.py table --data recordings/ --part cmu-walk-run
     OMP_NUM_THREADS=1 python tools/bench_solve.py table --published DIP_IMU/s_09
-    OMP_NUM_THREADS=1 python tools/bench_solve.py place --data recordings/ --part cmu-walk-run
-    OMP_NUM_THREADS=1 python tools/bench_solve.py real
 
 `speed` solves synthetic motion of 500 to 8000 frames and measures CPU seconds of one core. `table` is SIP's
 table 2 on held-out motion capture (recordings of `edgepose synthesize`), with the shipped networks on the
 same sensors. The wearer's body differs from the default, and the sensors have noise and bias. With
---published the table is for real sensors, from DIP-IMU or TotalCapture, and the default body. `place` measures
-the paths on the same takes, `real` the real wearers of tests/data/real.
+--published the table is for real sensors, from DIP-IMU or TotalCapture, and the default body.
 """
 
 from __future__ import annotations
@@ -20,7 +17,7 @@ import resource
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +35,6 @@ from edgepose.sip.parameterisation import PoseParameterisation, hinge_rig, netwo
 from edgepose.sip.prior import Prior, load_prior
 from edgepose.sip.residuals import concatenate
 from edgepose.sip.solve import Settings, Solution, solve
-from edgepose.sip.translation import pelvis_path
 from edgepose.skeleton import Body, default_body, forward_kinematics
 
 Array = NDArray[np.float64]
@@ -87,7 +83,7 @@ def sensors_of(local: Array, translation: Array, body: Body, rng: np.random.Gene
 
 
 def _turned(deviation_deg: float, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
-    """Return random rotations (..., 3, 3) whose vectors, of that shape, have a standard deviation per axis."""
+    """Return random rotations (..., 3, 3) whose vectors have this shape and deviation per axis."""
     return rot.rotvec_to_matrix(np.deg2rad(deviation_deg) * rng.normal(size=shape))
 
 
@@ -208,6 +204,12 @@ def with_network(name: str, body: Body) -> Callable[[Measurements], tuple[Soluti
     return run
 
 
+def plain_sip(body: Body) -> Callable[[Measurements], Solution]:
+    """Return SIP with the statistical prior."""
+    settings = Settings("sip", smpl_rig(load_prior(), BONES), sensor_points(body, PLACEMENTS), Weights())
+    return lambda measurements: concatenate(list(solve(measurements, settings)))
+
+
 def network(name: str, mode: str) -> Method:
     """Return a shipped model as a method, run as `edgepose run` runs it."""
     from edgepose.inference import archive
@@ -277,100 +279,6 @@ def table(samples: Iterable[Sample], body: Body, rows: dict[str, Method]) -> Non
     )
 
 
-WAYS_M = (3.0, 7.0)
-"""Lengths of the windows of a path in which its error is measured, metres."""
-
-
-def place_errors(found: Array, true: Array) -> dict[str, Array]:
-    """Return errors of a path (T, 3): % of the way, after 10 s in cm, of the height relative to the start in cm."""
-    steps = np.linalg.norm(np.diff(true[:, [0, 2]], axis=0), axis=1)
-    way, error = np.concatenate([[0.0], np.cumsum(steps)]), found - true
-    columns = {}
-    for length in WAYS_M:
-        ends = np.searchsorted(way, way + length)
-        starts = np.flatnonzero(ends < len(way))[::10]
-        moved = (error[ends[starts]] - error[starts])[:, [0, 2]]
-        columns[f"% of {length:g} m"] = 100.0 * np.linalg.norm(moved, axis=1) / length
-    frames = round(10.0 * RATE)
-    moved = (error[frames:] - error[:-frames])[::10, [0, 2]] if len(error) > frames else np.empty((0, 2))
-    columns["10 s, cm"] = 100.0 * np.linalg.norm(moved, axis=1)
-    columns["height, cm"] = 100.0 * np.abs(error[:, 1] - np.median(error[:30, 1]))
-    return columns
-
-
-def place_table(samples: Iterable[Sample], body: Body) -> None:
-    """Print mean errors of the paths: by birnn's contacts, by those of its poses, by those of SIP alone."""
-    guided = with_network("birnn", body)
-    plain = _plain(body)
-    values: dict[str, dict[str, list[Array]]] = {}
-    for sample in samples:
-        assert sample.path is not None, "recordings of edgepose synthesize have paths"
-        solution, place = guided(sample.measurements)
-        alone = plain(sample.measurements)
-        runs = {
-            "SIP, prior birnn": (solution, place),
-            "without its contacts": (solution, None),
-            "SIP": (alone, None),
-        }
-        for name, (poses, contacts) in runs.items():
-            path = pelvis_path(poses, body.offsets, RATE, contacts).translation
-            for key, column in place_errors(path, sample.path).items():
-                values.setdefault(name, {}).setdefault(key, []).append(column)
-    for name, columns in values.items():
-        joined = {key: np.concatenate(column) for key, column in columns.items()}
-        cells = [f"{key} {column.mean():.1f}" for key, column in joined.items() if len(column)]
-        print(f"{name:22}", ", ".join(cells), f"(largest {joined['height, cm'].max():.0f})")
-
-
-def real() -> None:
-    """Print the errors of the walker's unmeasured bones, and the path of walker and sitter; see `evaluate --real`."""
-    from edgepose_export.evaluation import real_wearers as wearers
-
-    body, methods = default_body(), ("rnn", "birnn", "SIP", "SIP, prior rnn", "SIP, prior birnn")
-    walker = wearers.read_walker(wearers.FOLDER)
-    measured = _real_measurements(wearers.FILES[0], wearers.WALKER)
-    poses = {name: Model(name).poses(*walker.take[1:3]).astype(float) for name in methods[:2]}
-    solved = {"SIP": (_plain(body)(measured), None)}
-    solved |= {f"SIP, prior {name}": with_network(name, body)(measured) for name in methods[:2]}
-    nearest = np.searchsorted(measured.time_s[:-1], walker.time_s - 0.5 / RATE)
-    poses |= {name: solution.rotations[nearest] for name, (solution, _) in solved.items()}
-    for part, span in wearers.WALKER.parts.items():
-        rows = {name: wearers.walker_columns(walker, poses[name], span) for name in methods}
-        print(wearers.format_table(f"walker, {part}: error, deg", rows))
-    for name, file, about in (
-        ("walker", wearers.FILES[0], wearers.WALKER),
-        ("sitter", wearers.FILES[2], wearers.SITTER),
-    ):
-        measured = _real_measurements(file, about)
-        solution, place = with_network("birnn", body)(measured)
-        path = pelvis_path(solution, body.offsets, RATE, place).translation
-        parts = {**about.parts, **({"walk": wearers.STRAIGHT_WALK} if name == "sitter" else {})}
-        for part, (start, end) in parts.items():
-            inside = path[(measured.time_s >= start) & (measured.time_s < end)]
-            way = np.linalg.norm((inside[-1] - inside[0])[[0, 2]])
-            heights = (
-                f"{inside[:, 1].mean():.3f} m high, from {inside[:, 1].min():.3f} to {inside[:, 1].max():.3f}"
-            )
-            print(f"{name}, {part}: pelvis {heights}; {way:.2f} m away from the start of this part")
-
-
-def _plain(body: Body) -> Callable[[Measurements], Solution]:
-    """Return SIP with the statistical prior."""
-    settings = Settings("sip", smpl_rig(load_prior(), BONES), sensor_points(body, PLACEMENTS), Weights())
-    return lambda measurements: concatenate(list(solve(measurements, settings)))
-
-
-def _real_measurements(file: str, about: Any) -> Measurements:
-    """Return what `edgepose solve` makes of a real wearer's recording."""
-    from edgepose.formats.recordings.registry import read_recording
-    from edgepose.sip.measurements import measure, mounts
-    from edgepose_export.evaluation import real_wearers as wearers
-
-    path = wearers.FOLDER / file
-    calibration, _ = wearers.calibrated(path, about, RATE)
-    return measure(read_recording(path), mounts(calibration), RATE)
-
-
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description="speed, memory and accuracy of edgepose solve")
@@ -381,12 +289,8 @@ def main() -> None:
     source = good.add_mutually_exclusive_group(required=True)
     source.add_argument("--data", type=Path, help="folder written by edgepose synthesize")
     source.add_argument("--published", type=Path, help="folder of DIP-IMU or TotalCapture")
-    paths = commands.add_parser("place", help="paths on held-out motion capture")
-    paths.add_argument("--data", type=Path, required=True, help="folder written by edgepose synthesize")
-    commands.add_parser("real", help="poses and paths of real wearers")
-    for parser in (good, paths):
-        parser.add_argument("--part", default="cmu-walk-run", help="part of the split")
-        parser.add_argument("--every", type=int, default=1, metavar="N", help="use every Nth take only")
+    good.add_argument("--part", default="cmu-walk-run", help="part of the split")
+    good.add_argument("--every", type=int, default=1, metavar="N", help="use every Nth take only")
     good.add_argument(
         "--prior", type=Path, help="file written by edgepose learn-prior, instead of the shipped prior"
     )
@@ -394,11 +298,6 @@ def main() -> None:
     flags = parser.parse_args()
     if flags.command == "speed":
         speed(flags.plot)
-    elif flags.command == "real":
-        real()
-    elif flags.command == "place":
-        body = own_body(np.random.default_rng(0))
-        place_table(takes(flags.data, flags.part, flags.every, body), body)
     else:
         weights, prior = Weights(mahal=flags.mahal), load_prior(flags.prior)
         print(f"prior of {prior.about}; {weights}")
