@@ -4,7 +4,8 @@ Assumptions:
 - The ground is level, apart from steps: a foot that comes to rest clearly above or below what the feet stood
   on stands on something else. Slopes, and steps lower than `_STEP`, cannot be told from errors of poses.
 - What a foot stands on does not move. A foot that has stood for long is where it was.
-- No part of the body is below the ground.
+- No part of the body is below the ground. A foot may be, if one of them stands: it goes down a step. Who
+  jumps comes down on a known ground, or higher.
 """
 
 from __future__ import annotations
@@ -113,8 +114,17 @@ class Ground:
             part = min(1.0, dt / _ANCHOR_S) / anchored
             position[0] += _limited(part * x, dt)
             position[2] += _limited(part * z, dt)
-        ground = min(self._feet[0].ground, self._feet[1].ground)
-        position[1] += _limited(max(ground + self.height_of(points) - position[1], 0.0), dt)
+        self._keep_above(dt, position, points)
+
+    def _keep_above(self, dt: float, position: list[float], points: Sequence[Point]) -> None:
+        """Lift a body out of the ground."""
+        ground = min(foot.ground for foot in self._feet)
+        standing = any(foot.planted_s > 0.0 for foot in self._feet)
+        parts: Sequence[int] = NEVER_BELOW[2:] if standing else NEVER_BELOW
+        if not standing:
+            ground = min(ground, 0.0)
+        depth = ground + max(self._skin[i] - points[i][1] for i in parts) - position[1]
+        position[1] += _limited(max(depth, 0.0), dt)
 
     def _ground_at(self, height: float) -> float:
         """Return the height of what a foot stands on that came to rest at a height."""

@@ -77,7 +77,8 @@ class PlaceTracker:
             rotations: (24, 3, 3) local rotations, joint 0 relative to T.
             place: (10,) the network's contacts and velocity, see `EngineOutput.place`; None without them.
         """
-        points = self._points.positions(rotations)
+        with np.errstate(all="ignore"):  # numbers that are not finite, or too large, are found below
+            points = self._points.positions(rotations)
         numbers: list[float] | None = None if place is None else place.tolist()
         if numbers is not None and not math.isfinite(sum(numbers)):
             place = numbers = None
