@@ -52,7 +52,8 @@ def evaluate_place(
             errors = summarise(path.errors for path in paths)
             kinds = summarise({BOTH: path.kinds} for path in paths)
             show(f"\n{format_table(f'{part}, {model.name}: errors of the path', errors)}")
-            show(f"\n{format_table(f'{part}, {model.name}: after 2 s, cm, by kind of motion', kinds)}")
+            if kinds:
+                show(f"\n{format_table(f'{part}, {model.name}: after 2 s, cm, by kind of motion', kinds)}")
             if model is able[0]:
                 drawn[part] = sorted(paths, key=_length, reverse=True)[:SHOWN]
     show(f"\n{LEGEND}")

@@ -260,7 +260,10 @@ def format_table(title: str, table: Mapping[str, Mapping[str, Metric]]) -> str:
     """Format means with one line per row; the last line has the numbers of values."""
     keys = list(next(iter(table.values())))
     head = ["", *keys]
-    rows = [[name, *(f"{row[key].mean:.1f}" for key in keys)] for name, row in table.items()]
+    rows = [
+        [name, *(f"{row[key].mean:.1f}" if row[key].frames else "-" for key in keys)]
+        for name, row in table.items()
+    ]
     counts = ["count", *(str(next(iter(table.values()))[key].frames) for key in keys)]
     widths = [max(map(len, column)) for column in zip(head, *rows, counts, strict=True)]
     lines = [title]
