@@ -92,9 +92,9 @@ TRUTH = "truth"
 
 LEGEND = """\
 means; count: measured times, ways, frames, takes
-2 s, ...: error after this time, cm; 1 m, ...: error over a way this long, % of it
-height: error of the height against the first second, cm; at end: in the last one
-slide: movement of a sole between the ends of a contact, cm per second of contact
+2 s, ...: error after this time, cm; 1 m, ...: error over a way this long, %
+height: error of the height against the first second, cm; at end: in the last
+slide: movement of a sole in a contact with the ground, cm per second of contact
 no heads: the lower foot stands still; velocity: the network's velocity alone;
     contacts: its contacts alone; both: as in a run; truth: the true motion"""
 
