@@ -73,6 +73,7 @@ class BodyPoints:
         Args:
             rotations: (24, 3, 3) local rotations, joint 0 relative to T.
         """
+        rotations = np.asarray(rotations, float)  # once, not in each product
         matmul, everything = np.matmul, self._all
         self._below_knee[:, :, 1:] = matmul(rotations[7:9], self._toe) + self._ankle
         self._below_hip[:, :, 1:] = matmul(rotations[4:6], self._below_knee) + self._knee
