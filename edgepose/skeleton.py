@@ -178,7 +178,7 @@ def with_leg_length(body: Body, leg_length_m: float) -> Body:
         raise EdgeposeError(
             f"leg length {leg_length_m:g} m does not fit a height of {body.height_m:g} m, for which it is "
             f"{low:.2f} to {high:.2f} m: measure from the hip joint to the ankle, in metres, and give the "
-            "height, too"
+            "height as well"
         )
     offsets, sensors = body.offsets.copy(), body.sensors.copy()
     offsets[_KNEES_AND_ANKLES] *= ratio

@@ -177,7 +177,7 @@ def _check_metadata(path: Path, metadata: Any) -> None:
         raise ModelError(f"{path}: made for other sensor placements: {metadata.get('placements')}")
     place = metadata.get("place")
     if has_place(metadata) and not (isinstance(place, dict) and place.get("contacts") == list(CONTACTS)):
-        raise ModelError(f"{path}: made for other contacts: {place}")
+        raise ModelError(f"{path}: it estimates other contacts than this edgepose reads; update edgepose")
     if not isinstance(metadata.get("rate_hz"), (int, float)) or not 1 <= metadata["rate_hz"] <= 1000:
         raise ModelError(f"{path}: the archive's frame rate {metadata.get('rate_hz')!r} is not a rate")
     for name in ("past", "future"):
@@ -218,6 +218,8 @@ def load(info: ArchiveInfo, trust: bool = False) -> torch.jit.ScriptModule:
         raise ModelError(
             f"{info.path}: torch cannot load the archive ({reason[0] if reason else type(error).__name__})"
         ) from error
+    if has_place(info.metadata) and not hasattr(module, "stream_place"):
+        raise ModelError(f"{info.path}: the contacts that its metadata name are missing; export it again")
     return module
 
 

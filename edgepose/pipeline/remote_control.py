@@ -8,10 +8,10 @@ from __future__ import annotations
 import math
 import socket
 import struct
-from collections import defaultdict
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
+from math import inf
 from typing import Literal, NamedTuple
 
 from edgepose.errors import DeviceError
@@ -141,13 +141,14 @@ class Requests:
         """
         self._control = None if control is None else stack.enter_context(Control(*control))
         self._by_key = by_key
-        self._pending: defaultdict[Action, list[float]] = defaultdict(list)
+        self._pending: dict[Action, float] = {}
 
     def poll(self, action: Action) -> list[float]:
-        """Return the delay of each new request for an action, seconds; poll for all actions in turn."""
+        """Return the delay of a new request for an action, the shortest of several, seconds."""
         for request in self._by_key() + ([] if self._control is None else self._control.requests()):
-            self._pending[request.action].append(request.delay_s)
-        return self._pending.pop(action, [])
+            # Only one is kept, so that a flood for an action that is not polled yet takes no memory.
+            self._pending[request.action] = min(self._pending.get(request.action, inf), request.delay_s)
+        return [self._pending.pop(action)] if action in self._pending else []
 
     def summary_lines(self) -> list[str]:
         """Return the lines for the end of the run."""

@@ -114,7 +114,7 @@ class VmcSink(DatagramSink):
             position = grounded_pelvis_position(pose.rotations, self._offsets)
         # The root stands on the floor below the pelvis, so that an avatar whose receiver keeps its own bone
         # positions walks, too.
-        x_m, height_m, z_m = position * TO_UNITY
+        x_m, height_m, z_m = position * TO_UNITY + 0.0  # no negative zeros
         root = _ROOT + struct.pack(">7f", x_m, 0, z_m, 0, 0, 0, 1)
         positions[0] = 0.0, height_m, 0.0
         numbers = np.column_stack([positions, x, -y, -z, w]).astype(">f4")

@@ -317,4 +317,10 @@ def test_contacts_that_an_archive_estimates(tmp_path, write_archive):
     assert not archive.has_place(archive.read_info(write_archive(tmp_path / "plain.pt")).metadata)
     for place in (None, 7, {}, {"contacts": ["left_ankle"]}, {"contacts": [*CONTACTS, "head"]}):
         text = json.dumps(metadata_of(path) | {"place": place})
-        fails(with_metadata(path, tmp_path / "other.pt", text), "made for other contacts")
+        fails(with_metadata(path, tmp_path / "other.pt", text), "estimates other contacts than this edgepose")
+
+
+def test_contacts_that_are_only_in_the_metadata(tmp_path, write_archive):
+    path = write_archive(tmp_path / "plain.pt", place={"contacts": list(CONTACTS)})
+    with pytest.raises(EdgeposeError, match=r"plain.pt: the contacts that its metadata name are missing"):
+        archive.load(archive.read_info(path), trust=True)
