@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from edgepose.calibration.checks import GRAVITY_TILT_LIMIT_DEG
 from edgepose.calibration.fit import POSE_TILT_DEG
+from edgepose.calibration.misfit import UPSIDE_DOWN_DEG
 from edgepose.diagnostics.sensor_health import REST_ACC, REST_S, SensorHealth
 from edgepose.sources.clock_sync import FOLLOWED_PPM
 from edgepose.utils import fault_messages as messages
@@ -262,12 +263,22 @@ def _heading(s: SensorHealth) -> str | None:
 def _placement(s: SensorHealth) -> str | None:
     if s.swapped_with is not None:
         return f"it is where {s.swapped_with} was calibrated: swap the two"
+    if s.pose_tilt_deg > POSE_TILT_DEG and not s.in_pose:
+        return (
+            f"it is tilted by {s.pose_tilt_deg:.0f} deg against the calibration, as are others: stand in its "
+            "pose; if you did, it is the calibration of another wearer or rig: calibrate again"
+        )
+    if s.pose_tilt_deg > UPSIDE_DOWN_DEG:
+        return (
+            f"it is turned by {s.pose_tilt_deg:.0f} deg against the calibration: it sits upside down; "
+            "turn it round, or calibrate again"
+        )
     if s.pose_tilt_deg > POSE_TILT_DEG:
         return (
             f"it is tilted by {s.pose_tilt_deg:.0f} deg against the calibration: "
             "stand as you did then; if it has slipped, calibrate again"
         )
-    return None
+    return s.impossible
 
 
 def _field(s: SensorHealth) -> str | None:

@@ -34,6 +34,7 @@ from edgepose.orientation.stage import OrientationStage
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 from edgepose.sinks.output_files import check_output
+from edgepose.skeleton import MAX_HEIGHT, MIN_HEIGHT
 from edgepose.sources.sensor_map import read_map
 
 
@@ -142,9 +143,21 @@ def _plan_options(command: Callable[..., Any]) -> Callable[..., Any]:
     help="Calibration file to write, JSON; - is standard output.",
 )
 @overwrite_option
+@click.option(
+    "--height",
+    "height_m",
+    type=click.FloatRange(MIN_HEIGHT, MAX_HEIGHT),
+    help="The wearer's height, metres, which run then uses.",
+)
 @_plan_options
 def calibrate(
-    source: SourceConfig, filter: str, no_mag: bool, out: str, overwrite: bool, plan: CalibrationPlan
+    source: SourceConfig,
+    filter: str,
+    no_mag: bool,
+    out: str,
+    overwrite: bool,
+    height_m: float | None,
+    plan: CalibrationPlan,
 ) -> None:
     """Find out how the six sensors sit on their wearer.
 
@@ -184,6 +197,7 @@ def calibrate(
         metadata=_metadata(source, plan, measured),
         filter=filter,
         north=orient.north and (filter != "none" or reset is None),
+        height_m=height_m,
     )
     if sensor_map is not None:
         for warning in calibration.mounting_warnings(result, mountings, sensor_map.path):

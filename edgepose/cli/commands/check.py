@@ -21,6 +21,7 @@ from edgepose.cli.terminal.messages import LEAST_COLUMNS, pieces, printable, say
 from edgepose.cli.terminal.stop_signal import StopSignal
 from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
+from edgepose.imu import FILTERS
 
 if TYPE_CHECKING:
     from edgepose.diagnostics.rules import Diagnosis
@@ -71,10 +72,22 @@ class State(NamedTuple):
     type=click.Path(path_type=Path, dir_okay=False),
     help="Calibration of a wearer who stands in its pose: headings and placements are compared with it.",
 )
+@click.option(
+    "--filter", type=click.Choice(FILTERS), help="Filter of the planned run, to compare with --calibration."
+)
+@click.option("--no-mag", is_flag=True, help="The planned run does not use magnetometers.")
+@click.option("--height", "height_m", type=float, help="The wearer's height in the planned run, metres.")
 @click.option("--json", "as_json", is_flag=True, help="Write the result as JSON.")
 @click.pass_context
 def check(
-    ctx: click.Context, source: SourceConfig, seconds: float | None, calibration: Path | None, as_json: bool
+    ctx: click.Context,
+    source: SourceConfig,
+    seconds: float | None,
+    calibration: Path | None,
+    filter: str | None,
+    no_mag: bool,
+    height_m: float | None,
+    as_json: bool,
 ) -> None:
     """Show the health of each sensor, and how to fix problems.
 
@@ -83,7 +96,8 @@ def check(
     The sensors may lie on a table or be worn. Hold them still for some seconds: gravity, noise and bias only
     show at rest. Then turn each one to and fro: gyroscope and orientation can only be compared in motion.
 
-    The exit code is 0 if all six sensors are fine, and 1 if one of them, or a part of the file, is not.
+    The exit code is 0 if all six sensors are fine, and 1 if one of them, or a part of the file, is not, or if
+    the rig has changed since the calibration.
 
     \b
     Examples:
@@ -94,10 +108,14 @@ def check(
     """
     from edgepose.calibration import load_calibration
     from edgepose.diagnostics.sensor_health import SensorHealthMonitor
-    from edgepose.pipeline.rig_comparison import missing_heading_reset, other_devices
+    from edgepose.pipeline.calibrated_settings import check_settings
+    from edgepose.pipeline.rig_comparison import changes, missing_heading_reset
     from edgepose.sources import open_source
+    from edgepose.sources.sensor_map import read_map
 
     loaded = None if calibration is None else load_calibration(calibration)
+    sensor_map = None if source.sensors is None else read_map(source.sensors)
+    differences = [] if loaded is None else check_settings(loaded, filter, no_mag, height_m)
     health = SensorHealthMonitor(loaded)
     if seconds is None:
         seconds = DEFAULT_S if source.live and not is_terminal() else math.inf
@@ -112,7 +130,8 @@ def check(
                 page.draw(_page_lines(source.name, now(), warnings))
 
         state, error = _listen(opened, health, source.file is None, seconds, lambda: stop.asked, watch)
-        differences = [] if loaded is None else other_devices(loaded, opened.devices)
+        if loaded is not None:
+            differences += changes(loaded, opened.devices, sensor_map)
         for difference in [*differences, *missing_heading_reset(loaded, opened.devices)]:
             _log.warning("%s", difference)
     if page is not None:
@@ -130,7 +149,7 @@ def check(
         click.echo("\n".join(_lines(state, shutil.get_terminal_size().columns if is_terminal() else None)))
     if error is not None:
         raise error
-    ctx.exit(1 if state.problems or opened.damage else 0)
+    ctx.exit(1 if state.problems or opened.damage or differences else 0)
 
 
 def _page_lines(name: str, state: State, warnings: list[str]) -> list[str]:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from edgepose.calibration.checks import GRAVITY_TILT_LIMIT_DEG
 from edgepose.calibration.sensor_to_segment import Calibration
 from edgepose.diagnostics.sensor_health.columns import joined_rows, row_of
-from edgepose.diagnostics.sensor_health.comparison import HeadingComparison, compare_values
+from edgepose.diagnostics.sensor_health.comparison import RigComparison, compare_values
 from edgepose.diagnostics.sensor_health.report import SensorHealth
 from edgepose.diagnostics.sensor_health.sensor import Sensor
 from edgepose.imu import ImuSample
@@ -27,7 +27,7 @@ class SensorHealthMonitor:
     def __init__(self, calibration: Calibration | None = None) -> None:
         """Create the monitor; with a calibration, headings and placements are checked on the body."""
         self._sensors = [Sensor() for _ in PLACEMENTS]
-        self._headings = HeadingComparison(calibration)
+        self._comparison = RigComparison(calibration)
         self._next_fold_s = -math.inf
 
     def add(self, samples: Iterable[ImuSample], arrival_s: float = math.nan) -> None:
@@ -58,9 +58,9 @@ class SensorHealthMonitor:
         """
         self._fold()
         result = []
-        headings, values = self._headings.result(), compare_values(self._sensors)
+        rig, values = self._comparison.result(), compare_values(self._sensors)
         for i, (name, sensor) in enumerate(zip(PLACEMENTS, self._sensors, strict=True)):
-            fields = headings[i] | values[i]
+            fields = rig[i] | values[i]
             if clocks is not None and i in clocks:
                 ppm, error = clocks[i].drift_ppm()
                 fields |= {
@@ -82,4 +82,4 @@ class SensorHealthMonitor:
     def _fold(self) -> None:
         for sensor in self._sensors:
             sensor.fold()
-        self._headings.update(self._sensors)
+        self._comparison.update(self._sensors)

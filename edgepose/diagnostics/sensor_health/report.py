@@ -34,8 +34,10 @@ class SensorHealth:
         field_change_percent: range of that strength from the 5th to the 95th percentile.
         heading_deg: against the median of all sensors, lying side by side or standing in the pose.
         heading_on: "table" or "body".
-        pose_tilt_deg: tilt against the calibration's pose in which the wearer stands.
+        pose_tilt_deg: tilt against the calibration's pose in which the wearer stands, or should.
+        in_pose: whether most sensors say that the wearer stands in it.
         swapped_with: the placement with which it must be swapped to fit that pose.
+        impossible: what is wrong with its bone if that has been in an orientation that no body can take.
         repeated_percent: samples that are the same as the one before, in motion.
         frozen: quantity that does not change while the sensor moves, or "everything" if only the other
             sensors change.
@@ -77,7 +79,9 @@ class SensorHealth:
     heading_deg: float = math.nan
     heading_on: str | None = None
     pose_tilt_deg: float = math.nan
+    in_pose: bool | None = None
     swapped_with: str | None = None
+    impossible: str | None = None
     repeated_percent: float = math.nan
     frozen: str | None = None
     saturated: str | None = None

@@ -13,7 +13,8 @@ import pytest
 
 from edgepose import rotations as rot
 from edgepose.calibration import POSES, load_calibration
-from edgepose.calibration.fit import fit_pose, impossible_bones
+from edgepose.calibration.fit import fit_pose
+from edgepose.calibration.impossible import impossible_bones
 from edgepose.calibration.misfit import MisfitDetector
 from edgepose.formats.recordings.npz import write_npz
 from edgepose.formats.recordings.registry import read_recording
