@@ -23,9 +23,10 @@ HEADING_LIMITS_DEG = np.array([60.0 if "forearm" in name else 30.0 for name in P
 _ORDERS = np.array(list(permutations(range(len(PLACEMENTS)))))
 
 SLIP_DEG = 30.0
-"""Tilt, or heading of a leg or the pelvis, from which on a sensor has slipped if all others fit the pose."""
+"""Tilt from which on a sensor has slipped if all others fit the pose."""
 
-_STEADY = np.array([name.endswith("leg") or name == "pelvis" for name in PLACEMENTS])  # head and arms turn
+_MOST_TURNED_DEG = np.array([100.0, 100.0, 30.0, 30.0, 90.0, 30.0])
+"""The same for headings: a head looks aside, forearms twist."""
 
 
 class PoseFit(NamedTuple):
@@ -62,8 +63,8 @@ class PoseFit(NamedTuple):
         off = self.tilt_deg > POSE_TILT_DEG
         angle = self.tilt_deg
         if self.north and not off.any():
-            angle = np.where(_STEADY, np.abs(self.heading_deg), 0.0)
-            off = angle > SLIP_DEG
+            off = np.abs(self.heading_deg) > _MOST_TURNED_DEG
+            angle = np.where(off, np.abs(self.heading_deg), 0.0)
         i = int(np.argmax(angle))
         alone = self.sits_at is None and np.count_nonzero(off) == 1 and angle[i] > SLIP_DEG
         return (PLACEMENTS[i], float(angle[i])) if alone else None

@@ -52,7 +52,7 @@ class MisfitDetector:
         self._nearest: PoseFit | None = None  # of the rests so far
         self._warned_no_pose = False
         self._impossible = ImpossibleBones()
-        self._explained = False  # whether a reported swap explains impossible bones
+        self._explained = False  # whether a reported swap or slip explains impossible bones
 
     def update(self, frame: ImuFrame, bones: Array) -> list[str]:
         """Return the warnings that a frame gives rise to, one line each.
@@ -93,6 +93,9 @@ class MisfitDetector:
         wrong: dict[str, list[str]] = {}
         for name, problem in self._impossible.update(bones, frame.held, _EVERY_S).items():
             wrong.setdefault(problem, []).append(name)
+        if wrong and self._nearest is not None and self._nearest.slipped is not None:
+            self._explained = True  # one wrong sensor, such as that of the pelvis, makes others look wrong
+            return self._no_pose()
         return [f"warning: {', '.join(names)}: {problem}" for problem, names in wrong.items()]
 
     def _check_pose(self, passed_s: float) -> list[str]:

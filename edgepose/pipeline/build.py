@@ -23,7 +23,7 @@ from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.network import Network
 from edgepose.pipeline.place_stage import PlaceStage
 from edgepose.pipeline.remote_control import Request, Requests
-from edgepose.pipeline.rig_comparison import changes, missing_heading_reset
+from edgepose.pipeline.rig_comparison import changes, missing_heading_reset, missing_quantities
 from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
 from edgepose.placements import PLACEMENTS
 from edgepose.sinks.open import open_outputs
@@ -150,6 +150,7 @@ class OpenWearer:
         return [
             *changes(self._calibration, devices, self._sensor_map),
             *missing_heading_reset(self._calibration, devices),
+            *missing_quantities(self._calibration, [], self._orient.without_field),
         ]
 
     def report(self, pipeline: WearerPipeline, rate: float, future: int) -> EdgeposeError | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from edgepose.calibration import Calibration, mounting_warnings
@@ -28,6 +28,29 @@ def changes(
         stated = {name: device.mounting for name, device in sensor_map.devices.items()}
         lines += mounting_warnings(calibration, stated, str(sensor_map.path))
     return lines
+
+
+def missing_quantities(
+    calibration: Calibration, raw: Sequence[str], without_field: Sequence[str]
+) -> list[str]:
+    """Return a warning if sensors do not send what the headings of their calibration are based on.
+
+    Args:
+        calibration: of the wearer.
+        raw: placements whose sensors send no orientation.
+        without_field: placements whose sensors send no magnetic field.
+    """
+    if calibration.filter == "none" and raw:
+        return [
+            f"the calibration was made with the sensors' own orientations, and {', '.join(raw)} send none: "
+            "set them to send quaternions, or calibrate again with --filter kalman"
+        ]
+    if calibration.filter != "none" and calibration.north and without_field:
+        return [
+            f"the calibration was made with magnetometers, and {', '.join(without_field)} send no magnetic "
+            "field: switch it on, or calibrate again with --no-mag"
+        ]
+    return []
 
 
 def other_devices(calibration: Calibration, devices: Mapping[int, Device]) -> list[str]:

@@ -109,7 +109,7 @@ def check(
     from edgepose.calibration import load_calibration
     from edgepose.diagnostics.sensor_health import SensorHealthMonitor
     from edgepose.pipeline.calibrated_settings import check_settings
-    from edgepose.pipeline.rig_comparison import changes, missing_heading_reset
+    from edgepose.pipeline.rig_comparison import changes, missing_heading_reset, missing_quantities
     from edgepose.sources import open_source
     from edgepose.sources.sensor_map import read_map
 
@@ -132,6 +132,12 @@ def check(
         state, error = _listen(opened, health, source.file is None, seconds, lambda: stop.asked, watch)
         if loaded is not None:
             differences += changes(loaded, opened.devices, sensor_map)
+            reporting = [sensor for sensor, _ in state.sensors if sensor.samples]
+            differences += missing_quantities(
+                loaded,
+                [sensor.placement for sensor in reporting if not sensor.orientation],
+                [sensor.placement for sensor in reporting if not sensor.magnetometer],
+            )
         for difference in [*differences, *missing_heading_reset(loaded, opened.devices)]:
             _log.warning("%s", difference)
     if page is not None:
