@@ -266,7 +266,9 @@ def _window(
         )
     why = "" if at is not None else ", the first of the stillest parts"
     say(f"{name}: hold from {start:.2f} to {start + seconds:.2f} s{why}.")
-    return calibration.trim(everything, start, start + seconds), start
+    hold = calibration.trim(everything, start, start + seconds)
+    calibration.check_covered(hold, start, start + seconds)
+    return hold, start
 
 
 def _extent(everything: Hold) -> tuple[float, float]:

@@ -113,7 +113,7 @@ def test_the_calibration_of_another_rig(command, real, calibrated, tmp_path, see
 
 
 def turned(recording: Recording, name: str, axis: str, angle_deg: float) -> Recording:
-    """A recording in which one sensor was turned about a level axis of the inertial frame, or the vertical."""
+    """A recording in which one sensor was turned about an axis of the inertial frame."""
     data = recording.sensors[name]
     about = rot.quat_rotate(rot.quat_conjugate(data.quat[0]), np.eye(3)["xyz".index(axis)])
     turn = rot.matrix_to_quat(rot.rotvec_to_matrix(np.radians(angle_deg) * about))

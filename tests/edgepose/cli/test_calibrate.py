@@ -135,6 +135,25 @@ def test_a_hold_is_covered_by_the_samples_of_every_sensor(
     assert not (tmp_path / "c.json").exists()
 
 
+@pytest.mark.parametrize("start", ["11", "+1"])
+def test_a_hold_in_which_all_sensors_are_silent(tmp_path: Path, start: str) -> None:
+    """A gap in the recording is no hold, wherever the samples before and after it are."""
+    path = write_recording(tmp_path / "pose.csv", lambda t: worn(cal.POSES["straight"]))
+    rows = path.read_text().splitlines(keepends=True)
+    path.write_text(
+        "".join(row for row in rows if row[0] == "t" or not 11.8 <= float(row.split(",")[0]) < 12.9)
+    )
+    words = ("--file", path, "--out", tmp_path / "c.json", "--body-frame", "heading:70")
+    message = error_of(run(*words, "--from", start, "--hold", 1.8))
+    assert message.startswith(
+        "silent during a part of the hold: left_forearm for 1.0 s, right_forearm for 1.0 s"
+    )
+    assert error_of(run(*words, "--from", 12, "--hold", 4)).startswith(
+        f"{path}: it does not contain 4 s from 12 s"
+    )
+    assert run(*words, "--from", start, "--hold", 0.8).exit_code == 0
+
+
 def _from(row: str, sensor: str, start_s: float, end_s: float) -> bool:
     time_s, name, *_ = row.split(",")
     return name == sensor and start_s <= float(time_s) < end_s
