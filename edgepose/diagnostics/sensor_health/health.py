@@ -49,18 +49,21 @@ class SensorHealthMonitor:
                 self._fold()
                 self._next_fold_s = sample.time_s + _FOLD_S
 
-    def report(self, now_s: float, clocks: Mapping[int, DeviceClock] | None = None) -> list[SensorHealth]:
+    def report(
+        self, now_s: float, clocks: Mapping[int, DeviceClock] | None = None, lag_ms: float = 0.0
+    ) -> list[SensorHealth]:
         """Return the health of the sensors, in the order of PLACEMENTS.
 
         Args:
             now_s: time up to which all samples have been added, on their clock, seconds.
             clocks: of the sensors that send a time.
+            lag_ms: delay with which this machine reads packets, see `SensorHealth`.
         """
         self._fold()
         result = []
         rig, values = self._comparison.result(), compare_values(self._sensors)
         for i, (name, sensor) in enumerate(zip(PLACEMENTS, self._sensors, strict=True)):
-            fields = rig[i] | values[i]
+            fields = rig[i] | values[i] | {"lag_ms": lag_ms}
             if clocks is not None and i in clocks:
                 ppm, error = clocks[i].drift_ppm()
                 fields |= {

@@ -18,6 +18,7 @@ class SensorHealth:
         jitter_ms: deviation of the intervals, without gaps.
         lost: number of samples missing in the sensor's times; lost_percent: their share of all.
         late_ms: 95 % of the packets come no later than this after the fastest ones.
+        lag_ms: delay that is this machine's: 95 % of its threads' waits end no later than this.
         invalid: number of samples with a NaN or with a quaternion that is not a rotation.
         orientation: whether it sends one; acceleration, gyroscope and magnetometer likewise.
         incomplete_percent: samples without a quantity that others have.
@@ -57,6 +58,7 @@ class SensorHealth:
     lost: int = 0
     lost_percent: float = math.nan
     late_ms: float = math.nan
+    lag_ms: float = 0.0
     invalid: int = 0
     orientation: bool = False
     acceleration: bool = False
