@@ -20,6 +20,7 @@ from edgepose.calibration.sensor_to_segment import POSES, Calibration, apply_cal
 from edgepose.calibration.static_pose import (
     Hold,
     SensorHold,
+    check_reported,
     hold_from_recording,
     hold_from_samples,
     stillest_start,
@@ -46,6 +47,7 @@ __all__ = [
     "check_body_frame",
     "check_covered",
     "check_hold",
+    "check_reported",
     "from_json",
     "headings_from_axis",
     "headings_from_motion",
