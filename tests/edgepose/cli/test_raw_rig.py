@@ -185,6 +185,22 @@ def test_calibrations_that_would_be_wrong_are_refused(rig, tmp_path, words, says
     assert not out.exists()
 
 
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ((), "no orientation from left_forearm, right_forearm, left_lower_leg"),
+        (("--filter", "kalman"), "headings are arbitrary: add --heading-reset motion"),
+    ],
+)
+def test_a_live_wearer_hears_at_once_what_is_missing(rig, tmp_path, monkeypatch, words, says):
+    """Nobody has to stand still for a calibration that cannot be made."""
+    monkeypatch.setattr("edgepose.cli.calibration_session.LISTEN_S", 0.2)
+    result = calibrated("--file", rig.raw, "--realtime", *words, "--out", tmp_path / "c.json")
+    assert says in str(result.exception)
+    assert "All six sensors report." in result.output
+    assert "The hold starts" not in result.output
+
+
 def test_magnetometers_give_a_north_and_make_a_reset_needless(command, tmp_path):
     short, out = tmp_path / "short.npz", tmp_path / "calib.json"
     simulate("--raw", 9, "--write", tmp_path / "whole.npz")
