@@ -18,7 +18,7 @@ from edgepose.formats.poses.csv_columns import ROTATION_FORMATS
 from edgepose.imu import FILTERS
 from edgepose.sinks.output_files import check_output
 from edgepose.sinks.registry import SINKS
-from edgepose.skeleton import Body, default_body
+from edgepose.skeleton import DEFAULT_HEIGHT, Body, default_body
 from edgepose.utils.output_targets import is_stream
 from edgepose.utils.similar_names import choices
 from edgepose.utils.sockets import parse_host_and_port
@@ -95,7 +95,7 @@ class OutputConfig:
             which is None if it is not written.
         rotations: representation of rotations in the CSV.
         std: add the network's standard deviations to the CSV.
-        height: the wearer's stature, metres.
+        height: the wearer's height, metres; None for that of the calibration, or an average one.
         leg_length: length of the wearer's thigh and shank, metres; None for the average at this height.
         overwrite: replace existing files.
     """
@@ -103,7 +103,7 @@ class OutputConfig:
     targets: tuple[tuple[str, Any], ...]
     rotations: str
     std: bool
-    height: float
+    height: float | None
     leg_length: float | None
     overwrite: bool
 
@@ -113,7 +113,7 @@ class OutputConfig:
         *,
         rotations: str = "axis-angle",
         std: bool = False,
-        height: float = 1.75,
+        height: float | None = None,
         leg_length: float | None = None,
         overwrite: bool = False,
         sinks: Mapping[str, str] | None = None,
@@ -125,7 +125,7 @@ class OutputConfig:
             targets: outputs as pairs of name and target.
             rotations: representation of rotations in the CSV.
             std: add the network's standard deviations to the CSV.
-            height: the wearer's stature, metres.
+            height: the wearer's height, metres.
             leg_length: length of the wearer's thigh and shank, metres.
             overwrite: replace existing files.
             sinks: targets of outputs from other packages (entry points `edgepose.sinks`), by output name.
@@ -177,7 +177,8 @@ class OutputConfig:
         Raises:
             EdgeposeError: `height` or `leg_length` is impossible.
         """
-        return default_body(self.height, leg_length_m=self.leg_length)
+        height = DEFAULT_HEIGHT if self.height is None else self.height
+        return default_body(height, leg_length_m=self.leg_length)
 
     @property
     def files(self) -> dict[str, str | Path]:
@@ -227,8 +228,8 @@ class WearerConfig:
         source: the source of samples.
         calibration: file written by `edgepose calibrate`.
         outputs: the outputs for poses.
-        filter: orientation filter, one of `edgepose.imu.FILTERS`.
-        no_mag: do not use magnetometers in the filter.
+        filter: orientation filter, one of `edgepose.imu.FILTERS`; None for that of the calibration.
+        no_mag: do not use magnetometers in the filter; they are not used either if the calibration did not.
         no_place: do not follow the wearer through the room; poses have no translation.
         control: address to listen on for requests, see `edgepose.pipeline.remote_control`.
         name: the wearer's name in messages; empty for a single wearer.
@@ -238,7 +239,7 @@ class WearerConfig:
     source: SourceConfig
     calibration: Path
     outputs: OutputConfig
-    filter: str = "none"
+    filter: str | None = None
     no_mag: bool = False
     no_place: bool = False
     control: tuple[str, int] | None = None
@@ -248,7 +249,7 @@ class WearerConfig:
     def __post_init__(self) -> None:
         """Raise ConfigError if fields contradict each other."""
         object.__setattr__(self, "calibration", Path(self.calibration))
-        if self.filter not in FILTERS:
+        if self.filter is not None and self.filter not in FILTERS:
             raise ConfigError(f"filter: {self.filter!r} is not one of {', '.join(map(repr, FILTERS))}")
         if not self.outputs.any:
             raise ConfigError(ANY_OUTPUT)

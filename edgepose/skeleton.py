@@ -94,6 +94,9 @@ def standing_pelvis_position(offsets: ArrayLike) -> Array:
 MIN_HEIGHT, MAX_HEIGHT = 0.8, 2.5
 """Range of statures that `default_body` accepts, metres; others are mistakes, mostly centimetres."""
 
+DEFAULT_HEIGHT = 1.75
+"""Stature of a wearer whose height is unknown, metres."""
+
 
 MOST_LEG_CHANGE = 0.15
 """Largest share by which `with_leg_length` changes legs; people of one stature differ by less."""
@@ -126,7 +129,9 @@ def _table() -> dict[str, Any]:
     return table
 
 
-def default_body(height_m: float = 1.75, sex: str = "neutral", leg_length_m: float | None = None) -> Body:
+def default_body(
+    height_m: float = DEFAULT_HEIGHT, sex: str = "neutral", leg_length_m: float | None = None
+) -> Body:
     """Return an average body for a stature.
 
     Interpolated linearly between the statures of `body.json`, scaled in proportion beyond them.

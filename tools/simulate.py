@@ -9,9 +9,9 @@
     simulate.py walk.bvh --exercises --mounting 7 --raw 6    sensors without a filter at random angles
 
 Prints `port NAME[,NAME...]` for use with --port (or `can NAME` for --can), `started UNIX_TIME` and `ended
-UNIX_TIME`. Before a clip, the wearer stands straight for 6 s. Sensors that rest before and after the
-recording have the noise of real ones. Ends at Ctrl-C, or when standard input closes and the recording,
-if it has started, is over.
+UNIX_TIME`. Before a clip, the wearer stands straight for 6 s. Sensors have the noise of a data sheet;
+with --ideal only while they rest before and after the recording. Ends at Ctrl-C, or when standard input
+closes and the recording, if it has started, is over.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ FIELD_UT = (0.0, 20.0, -40.0)
 """Magnetic field in the inertial frame, for formats that require one."""
 
 NOISE_ACC, NOISE_GYR, NOISE_QUAT = 0.005, 0.0005, 0.0001
-"""Noise of a sensor at rest per axis, m/s^2, rad/s and rad: a good chip's at a bandwidth of 25 Hz."""
+"""Noise of a sensor per axis, m/s^2, rad/s and rad: a good chip's data sheet at a bandwidth of 25 Hz."""
 
 GRAVITY = (0.0, 0.0, 9.81)
 
@@ -183,7 +183,7 @@ def at_rest(sample: Sample) -> Sample:
 
 
 def with_noise(sample: Sample, rng: random.Random) -> Sample:
-    """Return a sample with the noise of a sensor at rest."""
+    """Return a sample with the noise of a sensor."""
 
     def noisy(vector: Any, deviation: float) -> Any:
         return None if vector is None else tuple(v + rng.gauss(0.0, deviation) for v in vector)
@@ -315,9 +315,18 @@ class Sensor:
     """A simulated device: its samples and their times."""
 
     def __init__(
-        self, index: int, data: SensorData, start_s: float, encode: Callable[[Sample, int], Any]
+        self, index: int, data: SensorData, start_s: float, noisy: bool, encode: Callable[[Sample, int], Any]
     ) -> None:
-        """Start at the first row; `start_s` is the time of the recording's first sample."""
+        """Start at the first row.
+
+        Args:
+            index: its placement.
+            data: its samples.
+            start_s: time of the recording's first sample.
+            noisy: add noise in motion, too.
+            encode: makes packets.
+        """
+        self._noisy = noisy
         self.index = index
         self.rows = rows_of(data)
         self.times = (data.time_s - start_s).tolist()
@@ -355,8 +364,10 @@ class Sensor:
 
     def _sample(self, t_us: int) -> Sample:
         sample = self.rows[self.row]._replace(time_us=t_us)
-        if self._rests:
-            sample = with_noise(at_rest(sample) if self.row else sample, self._rng)
+        if self._rests and self.row:
+            sample = at_rest(sample)
+        if self._rests or self._noisy:
+            sample = with_noise(sample, self._rng)
         return with_field(sample) if self._add_field else sample
 
     def measure(self, t_us: int) -> None:
@@ -501,7 +512,9 @@ def parse_kill(ctx: click.Context, param: click.Parameter, values: Sequence[str]
     return tuple(result)
 
 
-def simulate(recording: Recording, wire_format: Format, bus: str | None, stand: bool, faults: Faults) -> None:
+def simulate(
+    recording: Recording, wire_format: Format, bus: str | None, stand: bool, noisy: bool, faults: Faults
+) -> None:
     """Open the lines and play the recording on them."""
     start_s = min(float(data.time_s[0]) for data in recording.sensors.values())
     ids = [0] * len(PLACEMENTS) if wire_format.single_device else list(wire_format.ids)
@@ -510,7 +523,7 @@ def simulate(recording: Recording, wire_format: Format, bus: str | None, stand: 
     encoders = [wire_format.encoder() for _ in range(len(PLACEMENTS) if wire_format.single_device else 1)]
     sensors = []
     for index, data in enumerate(recording.sensors.values()):
-        sensor = Sensor(index, data, start_s, encoders[index % len(encoders)])
+        sensor = Sensor(index, data, start_s, noisy, encoders[index % len(encoders)])
         sensor.prepare(wire_format, ids[index])
         sensors.append(sensor)
     lines = open_lines(wire_format, bus)
@@ -568,6 +581,7 @@ def simulate(recording: Recording, wire_format: Format, bus: str | None, stand: 
     type=click.Choice(["6", "9"]),
     help="No orientations, only rates and forces of a BMI270 with noise and bias; 9 adds a magnetometer.",
 )
+@click.option("--ideal", is_flag=True, help="Add no noise while the recording is played.")
 @click.option("--seed", type=int, default=0, help="Seed of the errors of --raw.")
 @click.option(
     "--write",
@@ -589,6 +603,7 @@ def main(
     exercises: bool,
     mounting: int | None,
     raw: str | None,
+    ideal: bool,
     seed: int,
     write: Path | None,
     duplicate_id: bool,
@@ -608,7 +623,9 @@ def main(
         if write is not None:
             write_npz(write, played)
             return
-        simulate(played, wire_format, bus, stand, Faults(loss, corrupt, jitter, drift, kill, duplicate_id))
+        noisy = not ideal and raw is None  # chips without a filter have their own noise
+        faults = Faults(loss, corrupt, jitter, drift, kill, duplicate_id)
+        simulate(played, wire_format, bus, stand, noisy, faults)
     except EdgeposeError as error:
         raise click.ClickException(str(error)) from error
     except KeyboardInterrupt:

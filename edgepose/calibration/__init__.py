@@ -5,7 +5,7 @@ are in radians, except those whose names end in `_deg`, which are for people to 
 """
 
 from edgepose.calibration.body_frame import body_from_inertial, check_body_frame
-from edgepose.calibration.checks import HoldError, HoldSummary, MovedError, check_hold
+from edgepose.calibration.checks import HoldError, HoldSummary, MovedError, check_covered, check_hold
 from edgepose.calibration.functional import EXERCISE_S, ROUTINE, WeakMotionError, headings_from_motion
 from edgepose.calibration.heading_reset import (
     HeadingReset,
@@ -20,6 +20,7 @@ from edgepose.calibration.sensor_to_segment import POSES, Calibration, apply_cal
 from edgepose.calibration.static_pose import (
     Hold,
     SensorHold,
+    check_reported,
     hold_from_recording,
     hold_from_samples,
     stillest_start,
@@ -44,7 +45,9 @@ __all__ = [
     "body_from_inertial",
     "calibrate",
     "check_body_frame",
+    "check_covered",
     "check_hold",
+    "check_reported",
     "from_json",
     "headings_from_axis",
     "headings_from_motion",

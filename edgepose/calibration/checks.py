@@ -77,7 +77,7 @@ def check_hold(hold: Hold, advice: str = "stand still and repeat") -> HoldSummar
             f"too few samples in the hold ({', '.join(few)}; at least {MIN_SAMPLES}): "
             "check the rate and the link, or hold longer"
         )
-    _check_gaps(hold)
+    check_covered(hold, min(s.time_s.min() for s in hold), max(s.time_s.max() for s in hold))
     broken = [
         f"{name} ({bad} of {len(s.quat)})"
         for name, s in sensor_names(hold)
@@ -109,10 +109,20 @@ def check_hold(hold: Hold, advice: str = "stand still and repeat") -> HoldSummar
     return HoldSummary([len(s.quat) for s in hold], mean, np.degrees(spread), force, warnings)
 
 
-def _check_gaps(hold: Hold) -> None:
-    """Raise HoldError if a sensor sent nothing for a part of a hold."""
-    start, end = min(s.time_s.min() for s in hold), max(s.time_s.max() for s in hold)
-    gaps = [np.diff(np.sort([start, *s.time_s, end])).max() for s in hold]
+def check_covered(hold: Hold, start_s: float, end_s: float) -> None:
+    """Check that every sensor sent samples during all of a hold.
+
+    Args:
+        hold: six sensors' samples.
+        start_s: start of the hold, on the clock of the samples, seconds.
+        end_s: its end.
+
+    Raises:
+        HoldError: sensors were silent for a part of it; names them.
+        CalibrationError: a sensor sent nothing at all, or no orientation.
+    """
+    check_reported(hold)
+    gaps = [np.diff(np.sort([start_s, *s.time_s, end_s])).max() for s in hold]
     if silent := [
         f"{n} for {gap:.1f} s" for n, gap in zip(PLACEMENTS, gaps, strict=True) if gap > GAP_LIMIT_S
     ]:

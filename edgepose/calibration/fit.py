@@ -1,9 +1,8 @@
-"""Checks whether a calibration fits a wearer: by the pose they stand in and by what bones can do."""
+"""Fit of a wearer who stands still to the pose of a calibration."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from itertools import permutations
 from typing import NamedTuple
 
@@ -23,16 +22,11 @@ HEADING_LIMITS_DEG = np.array([60.0 if "forearm" in name else 30.0 for name in P
 
 _ORDERS = np.array(list(permutations(range(len(PLACEMENTS)))))
 
-_MOST_DEG: Mapping[str, tuple[float, float]] = {
-    "head": (120.0, 140.0),
-    "left_lower_leg": (165.0, 130.0),
-    "right_lower_leg": (165.0, 130.0),
-}
-"""Largest possible angles between a bone's Y (along the body) and X (to the left) and those of the pelvis.
+SLIP_DEG = 30.0
+"""Tilt from which on a sensor has slipped if all others fit the pose."""
 
-A head nods and turns by about 120 with the whole back, a knee bends to 155, legs cross at 100. Arms reach
-anywhere.
-"""
+_MOST_TURNED_DEG = np.array([100.0, 100.0, 30.0, 30.0, 90.0, 30.0])
+"""The same for headings: a head looks aside, forearms twist."""
 
 
 class PoseFit(NamedTuple):
@@ -44,12 +38,14 @@ class PoseFit(NamedTuple):
         sits_at: (6,) index of the placement at which each sensor seems to be worn, if the sensors fit the
             pose in another order only; None if they fit in their own, or in none.
         best_tilt_deg: (6,) as `tilt_deg`, in that order; None if `sits_at` is.
+        north: whether all headings count from one north, so that they can be compared.
     """
 
     tilt_deg: Array
     heading_deg: Array
     sits_at: NDArray[np.intp] | None
     best_tilt_deg: Array | None
+    north: bool
 
     @property
     def in_pose(self) -> bool:
@@ -59,7 +55,19 @@ class PoseFit(NamedTuple):
     @property
     def good(self) -> bool:
         """Whether every sensor fits the pose at its own placement."""
-        return self.sits_at is None and bool(np.all(self.tilt_deg < POSE_TILT_DEG))
+        return self.sits_at is None and bool(np.all(self.tilt_deg < POSE_TILT_DEG)) and self.slipped is None
+
+    @property
+    def slipped(self) -> tuple[str, float] | None:
+        """The sensor that alone does not fit the pose, and how far it is off, degrees; None otherwise."""
+        off = self.tilt_deg > POSE_TILT_DEG
+        angle = self.tilt_deg
+        if self.north and not off.any():
+            off = np.abs(self.heading_deg) > _MOST_TURNED_DEG
+            angle = np.where(off, np.abs(self.heading_deg), 0.0)
+        i = int(np.argmax(angle))
+        alone = self.sits_at is None and np.count_nonzero(off) == 1 and angle[i] > SLIP_DEG
+        return (PLACEMENTS[i], float(angle[i])) if alone else None
 
     @property
     def off_deg(self) -> float:
@@ -67,15 +75,16 @@ class PoseFit(NamedTuple):
         return float(np.sum(self.tilt_deg if self.best_tilt_deg is None else self.best_tilt_deg))
 
     @property
-    def exchanged(self) -> str:
-        """Misplaced sensors and where they seem to be worn, for a message."""
+    def swapped(self) -> str | None:
+        """A message on the misplaced sensors and where they seem to be worn; None if there are none."""
         if self.sits_at is None:
-            return ""
-        return ", ".join(
+            return None
+        where = ", ".join(
             f"{PLACEMENTS[sensor]} is where {PLACEMENTS[placement]} was"
             for sensor, placement in enumerate(self.sits_at)
             if sensor != placement
         )
+        return f"sensors were swapped since the calibration: {where}; swap them back, or calibrate again"
 
 
 def fit_pose(calibration: Calibration, orientation: Array) -> PoseFit:
@@ -95,21 +104,21 @@ def fit_pose(calibration: Calibration, orientation: Array) -> PoseFit:
         2.0
         * np.arctan2(np.hypot(between[..., 1], between[..., 2]), np.hypot(between[..., 0], between[..., 3]))
     )
+    # Without a common north, headings that were reset drift: only tilts can be compared.
+    north = calibration.north and not np.any(calibration.heading_offset)
     yaw = rot.yaw_of_quat(between) - calibration.heading_offset[:, None]
     placements = np.arange(len(PLACEMENTS))
     own_tilt, own_heading = tilt[placements, placements], from_median(-yaw[placements, placements])
-    order = _other_order(calibration, tilt, yaw, own_tilt, own_heading)
+    order = _other_order(tilt, yaw, own_tilt, own_heading, north)
     if order is None:
-        return PoseFit(own_tilt, own_heading, None, None)
-    return PoseFit(own_tilt, own_heading, np.argsort(order), tilt[placements, order])
+        return PoseFit(own_tilt, own_heading, None, None, north)
+    return PoseFit(own_tilt, own_heading, np.argsort(order), tilt[placements, order], north)
 
 
 def _other_order(
-    calibration: Calibration, tilt: Array, yaw: Array, own_tilt: Array, own_heading: Array
+    tilt: Array, yaw: Array, own_tilt: Array, own_heading: Array, north: bool
 ) -> NDArray[np.intp] | None:
     """Find the sensor that fits each placement; None if the order is right or no order fits."""
-    # Without a common north, headings that were reset drift: only tilts can be compared.
-    north = calibration.north and not np.any(calibration.heading_offset)
     if np.all(own_tilt < POSE_TILT_DEG) and not (north and np.any(abs(own_heading) > HEADING_LIMITS_DEG)):
         return None
     best, least = None, math.inf
@@ -130,20 +139,3 @@ def from_median(angles: Array) -> Array:
     apart = np.angle(np.exp(1j * (angles[:, None] - angles)))
     middle = angles[int(np.argmin(np.abs(apart).sum(axis=1)))]
     return np.degrees(np.angle(np.exp(1j * (angles - middle))))
-
-
-def impossible_bones(bones: Array) -> list[str]:
-    """Return the names of bones in orientations that no body can take.
-
-    Args:
-        bones: (6, 3, 3) R_TB, in the order of PLACEMENTS.
-    """
-    pelvis = bones[PLACEMENTS.index("pelvis")]
-    # Cosines between the axes of a bone and those of the pelvis.
-    x, y = (np.einsum("sa,a->s", bones[:, :, axis], pelvis[:, axis]) for axis in (0, 1))
-    result = []
-    for name, (along, across) in _MOST_DEG.items():
-        i = PLACEMENTS.index(name)
-        if y[i] < math.cos(math.radians(along)) or x[i] < math.cos(math.radians(across)):
-            result.append(name)
-    return result

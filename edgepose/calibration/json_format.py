@@ -19,6 +19,7 @@ from edgepose.errors import CalibrationError, EdgeposeError
 from edgepose.imu import FILTERS
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
+from edgepose.skeleton import MAX_HEIGHT, MIN_HEIGHT
 from edgepose.utils.durable_files import write_whole
 from edgepose.utils.text_files import read_text
 
@@ -44,6 +45,7 @@ def to_json(calibration: Calibration) -> str:
         "body_frame": calibration.body_frame,
         "body_from_inertial": calibration.body_from_inertial.tolist(),
         "orientation": {"filter": calibration.filter, "north": calibration.north},
+        "wearer": {} if calibration.height_m is None else {"height_m": calibration.height_m},
         "sensors": sensors,
         "metadata": dict(calibration.metadata),
     }
@@ -94,6 +96,10 @@ def from_json(text: str, where: str = "calibration") -> Calibration:
     source = _member({"orientation": {"filter": "none", "north": True}} | document, "orientation", dict, fail)
     if source.get("filter") not in FILTERS or not isinstance(source.get("north"), bool):
         raise fail(f"'orientation' must have filter ({', '.join(FILTERS)}) and north (true or false)")
+    wearer = _member({"wearer": {}} | document, "wearer", dict, fail)
+    height_m = _number(wearer.get("height_m", 1.0))
+    if height_m is None or not MIN_HEIGHT <= height_m <= MAX_HEIGHT:
+        raise fail(f"'wearer': height_m is not a number between {MIN_HEIGHT} and {MAX_HEIGHT}")
     offsets, mounts, residuals = zip(
         *(_numbers_of(name, sensors[name], fail) for name in PLACEMENTS), strict=True
     )
@@ -108,6 +114,7 @@ def from_json(text: str, where: str = "calibration") -> Calibration:
         metadata=_member(document, "metadata", dict, fail),
         filter=source["filter"],
         north=source["north"],
+        height_m=height_m if "height_m" in wearer else None,
     )
 
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from edgepose import rotations as rot
 from edgepose.calibration import Calibration
-from edgepose.calibration.fit import PoseFit, fit_pose, impossible_bones
+from edgepose.calibration.fit import PoseFit, fit_pose
+from edgepose.calibration.impossible import ImpossibleBones
 from edgepose.imu import ImuFrame
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
@@ -23,8 +24,8 @@ REST_S, REST_DEG = 1.5, 3.0
 STRANGE_DEG = 60.0
 """Tilt of one sensor against the pose that a sloppy stance does not explain."""
 
-IMPOSSIBLE_S = 3.0
-"""Time in an impossible orientation before a bone is reported: sensors may be knocked for a moment."""
+UPSIDE_DOWN_DEG = 120.0
+"""Tilt of one sensor from which on it is upside down rather than slipped."""
 
 COMPARE_S = 2.0
 """Time after which the rig is compared with the calibration's: all sensors have reported by then."""
@@ -50,7 +51,8 @@ class MisfitDetector:
         self._compared = False
         self._nearest: PoseFit | None = None  # of the rests so far
         self._warned_no_pose = False
-        self._impossible_s = dict.fromkeys(PLACEMENTS, 0.0)
+        self._impossible = ImpossibleBones()
+        self._explained = False  # whether a reported swap or slip explains impossible bones
 
     def update(self, frame: ImuFrame, bones: Array) -> list[str]:
         """Return the warnings that a frame gives rise to, one line each.
@@ -78,7 +80,7 @@ class MisfitDetector:
 
     def at_end(self) -> list[str]:
         """Return the warnings that are left after the last frame."""
-        lines = [] if self._compared or self._start_s is None else self._comparison()
+        lines = [] if self._compared else self._comparison()
         return lines + (self._no_pose() if self._looking else [])
 
     def _comparison(self) -> list[str]:
@@ -86,30 +88,24 @@ class MisfitDetector:
         return [f"warning: {line}" for line in self._compare()]
 
     def _check_bones(self, frame: ImuFrame, bones: Array) -> list[str]:
-        wrong = [name for name in impossible_bones(bones) if not frame.held[PLACEMENTS.index(name)]]
-        reported = []
-        for name, since_s in self._impossible_s.items():
-            self._impossible_s[name] = since_s + _EVERY_S if name in wrong else min(since_s, 0.0)
-            if self._impossible_s[name] > IMPOSSIBLE_S:
-                self._impossible_s[name] = -np.inf
-                reported.append(name)
-        if not reported:
+        if self._explained:
             return []
-        return [
-            f"warning: {', '.join(reported)}: turned against the pelvis as no body can turn; check that the "
-            "calibration is of this wearer and rig and that no sensor has moved, or calibrate again"
-        ]
+        wrong: dict[str, list[str]] = {}
+        for name, problem in self._impossible.update(bones, frame.held, _EVERY_S).items():
+            wrong.setdefault(problem, []).append(name)
+        if wrong and self._nearest is not None and self._nearest.slipped is not None:
+            self._explained = True  # one wrong sensor, such as that of the pelvis, makes others look wrong
+            return self._no_pose()
+        return [f"warning: {', '.join(names)}: {problem}" for problem, names in wrong.items()]
 
     def _check_pose(self, passed_s: float) -> list[str]:
         rest = _rest(self._frames)
         if rest is not None:
             fit = fit_pose(self._calibration, rest)
-            self._looking = fit.sits_at is None and not fit.good
-            if fit.sits_at is not None:
-                return [
-                    f"warning: sensors were swapped since the calibration: {fit.exchanged}; "
-                    "swap them back, or calibrate again"
-                ]
+            self._looking = fit.swapped is None and not fit.good
+            if fit.swapped is not None:
+                self._explained = True
+                return [f"warning: {fit.swapped}"]
             if self._nearest is None or fit.off_deg < self._nearest.off_deg:
                 self._nearest = fit
         return self._no_pose() if self._looking and passed_s > START_S else []
@@ -117,6 +113,8 @@ class MisfitDetector:
     def _no_pose(self) -> list[str]:
         nearest, warned = self._nearest, self._warned_no_pose
         self._warned_no_pose = True
+        if not warned and nearest is not None and nearest.slipped is not None:
+            return [f"warning: {_slip(*nearest.slipped)}"]
         if warned or nearest is None or (nearest.in_pose and nearest.tilt_deg.max() < STRANGE_DEG):
             return []
         tilt = ", ".join(f"{n} {angle:.0f}" for n, angle in zip(PLACEMENTS, nearest.tilt_deg, strict=True))
@@ -124,6 +122,14 @@ class MisfitDetector:
             f"warning: the wearer has not stood still in the calibration's pose (tilt off by {tilt} deg); if "
             "they have, the calibration is of another wearer or rig: calibrate again"
         ]
+
+
+def _slip(name: str, angle_deg: float) -> str:
+    """Return the message about the only sensor that does not sit as calibrated."""
+    off = f"{name} is turned by {angle_deg:.0f} deg against the calibration, while all others fit"
+    if angle_deg > UPSIDE_DOWN_DEG:
+        return f"{off}: it sits upside down; turn it round, or calibrate again"
+    return f"{off}: if the wearer stood in its pose, the sensor has slipped; put it back, or calibrate again"
 
 
 def _rest(frames: deque[ImuFrame]) -> Array | None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from edgepose import rotations as rot
 from edgepose.calibration import Calibration, HeadingReset, headings_from_pose
+from edgepose.calibration.fit import fit_pose
 from edgepose.errors import CalibrationError, EdgeposeError
 from edgepose.imu import ImuFrame
 from edgepose.placements import PLACEMENTS
@@ -160,6 +161,8 @@ def _from_hold(calibration: Calibration, frames: list[ImuFrame]) -> HeadingReset
     if moved := _names(spread > SPREAD_LIMIT_DEG, spread):
         raise CalibrationError(f"moved: {moved}; hold still")
     found = headings_from_pose(calibration, mean)
+    if (swapped := fit_pose(replace(calibration, north=False), mean).swapped) is not None:
+        raise CalibrationError(swapped)
     if crooked := _names(found.error_deg > TILT_LIMIT_DEG, found.error_deg):
         raise CalibrationError(
             f"tilt differs from the calibration's: {crooked}; "

@@ -47,6 +47,7 @@ class Calibration:
         metadata: further facts (source, window, ...), JSON values.
         filter: filter that computed the orientations, one of `edgepose.imu.FILTERS`.
         north: whether all headings count from one north; if not, they change whenever a filter restarts.
+        height_m: the wearer's height, metres; None if unknown.
     """
 
     body_from_inertial: Array
@@ -59,6 +60,7 @@ class Calibration:
     metadata: Mapping[str, Any]
     filter: str = "none"
     north: bool = True
+    height_m: float | None = None
 
     @cached_property
     def _maps(self) -> tuple[Array, Array, Array]:
@@ -89,6 +91,7 @@ def calibrate(
     metadata: Mapping[str, Any] | None = None,
     filter: str = "none",
     north: bool = True,
+    height_m: float | None = None,
 ) -> Calibration:
     """Compute the calibration (DIP 4.2, eq. 6 and 7) from a checked hold of a known pose.
 
@@ -101,6 +104,7 @@ def calibrate(
         metadata: JSON values to store.
         filter: filter that computed the orientations, one of `edgepose.imu.FILTERS`.
         north: whether all headings count from one north.
+        height_m: the wearer's height, metres, if known.
     """
     if pose not in POSES:
         raise CalibrationError(f"pose {pose!r} is none of: {', '.join(POSES)}")
@@ -119,6 +123,7 @@ def calibrate(
         dict(metadata or {}),
         filter,
         north,
+        height_m,
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -11,20 +11,29 @@ from typing import NamedTuple
 
 from edgepose import calibration
 from edgepose.calibration import HeadingReset, Hold, HoldSummary
+from edgepose.cli.guide.guide import Guide
+from edgepose.cli.guide.stage import LISTEN, Stage
 from edgepose.cli.options.recording_time import RecordingTime
-from edgepose.cli.prompts import Prompter, record_hold, record_motion, wait_for_all_sensors, wait_for_enter
+from edgepose.cli.prompts import collect, record_hold, record_motion, wait_for_all_sensors, wait_for_start
 from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.base import iter_samples
 from edgepose.formats.recordings.registry import read_recording
+from edgepose.imu import ImuSample
 from edgepose.orientation.stage import OrientationStage
 from edgepose.pipeline.rig_comparison import without_common_heading
-from edgepose.sources import Device, open_source
+from edgepose.sources import Batch, Device, open_source
 from edgepose.sources.replay import is_recording
 from edgepose.utils.fault_messages import HEADING_RESETS
 
 END_S = 0.1
 """Longest time from the last sample of a recording to its end, seconds."""
+
+LISTEN_S = 1.0
+"""Time in which most sensors send all that they measure, seconds."""
+
+LISTENS = 3
+"""Number of such times after which something is missing: some magnetometers are slow."""
 
 ROUTINE_S = 30.0
 """Length of the motion that is taken from a recording without --motion, seconds."""
@@ -95,46 +104,78 @@ class Measured(NamedTuple):
 
 
 def measure_live(
-    source: SourceConfig, plan: CalibrationPlan, orient: OrientationStage, say: Prompter
+    source: SourceConfig, plan: CalibrationPlan, orient: OrientationStage, guide: Guide
 ) -> Measured:
     """Guide a wearer through the hold and the heading reset with live sensors.
 
     Raises:
         EdgeposeError: sensors are missing, the wearer moved, or headings would be arbitrary.
     """
-    reset, damaged = _side_by_side(source, plan, orient, say)
+    reset, damaged = _side_by_side(source, plan, orient, guide)
     with open_source(**source.arguments()) as opened:
-        batches = wait_for_all_sensors((b._replace(samples=orient(b.samples)) for b in opened), say)
+        batches = wait_for_all_sensors((b._replace(samples=orient(b.samples)) for b in opened), guide)
+        _check_before_hold(batches, guide, orient, plan, opened.devices)
         if plan.heading_reset == "live":
             reset = record_hold(
-                batches, "lying", plan.countdown_s, plan.hold_s, say, calibration.headings_side_by_side
+                batches, "lying", plan.countdown_s, plan.hold_s, guide, calibration.headings_side_by_side
             )
-            wait_for_enter(batches, say)
-        summary = record_hold(batches, plan.pose, plan.countdown_s, plan.hold_s, say, calibration.check_hold)
-        # Checked only now, because magnetometers may be slower than the other sensors.
+            if guide.phone is None:  # otherwise every hold begins with its start button
+                text = "Put the sensors on. Press Enter when the wearer is ready."
+                wait_for_start(batches, guide, text, plan.pose)
+        summary = record_hold(
+            batches, plan.pose, plan.countdown_s, plan.hold_s, guide, calibration.check_hold
+        )
         _check_north(orient, plan, opened.devices)
         if plan.heading_reset == "motion":
             upright = summary.orientation
             reset = record_motion(
-                batches, say, lambda moving: calibration.headings_from_motion(moving, upright)
+                batches,
+                plan.countdown_s,
+                guide,
+                lambda moving: calibration.headings_from_motion(moving, upright),
             )
     return Measured(summary, reset or _mounted(plan, summary), None, opened.devices, damaged)
 
 
+def _check_before_hold(
+    batches: Iterator[Batch],
+    guide: Guide,
+    orient: OrientationStage,
+    plan: CalibrationPlan,
+    devices: Mapping[int, Device],
+) -> None:
+    """Check that sensors send all that the calibration needs, before the wearer takes the pose.
+
+    Raises:
+        EdgeposeError: orientations, or a common heading, are missing.
+    """
+    samples: list[ImuSample] = []
+    for left in range(LISTENS - 1, -1, -1):
+        listening = Stage(LISTEN, "...", "Listening to the sensors.", plan.pose, LISTEN_S)
+        samples += collect(batches, listening, guide)[0]
+        try:
+            calibration.check_reported(calibration.hold_from_samples(samples))
+            _check_north(orient, plan, devices)
+            return
+        except EdgeposeError:
+            if not left:
+                raise
+
+
 def measure_recorded(
-    source: SourceConfig, plan: CalibrationPlan, orient: OrientationStage, say: Prompter
+    source: SourceConfig, plan: CalibrationPlan, orient: OrientationStage, guide: Guide
 ) -> Measured:
     """Find the hold and the heading reset in a recording.
 
     Raises:
         EdgeposeError: they are not in it, the wearer moved, or headings would be arbitrary.
     """
-    reset, damaged = _side_by_side(source, plan, orient, say)
+    reset, damaged = _side_by_side(source, plan, orient, guide)
     everything, damage, devices = _read(source, orient)
     _check_north(orient, plan, devices)
-    still, start_s = _window(source.name, (everything, damage), plan.start, plan.hold_s, say)
+    still, start_s = _window(source.name, (everything, damage), plan.start, plan.hold_s, guide)
     if plan.start is None:
-        say("If the wearer stood in the pose at another time, give its start with --from.")
+        guide("If the wearer stood in the pose at another time, give its start with --from.")
     summary = calibration.check_hold(still, "choose a still part with --from, or record again")
     if plan.heading_reset == "motion":
         moving = _movements(source.name, everything, plan, start_s + plan.hold_s)
@@ -169,7 +210,7 @@ def _movements(name: str, everything: Hold, plan: CalibrationPlan, hold_end_s: f
 
 
 def _side_by_side(
-    source: SourceConfig, plan: CalibrationPlan, orient: OrientationStage, say: Prompter
+    source: SourceConfig, plan: CalibrationPlan, orient: OrientationStage, guide: Guide
 ) -> tuple[HeadingReset | None, bool]:
     """Return the heading reset from a recording of the sensors lying side by side, if the plan names one.
 
@@ -181,7 +222,7 @@ def _side_by_side(
     path = plan.side_by_side
     if path is None:
         return None, False
-    say(f"Heading reset from {path}.")
+    guide(f"Heading reset from {path}.")
     fresh = orient.fresh()
     everything, damage, _ = _read(dataclasses.replace(source, file=path, port=None, can=None), fresh)
     if not fresh.north:
@@ -189,7 +230,7 @@ def _side_by_side(
             "without magnetometers the filter starts each recording with arbitrary headings, which another "
             f"recording cannot reset: use {HEADING_RESETS}"
         )
-    lying, _ = _window(str(path), (everything, damage), None, plan.hold_s, say)
+    lying, _ = _window(str(path), (everything, damage), None, plan.hold_s, guide)
     return calibration.headings_side_by_side(lying), damage is not None
 
 
@@ -251,12 +292,12 @@ def _serial_numbers(sensors: Path | None) -> Mapping[int, str] | None:
 
 
 def _window(
-    name: str, read: tuple[Hold, str | None], at: RecordingTime | None, seconds: float, say: Prompter
+    name: str, read: tuple[Hold, str | None], at: RecordingTime | None, seconds: float, guide: Guide
 ) -> tuple[Hold, float]:
     """Return the hold in a recording, and its start on the recording's clock, seconds."""
     everything, damage = read
     if damage:
-        say(f"warning: {damage}")
+        guide(f"warning: {damage}")
     first, last = _extent(everything)
     start = calibration.stillest_start(everything, seconds) if at is None else at.on_clock(first)
     if at is not None and not first - 1e-6 <= start <= last - seconds + END_S:
@@ -265,8 +306,10 @@ def _window(
             f"{last:.2f} s, choose --from and --hold within that"
         )
     why = "" if at is not None else ", the first of the stillest parts"
-    say(f"{name}: hold from {start:.2f} to {start + seconds:.2f} s{why}.")
-    return calibration.trim(everything, start, start + seconds), start
+    guide(f"{name}: hold from {start:.2f} to {start + seconds:.2f} s{why}.")
+    hold = calibration.trim(everything, start, start + seconds)
+    calibration.check_covered(hold, start, start + seconds)
+    return hold, start
 
 
 def _extent(everything: Hold) -> tuple[float, float]:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from edgepose.calibration.checks import GRAVITY_TILT_LIMIT_DEG
 from edgepose.calibration.fit import POSE_TILT_DEG
+from edgepose.calibration.misfit import UPSIDE_DOWN_DEG
 from edgepose.diagnostics.sensor_health import REST_ACC, REST_S, SensorHealth
 from edgepose.sources.clock_sync import FOLLOWED_PPM
 from edgepose.utils import fault_messages as messages
@@ -191,12 +192,28 @@ def _irregular(s: SensorHealth) -> str | None:
 
 
 def _late(s: SensorHealth) -> str | None:
-    if s.late_ms > LATE_LIMIT_MS + LATE_LIMIT_PERIODS * 1e3 / s.rate_hz:
+    # Both the reading thread and what it waits for may be late.
+    if s.late_ms > _late_limit_ms(s) + 2.0 * s.lag_ms:
         return (
             f"packets come up to {s.late_ms:.0f} ms late, in bursts: "
             "shorten the USB adapter's latency timer, reduce the load on radio or line, or end other programs"
         )
     return None
+
+
+def _late_limit_ms(s: SensorHealth) -> float:
+    return LATE_LIMIT_MS + LATE_LIMIT_PERIODS * 1e3 / s.rate_hz
+
+
+def busy_machine(sensors: Iterable[SensorHealth]) -> str | None:
+    """Return a message if packets come late, but perhaps only because this machine is busy."""
+    lags = [s.lag_ms for s in sensors if s.late_ms > _late_limit_ms(s) and _late(s) is None]
+    if not lags:
+        return None
+    return (
+        f"this machine is busy: programs wait up to {max(lags):.0f} ms for their turn, which hides whether "
+        "packets come late; end other programs"
+    )
 
 
 def _drift(s: SensorHealth) -> str | None:
@@ -262,12 +279,22 @@ def _heading(s: SensorHealth) -> str | None:
 def _placement(s: SensorHealth) -> str | None:
     if s.swapped_with is not None:
         return f"it is where {s.swapped_with} was calibrated: swap the two"
+    if s.pose_tilt_deg > POSE_TILT_DEG and not s.in_pose:
+        return (
+            f"it is tilted by {s.pose_tilt_deg:.0f} deg against the calibration, as are others: stand in its "
+            "pose; if you did, it is the calibration of another wearer or rig: calibrate again"
+        )
+    if s.pose_tilt_deg > UPSIDE_DOWN_DEG:
+        return (
+            f"it is turned by {s.pose_tilt_deg:.0f} deg against the calibration: it sits upside down; "
+            "turn it round, or calibrate again"
+        )
     if s.pose_tilt_deg > POSE_TILT_DEG:
         return (
             f"it is tilted by {s.pose_tilt_deg:.0f} deg against the calibration: "
             "stand as you did then; if it has slipped, calibrate again"
         )
-    return None
+    return s.impossible
 
 
 def _field(s: SensorHealth) -> str | None:

@@ -52,6 +52,13 @@ class OrientationStage:
         """Whether magnetometers are used and only some sensors have sent a magnetic field."""
         return self._magnetometer and 0 < len(self._with_north) < len(PLACEMENTS)
 
+    @property
+    def without_field(self) -> list[str]:
+        """The sensors that have not sent a magnetic field, although one is to be used."""
+        if self._orienter is None or not self._magnetometer:
+            return []
+        return [name for i, name in enumerate(PLACEMENTS) if i not in self._with_north]
+
     def summary_lines(self) -> list[str]:
         """Return one line per sensor with its events, for the end of a run."""
         status = {} if self._orienter is None else self._orienter.status()

@@ -16,17 +16,19 @@ from edgepose.calibration.misfit import MisfitDetector
 from edgepose.calibration.rezero import HeadingRezero
 from edgepose.config import WearerConfig
 from edgepose.diagnostics.rig_monitor import RigMonitor
-from edgepose.errors import CalibrationError, EdgeposeError, FileFormatError, prefix_errors
+from edgepose.errors import EdgeposeError, FileFormatError, prefix_errors
 from edgepose.orientation.stage import OrientationStage
+from edgepose.pipeline.calibrated_settings import age_days, check_settings, with_calibrated_settings
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.network import Network
 from edgepose.pipeline.place_stage import PlaceStage
 from edgepose.pipeline.remote_control import Request, Requests
-from edgepose.pipeline.rig_comparison import missing_heading_reset, other_devices
+from edgepose.pipeline.rig_comparison import changes, missing_heading_reset, missing_quantities
 from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
 from edgepose.placements import PLACEMENTS
 from edgepose.sinks.open import open_outputs
 from edgepose.sources import open_source
+from edgepose.sources.sensor_map import read_map
 
 if TYPE_CHECKING:
     from edgepose.calibration import Calibration
@@ -57,8 +59,8 @@ class OpenWearer:
 
         Args:
             stack: closes the source and the control socket.
-            config: the wearer's configuration.
-            calibration: the wearer's calibration, see `load_wearer_calibration`.
+            config: the wearer's configuration, see `load_wearer`.
+            calibration: the wearer's calibration, see `load_wearer`.
             by_key: returns the requests from the keyboard.
             blocking: see `edgepose.sources.open_source`.
             notify: called with each line for the user.
@@ -69,9 +71,11 @@ class OpenWearer:
         self.notify = _with_name(config.name, notify)
         self._config, self._calibration = config, calibration
         with prefix_errors(config.name):
+            sensors = config.source.sensors
+            self._sensor_map = None if sensors is None else read_map(sensors)
             self.source = stack.enter_context(open_source(**config.source.arguments(), blocking=blocking))
             self._requests = Requests(stack, config.control, by_key)
-            self._orient = OrientationStage(config.filter, magnetometer=calibration.north)
+            self._orient = OrientationStage(calibration.filter, magnetometer=calibration.north)
         self._sinks: list[Sink] = []
 
     def open_outputs(self, stack: ExitStack, network: Network, stopped: Callable[[], bool]) -> None:
@@ -144,8 +148,9 @@ class OpenWearer:
     def _differences(self) -> list[str]:
         devices = self.source.devices
         return [
-            *other_devices(self._calibration, devices),
+            *changes(self._calibration, devices, self._sensor_map),
             *missing_heading_reset(self._calibration, devices),
+            *missing_quantities(self._calibration, [], self._orient.without_field),
         ]
 
     def report(self, pipeline: WearerPipeline, rate: float, future: int) -> EdgeposeError | None:
@@ -195,38 +200,29 @@ def _latency(summary: RunSummary, rate: float, future: int) -> str:
     )
 
 
-def load_wearer_calibration(config: WearerConfig, notify: Notify) -> Calibration:
-    """Load a wearer's calibration.
+def load_wearer(config: WearerConfig, notify: Notify) -> tuple[WearerConfig, Calibration]:
+    """Load a wearer's calibration; return it, and the configuration with the settings that it knows.
 
     Raises:
         EdgeposeError: it cannot be read, or was made with another orientation filter than the run's.
     """
     calibration = load_calibration(config.calibration)
     with prefix_errors(config.name):
-        _check_filter(calibration, config, notify)
-    return calibration
-
-
-def _check_filter(calibration: Calibration, config: WearerConfig, notify: Notify) -> None:
-    """Raise EdgeposeError unless the run's orientation filter is the one that the calibration was made with.
-
-    This is no mere warning: another filter has other headings, and all poses would be subtly wrong.
-    """
-    if config.filter != calibration.filter:
-        raise CalibrationError(
-            f"the calibration was made with --filter {calibration.filter}, and this run has --filter "
-            f"{config.filter}: headings would differ; use the same one, or calibrate again"
-        )
-    if config.no_mag and config.filter != "none" and calibration.north:
-        raise CalibrationError(
-            "the calibration was made with magnetometers: leave --no-mag out, or calibrate again with it"
-        )
+        lines = check_settings(calibration, config.filter, config.no_mag, config.outputs.height)
     made_from = calibration.metadata.get("source")
     if not config.source.live and _restarts_with_filter(calibration) and made_from != config.source.name:
-        _with_name(config.name, notify)(
-            f"warning: the calibration was made from {made_from}, and headings of a filter without "
-            "magnetometers start from scratch in each recording: calibrate from this one"
+        lines.append(
+            f"the calibration was made from {made_from}, and headings of a filter without magnetometers "
+            "start from scratch in each recording: calibrate from this one"
         )
+    for line in lines:
+        _with_name(config.name, notify)(f"warning: {line}")
+    if config.source.live and (days := age_days(calibration)) >= 1:
+        _with_name(config.name, notify)(
+            f"the calibration is {days} day{'s' if days > 1 else ''} old: calibrate again if a sensor was "
+            "taken off since"
+        )
+    return with_calibrated_settings(config, calibration), calibration
 
 
 def _restarts_with_filter(calibration: Calibration) -> bool:

@@ -155,7 +155,7 @@ class FrameSynchronizer:
         if quat is None:
             raise EdgeposeError(
                 f"{PLACEMENTS[sensor]}: the device sends no orientation; set it to send quaternions, "
-                "or compute it here from gyroscope and accelerometer: --filter kalman"
+                "or compute it here from gyroscope and accelerometer: calibrate with --filter kalman"
             )
         if acc is None:
             raise EdgeposeError(

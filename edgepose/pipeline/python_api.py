@@ -16,7 +16,7 @@ from edgepose.pipeline.place_stage import PlaceStage
 from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
 from edgepose.pose import PoseFrame
 from edgepose.sinks.base import Sink
-from edgepose.skeleton import default_body
+from edgepose.skeleton import DEFAULT_HEIGHT, default_body
 from edgepose.sources import Batch
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ class Pipeline:
         model: str | Path | Model = "birnn",
         *,
         trust: bool = False,
-        height: float = 1.75,
+        height: float | None = None,
         leg_length: float | None = None,
         place: bool = True,
     ) -> None:
@@ -63,7 +63,7 @@ class Pipeline:
             calibration: the wearer's calibration; it names the orientation filter to use.
             model: name of a bundled model, path of an archive, or a loaded model.
             trust: load an archive although its checksum is unknown.
-            height: the wearer's stature, metres.
+            height: the wearer's stature, metres; None for the calibration's, or an average one.
             leg_length: length of the wearer's thigh and shank, hip joint to ankle, metres; None for the
                 average at this height.
             place: follow the wearer through the room; otherwise poses have no translation.
@@ -75,6 +75,8 @@ class Pipeline:
         from edgepose.inference.model import Model
 
         self._calibration, self._follow = calibration, place
+        if height is None:
+            height = calibration.height_m or DEFAULT_HEIGHT
         self._body = default_body(height, leg_length_m=leg_length)
         self._model = model if isinstance(model, Model) else Model(model, trust=trust)
         self.summary = RunSummary()

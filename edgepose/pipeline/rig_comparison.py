@@ -2,14 +2,55 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from edgepose.calibration import Calibration
+from edgepose.calibration import Calibration, mounting_warnings
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import Device
+from edgepose.sources.sensor_map import SensorMap
 from edgepose.utils.fault_messages import no_common_heading
 from firmware_protocols.registry import PROTOCOLS
+
+
+def changes(
+    calibration: Calibration, devices: Mapping[int, Device], sensor_map: SensorMap | None
+) -> list[str]:
+    """Return a warning for each kind of change of a rig since its calibration.
+
+    Args:
+        calibration: a calibration, whose metadata may name the devices it was made with.
+        devices: devices in use now, by placement.
+        sensor_map: the map in use, which may say how sensors are mounted.
+    """
+    lines = other_devices(calibration, devices)
+    if sensor_map is not None:
+        stated = {name: device.mounting for name, device in sensor_map.devices.items()}
+        lines += mounting_warnings(calibration, stated, str(sensor_map.path))
+    return lines
+
+
+def missing_quantities(
+    calibration: Calibration, raw: Sequence[str], without_field: Sequence[str]
+) -> list[str]:
+    """Return a warning if sensors do not send what the headings of their calibration are based on.
+
+    Args:
+        calibration: of the wearer.
+        raw: placements whose sensors send no orientation.
+        without_field: placements whose sensors send no magnetic field.
+    """
+    if calibration.filter == "none" and raw:
+        return [
+            f"the calibration was made with the sensors' own orientations, and {', '.join(raw)} send none: "
+            "set them to send quaternions, or calibrate again with --filter kalman"
+        ]
+    if calibration.filter != "none" and calibration.north and without_field:
+        return [
+            f"the calibration was made with magnetometers, and {', '.join(without_field)} send no magnetic "
+            "field: switch it on, or calibrate again with --no-mag"
+        ]
+    return []
 
 
 def other_devices(calibration: Calibration, devices: Mapping[int, Device]) -> list[str]:

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from edgepose.config import WearerConfig
 from edgepose.errors import EdgeposeError
 from edgepose.inference.engine import Engine, MultiWearerEngine
-from edgepose.pipeline.build import Notify, OpenWearer, load_wearer_calibration
+from edgepose.pipeline.build import Notify, OpenWearer, load_wearer
 from edgepose.pipeline.multi_wearer import POLL_S, Wearer, run_together
 from edgepose.pipeline.network import Network
 from edgepose.pipeline.remote_control import key_requests
@@ -31,11 +31,11 @@ def open_wearers(
     Raises:
         EdgeposeError: a calibration cannot be read or does not fit the run, or a source cannot be opened.
     """
-    calibrations = [load_wearer_calibration(wearer, notify) for wearer in wearers]
+    loaded = [load_wearer(wearer, notify) for wearer in wearers]
     keys = key_requests(len(wearers), pressed)
     return [
         OpenWearer(stack, wearer, calibration, by_key, len(wearers) == 1, notify)
-        for wearer, calibration, by_key in zip(wearers, calibrations, keys, strict=True)
+        for (wearer, calibration), by_key in zip(loaded, keys, strict=True)
     ]
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from edgepose.config import OutputConfig
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.sinks.registry import SINKS, sink_factory
-from edgepose.skeleton import Body
+from edgepose.skeleton import DEFAULT_HEIGHT, Body
 from edgepose.utils.output_targets import has_reader
 
 
@@ -48,7 +48,7 @@ def open_outputs(
     outputs.check()
     context = SinkContext(
         body=body or outputs.body,
-        height=outputs.height,
+        height=DEFAULT_HEIGHT if outputs.height is None else outputs.height,
         rate=rate,
         rotations=outputs.rotations,
         std=outputs.std,

@@ -62,7 +62,7 @@ def recording(tmp_path_factory):
 
 def start(*words, stdin=subprocess.PIPE):
     return processes.Popen(
-        [sys.executable, str(SIMULATOR), *map(str, words)],
+        [sys.executable, str(SIMULATOR), "--ideal", *map(str, words)],
         stdin=stdin,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

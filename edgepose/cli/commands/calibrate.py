@@ -6,9 +6,10 @@ import dataclasses
 import math
 import re
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import click
 import numpy as np
@@ -22,11 +23,13 @@ from edgepose.cli.calibration_session import (
     measure_live,
     measure_recorded,
 )
+from edgepose.cli.calibration_verdict import judge, next_command, table
+from edgepose.cli.guide.guide import Guide, end_stage
+from edgepose.cli.guide.phone_page import PhonePage, address_in_network
 from edgepose.cli.options.gathered import gathered
-from edgepose.cli.options.outputs import check_files, overwrite_option
+from edgepose.cli.options.outputs import address, check_files, overwrite_option
 from edgepose.cli.options.recording_time import RecordingTime, RecordingTimeType
 from edgepose.cli.options.source import filter_options, source_options
-from edgepose.cli.prompts import Prompter
 from edgepose.cli.terminal import messages as terminal
 from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
@@ -34,7 +37,11 @@ from edgepose.orientation.stage import OrientationStage
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 from edgepose.sinks.output_files import check_output
-from edgepose.sources.sensor_map import read_map
+from edgepose.skeleton import MAX_HEIGHT, MIN_HEIGHT
+from edgepose.sources.sensor_map import SensorMap, read_map
+
+PAGE_PORT = 8090
+"""Port of the page without an address."""
 
 
 def _body_frame(ctx: click.Context, param: click.Parameter, value: str | None) -> str | None:
@@ -119,9 +126,9 @@ _PLAN_FLAGS = [
         "--countdown",
         "countdown_s",
         type=click.FloatRange(0, 600),
-        default=3.0,
+        default=10.0,
         show_default=True,
-        help="Time before each live hold, seconds.",
+        help="Time before each live hold, seconds; before each movement 3 at most.",
     ),
 ]
 
@@ -142,9 +149,31 @@ def _plan_options(command: Callable[..., Any]) -> Callable[..., Any]:
     help="Calibration file to write, JSON; - is standard output.",
 )
 @overwrite_option
+@click.option(
+    "--height",
+    "height_m",
+    type=click.FloatRange(MIN_HEIGHT, MAX_HEIGHT),
+    help="The wearer's height, metres, which run then uses.",
+)
+@click.option(
+    "--page",
+    is_flag=False,
+    flag_value=f"127.0.0.1:{PAGE_PORT}",
+    callback=address,
+    metavar="[HOST:PORT]",
+    help="Guide the wearer by a page at this address of this machine, for a browser or a phone, with sound "
+    f"and buttons; live sources only.  [default without a value: 127.0.0.1:{PAGE_PORT}]",
+)
 @_plan_options
 def calibrate(
-    source: SourceConfig, filter: str, no_mag: bool, out: str, overwrite: bool, plan: CalibrationPlan
+    source: SourceConfig,
+    filter: str,
+    no_mag: bool,
+    out: str,
+    overwrite: bool,
+    height_m: float | None,
+    page: tuple[str, int] | None,
+    plan: CalibrationPlan,
 ) -> None:
     """Find out how the six sensors sit on their wearer.
 
@@ -156,10 +185,11 @@ def calibrate(
     Examples:
       edgepose calibrate --port /dev/ttyUSB0
       edgepose calibrate --port COM3 --filter kalman --heading-reset motion
+      edgepose calibrate --port COM3 --page 192.168.1.5:8090
       edgepose calibrate --sensors rig.toml --pose t-pose
       edgepose calibrate --file walk.csv --from +2.5 --body-frame heading:0
     """
-    _check_use(source, plan)
+    _check_use(source, plan, page)
     inputs = {"--file": source.file, "--sensors": source.sensors, "--heading-reset": plan.side_by_side}
     check_files({"--out": out}, inputs)
     _check_writable(out, overwrite)
@@ -169,11 +199,69 @@ def calibrate(
     )
     if plan.heading_reset == "mounting":
         plan = dataclasses.replace(plan, mounting=_all_mountings(mountings))
-    orient = OrientationStage(filter, magnetometer=not no_mag)
-    say = Prompter(err=out == "-")
-    measured = (measure_live if source.live else measure_recorded)(source, plan, orient, say)
-    for warning in measured.warnings:
-        terminal.say(f"warning: {warning}")
+    job = _Job(source, plan, filter, not no_mag, height_m, sensor_map)
+    with ExitStack() as stack:
+        phone = None if page is None else stack.enter_context(PhonePage(*page))
+        guide = stack.enter_context(Guide(err=out == "-", phone=phone))
+        if phone is not None:
+            _announce(phone, guide)
+        damaged = _repeated(job, guide, out, overwrite)
+    if damaged:
+        raise EdgeposeError("a part of the recording was left out, see the warnings above")
+
+
+def _repeated(job: _Job, guide: Guide, out: str, overwrite: bool) -> bool:
+    """Calibrate, again as often as the wearer asks for it; return whether a part of a recording was left out.
+
+    Raises:
+        EdgeposeError: the last calibration failed, or cannot be written.
+    """
+    while True:
+        try:
+            measured, result, warnings = _calibrated(job, guide)
+        except EdgeposeError as error:
+            if not guide.wants_repeat(end_stage("REDO", str(error), job.plan.pose)):
+                raise
+            continue
+        guide.close_page()
+        for warning in warnings:
+            terminal.say(f"warning: {warning}")
+        if out == "-":
+            click.echo(calibration.to_json(result), nl=False)
+        else:
+            calibration.save(result, out, overwrite)
+            overwrite = True  # by a repetition
+        guide(table(result, measured))
+        guide(f"Wrote {'stdout' if out == '-' else out}.")
+        judgement = judge(result, measured, warnings)
+        guide(judgement.text)
+        if out != "-" and not measured.damaged:
+            guide("Next:")
+            terminal.show(f"  {next_command(job.source, out)}")  # in one line, to be copied
+        if not guide.wants_repeat(end_stage(judgement.word, judgement.text, job.plan.pose)):
+            return measured.damaged
+
+
+class _Job(NamedTuple):
+    """What to calibrate and how."""
+
+    source: SourceConfig
+    plan: CalibrationPlan
+    filter: str
+    magnetometer: bool
+    height_m: float | None
+    sensor_map: SensorMap | None
+
+
+def _calibrated(job: _Job, guide: Guide) -> tuple[Measured, Calibration, list[str]]:
+    """Measure once; return the measurements, the calibration, and warnings about it.
+
+    Raises:
+        EdgeposeError: sensors are missing, the wearer moved, or headings would be arbitrary.
+    """
+    source, plan = job.source, job.plan
+    orient = OrientationStage(job.filter, job.magnetometer)
+    measured = (measure_live if source.live else measure_recorded)(source, plan, orient, guide)
     reset = measured.reset
     result = calibration.calibrate(
         measured.summary,
@@ -182,27 +270,32 @@ def calibrate(
         created=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         heading_offset=None if reset is None else reset.offset,
         metadata=_metadata(source, plan, measured),
-        filter=filter,
-        north=orient.north and (filter != "none" or reset is None),
+        filter=job.filter,
+        north=orient.north and (job.filter != "none" or reset is None),
+        height_m=job.height_m,
     )
-    if sensor_map is not None:
-        for warning in calibration.mounting_warnings(result, mountings, sensor_map.path):
-            terminal.say(f"warning: {warning}")
-    if out == "-":
-        click.echo(calibration.to_json(result), nl=False)
-    else:
-        calibration.save(result, out, overwrite)
-    say(_table(result, measured))
-    say(f"Wrote {'stdout' if out == '-' else out}.")
-    if measured.damaged:
-        raise EdgeposeError("a part of the recording was left out, see the warnings above")
+    warnings = list(measured.warnings)
+    if job.sensor_map is not None:
+        stated = {name: device.mounting for name, device in job.sensor_map.devices.items()}
+        warnings += calibration.mounting_warnings(result, stated, job.sensor_map.path)
+    return measured, result, warnings
 
 
-def _check_use(source: SourceConfig, plan: CalibrationPlan) -> None:
+def _announce(phone: PhonePage, guide: Guide) -> None:
+    """Say where the page is."""
+    guide(f"Page for the wearer: {phone.url}")
+    own = address_in_network()
+    if phone.is_local and own is not None:
+        guide(f"Only this machine can open it. For a phone in your network: --page {own}:{phone.port}")
+
+
+def _check_use(source: SourceConfig, plan: CalibrationPlan, page: tuple[str, int] | None) -> None:
     """Raise click.UsageError if flags exclude each other."""
     if source.live and (plan.start is not None or plan.motion is not None):
         flag = "--motion" if plan.start is None else "--from"
         raise click.UsageError(f"{flag} needs a recording that is read at once: --file without --realtime")
+    if page is not None and not source.live:
+        raise click.UsageError("--page guides a wearer in front of live sensors: give --port or --can")
     if plan.heading_reset == "live" and not source.live:
         raise click.UsageError(
             "--heading-reset live needs --port; give a recording of the sensors lying side by side instead"
@@ -266,20 +359,3 @@ def _check_writable(out: str, overwrite: bool) -> None:
     if out != "-" and not Path(out).parent.is_dir():
         raise EdgeposeError(f"{out}: no folder {Path(out).parent}; make it first or choose another --out")
     check_output(out, "the calibration", (".json",), overwrite)
-
-
-# --- result -------------------------------------------------------------------------------------------------
-
-
-def _table(result: Calibration, measured: Measured) -> str:
-    summary, reset = measured.summary, measured.reset
-    lines = ["sensor          samples  residual deg  m/s^2 heading its error  sits"]
-    for i, (name, sits) in enumerate(zip(PLACEMENTS, calibration.mounting(result), strict=True)):
-        force = float(np.linalg.norm(summary.force[i]))
-        heading = "-" if reset is None else f"{math.degrees(reset.offset[i]):.1f}"
-        error = "-" if reset is None else f"{reset.error_deg[i]:.1f}"
-        lines.append(
-            f"{name:16}{summary.samples[i]:7d}{result.residual_deg[i]:14.2f}"
-            f"{'-' if math.isnan(force) else f'{force:.2f}':>7}{heading:>8}{error:>10}  {sits}"
-        )
-    return "\n".join(lines)

@@ -176,13 +176,14 @@ def solve(
     """
     _check_outputs(outputs, plot, {"IN": recording, "--calibration": calibration_path})
 
+    from edgepose.calibration import load_calibration
     from edgepose.sinks.open import open_outputs
     from edgepose.sip import residuals
     from edgepose.sip.measurements import measure
     from edgepose.sip.solve import solve as solve_all
     from edgepose.sip.translation import pelvis_path
 
-    wearer_body = body.build()
+    wearer_body = body.build(load_calibration(calibration_path).height_m)
     data, mounts = _read(recording, calibration_path, solver)
     measurements = measure(data, mounts, solver.rate)
     network = _network(solver, body.hinges, data, mounts, measurements)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from edgepose.skeleton import MAX_HEIGHT, MIN_HEIGHT, with_leg_length
+from edgepose.skeleton import DEFAULT_HEIGHT, MAX_HEIGHT, MIN_HEIGHT, with_leg_length
 
 if TYPE_CHECKING:
     from edgepose.skeleton import Body
@@ -38,8 +38,8 @@ class BodyFlags(NamedTuple):
         """Whether to use a hand-rigged skeleton with hinges instead of SMPL's joints."""
         return self.body == "hinges"
 
-    def build(self) -> Body:
-        """Return the body.
+    def build(self, known_height_m: float | None = None) -> Body:
+        """Return the body; `known_height_m` is used if no height was given.
 
         Raises:
             EdgeposeError: no body has these measures, or the file is not an SMPL model.
@@ -47,7 +47,8 @@ class BodyFlags(NamedTuple):
         from edgepose.sip.bodies import scaled, shaped_body
 
         if self.body in ("smpl", "hinges"):
-            body = shaped_body(self.height or 1.75, self.sex or "neutral", self.weight, self.words)
+            height_m = self.height or known_height_m or DEFAULT_HEIGHT
+            body = shaped_body(height_m, self.sex or "neutral", self.weight, self.words)
             if self.leg_length is not None:
                 body = with_leg_length(body, self.leg_length)
         else:
@@ -75,7 +76,7 @@ def body_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--height",
             type=click.FloatRange(MIN_HEIGHT, MAX_HEIGHT),
-            help="The wearer's height, metres.  [default: 1.75]",
+            help=f"The wearer's height, metres.  [default: the calibration's, or {DEFAULT_HEIGHT}]",
         ),
         leg_length_option,
         click.option(

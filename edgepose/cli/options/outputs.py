@@ -14,6 +14,7 @@ from edgepose.config import OutputConfig
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.csv_columns import ROTATION_FORMATS
 from edgepose.sinks.registry import SINKS, Output
+from edgepose.skeleton import DEFAULT_HEIGHT
 from edgepose.utils.output_targets import identity, is_null
 from edgepose.utils.sockets import parse_host_and_port
 
@@ -85,10 +86,8 @@ def output_options(command: Command) -> Command:
     height_option = click.option(
         "--height",
         type=float,
-        default=1.75,
-        show_default=True,
         help="The wearer's height, metres: for the length of their steps, and for the bones of --bvh, --osc "
-        "and --view.",
+        f"and --view.  [default: the calibration's, or {DEFAULT_HEIGHT}]",
     )
     other_sinks_option = click.option(
         "--sink",

@@ -91,13 +91,22 @@ def source_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def filter_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add --filter and --no-mag; the command gets them as `filter: str` and `no_mag: bool`."""
-    filter_option = click.option(
+    return _filter_option(default="none", show_default=True)(_no_mag_option(command))
+
+
+def calibrated_filter_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add --filter and --no-mag for a command whose calibration knows them; `filter` is None if not given."""
+    return _filter_option(default=None, more="  [default: the calibration's]")(_no_mag_option(command))
+
+
+def _filter_option(more: str = "", **how: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    return click.option(
         "--filter",
         type=click.Choice(FILTERS),
-        default="none",
-        show_default=True,
         help="Compute orientations from gyroscope, accelerometer and, where available, magnetometer. none: "
-        "the sensors send orientations.",
+        f"the sensors send orientations.{more}",
+        **how,
     )
-    no_mag_option = click.option("--no-mag", is_flag=True, help="Do not use magnetometers in --filter.")
-    return filter_option(no_mag_option(command))
+
+
+_no_mag_option = click.option("--no-mag", is_flag=True, help="Do not use magnetometers in --filter.")

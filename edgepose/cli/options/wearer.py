@@ -14,7 +14,7 @@ from click.core import ParameterSource
 from edgepose.cli.conflicts import check_lines
 from edgepose.cli.options.gathered import usage_errors
 from edgepose.cli.options.outputs import address, output_options
-from edgepose.cli.options.source import filter_options, source_options
+from edgepose.cli.options.source import calibrated_filter_options, source_options
 from edgepose.config import WearerConfig
 from edgepose.errors import ConfigError
 
@@ -27,7 +27,7 @@ def _required_without_rig(ctx: click.Context, param: click.Parameter, value: Pat
 
 @click.command()
 @source_options
-@filter_options
+@calibrated_filter_options
 @click.option(
     "--calibration",
     callback=_required_without_rig,

@@ -2,78 +2,58 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 
-from edgepose.calibration.fit import POSE_TILT_DEG, fit_pose, from_median
-from edgepose.calibration.heading_reset import RESET_TILT_LIMIT_DEG, headings_from_pose, turn_about_z
+from edgepose.calibration.fit import from_median
+from edgepose.calibration.heading_reset import RESET_TILT_LIMIT_DEG, turn_about_z
 from edgepose.calibration.sensor_to_segment import Calibration
 from edgepose.diagnostics.sensor_health.columns import FEWEST
 from edgepose.diagnostics.sensor_health.repeats import FROZEN_S, is_constant, newest_values
 from edgepose.diagnostics.sensor_health.rest import is_table
 from edgepose.diagnostics.sensor_health.sensor import Sensor
+from edgepose.diagnostics.sensor_health.worn import WornComparison
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 
-_POSE_OFF_DEG = 30.0  # sum over six sensors: accuracy with which a wearer takes the pose again
 
-
-class HeadingComparison:
-    """Headings of sensors that are all at rest, side by side or on a wearer who stands in the pose."""
+class RigComparison:
+    """Sensors that are all at rest: side by side, or on a wearer who stands in the pose of a calibration."""
 
     def __init__(self, calibration: Calibration | None) -> None:
         """Create the comparison; without a calibration only sensors that lie side by side are compared."""
-        self._calibration = calibration
-        self._headings: tuple[str | None, Array] = (None, np.full(len(PLACEMENTS), np.nan))
-        self._pose: tuple[Array, list[str | None]] | None = None
-        self._pose_off_deg = math.inf
+        self._worn = None if calibration is None else WornComparison(calibration)
+        self._table_deg: Array | None = None
 
     def update(self, sensors: Sequence[Sensor]) -> None:
         """Compare the sensors, in the order of PLACEMENTS, in their current state."""
+        if self._worn is not None:
+            self._worn.check_bones(sensors)
         resting = {i: rest for i, sensor in enumerate(sensors) if (rest := sensor.present_rest()) is not None}
         reporting = sum(len(sensor.window) > 0 for sensor in sensors)
         if len(resting) < 2 or len(resting) < reporting:
             return
         rests = list(resting.values())
-        quats = np.stack([rest.quat for rest in rests])
         if is_table(rests):
+            quats = np.stack([rest.quat for rest in rests])
             reset = turn_about_z(quats, quats[-1])
-            if reset.error_deg.max() < RESET_TILT_LIMIT_DEG:
-                headings = np.full(len(PLACEMENTS), np.nan)
-                headings[list(resting)] = from_median(-reset.offset)
-                self._headings = "table", headings
-        elif self._calibration is not None and len(resting) == len(PLACEMENTS):
-            self._compare_pose(self._calibration, quats)
+            if reset.error_deg.max() < RESET_TILT_LIMIT_DEG:  # false for sensors without orientation
+                self._table_deg = np.full(len(PLACEMENTS), np.nan)
+                self._table_deg[list(resting)] = from_median(-reset.offset)
+        elif self._worn is not None and len(resting) == len(PLACEMENTS):
+            self._table_deg = None
+            self._worn.compare_pose(rests)
 
     def result(self) -> list[dict[str, Any]]:
         """Return fields for the `SensorHealth` of each sensor."""
-        on, headings = self._headings
-        fields: list[dict[str, Any]] = [
-            {"heading_deg": heading, "heading_on": on} for heading in headings.tolist()
-        ]
-        if self._pose is not None:
-            for sensor_fields, tilt, swap in zip(fields, self._pose[0].tolist(), self._pose[1], strict=True):
-                sensor_fields |= {"pose_tilt_deg": tilt, "swapped_with": swap}
+        fields = [{} for _ in PLACEMENTS] if self._worn is None else self._worn.result()
+        if self._table_deg is not None:
+            for of_sensor, heading in zip(fields, self._table_deg.tolist(), strict=True):
+                of_sensor |= {"heading_deg": heading, "heading_on": "table"}
         return fields
-
-    def _compare_pose(self, calibration: Calibration, quats: Array) -> None:
-        """Compare the sensors of a wearer who stands in the pose, or should."""
-        fit = fit_pose(calibration, quats)
-        if fit.off_deg > self._pose_off_deg + _POSE_OFF_DEG:
-            return  # the wearer has been nearer to the pose before
-        self._pose_off_deg = min(fit.off_deg, self._pose_off_deg)
-        if fit.in_pose:
-            self._headings = "body", fit.heading_deg
-        swaps: list[str | None] = [None] * len(PLACEMENTS)
-        if fit.sits_at is not None:
-            swaps = [PLACEMENTS[at] if at != i else None for i, at in enumerate(fit.sits_at)]
-        elif fit.in_pose:
-            swaps = _swaps(calibration, quats, fit.tilt_deg)
-        self._pose = fit.tilt_deg, swaps
 
 
 def compare_values(sensors: Sequence[Sensor]) -> list[dict[str, Any]]:
@@ -89,14 +69,3 @@ def compare_values(sensors: Sequence[Sensor]) -> list[dict[str, Any]]:
             if is_constant(sensor.window, 2.0 * FROZEN_S):
                 sensor_fields["frozen"] = "everything"
     return fields
-
-
-def _swaps(calibration: Calibration, quats: Array, tilt: Array) -> list[str | None]:
-    """Find for each sensor the one with which it must be swapped so that both fit the pose."""
-    result: list[str | None] = [None] * len(PLACEMENTS)
-    for i, j in combinations(np.flatnonzero(tilt > POSE_TILT_DEG), 2):
-        swapped = quats.copy()
-        swapped[[i, j]] = quats[[j, i]]
-        if headings_from_pose(calibration, swapped).error_deg[[i, j]].max() < POSE_TILT_DEG:
-            result[i], result[j] = PLACEMENTS[j], PLACEMENTS[i]
-    return result

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from edgepose.calibration.checks import GRAVITY_TILT_LIMIT_DEG
 from edgepose.calibration.sensor_to_segment import Calibration
 from edgepose.diagnostics.sensor_health.columns import joined_rows, row_of
-from edgepose.diagnostics.sensor_health.comparison import HeadingComparison, compare_values
+from edgepose.diagnostics.sensor_health.comparison import RigComparison, compare_values
 from edgepose.diagnostics.sensor_health.report import SensorHealth
 from edgepose.diagnostics.sensor_health.sensor import Sensor
 from edgepose.imu import ImuSample
@@ -27,7 +27,7 @@ class SensorHealthMonitor:
     def __init__(self, calibration: Calibration | None = None) -> None:
         """Create the monitor; with a calibration, headings and placements are checked on the body."""
         self._sensors = [Sensor() for _ in PLACEMENTS]
-        self._headings = HeadingComparison(calibration)
+        self._comparison = RigComparison(calibration)
         self._next_fold_s = -math.inf
 
     def add(self, samples: Iterable[ImuSample], arrival_s: float = math.nan) -> None:
@@ -49,18 +49,21 @@ class SensorHealthMonitor:
                 self._fold()
                 self._next_fold_s = sample.time_s + _FOLD_S
 
-    def report(self, now_s: float, clocks: Mapping[int, DeviceClock] | None = None) -> list[SensorHealth]:
+    def report(
+        self, now_s: float, clocks: Mapping[int, DeviceClock] | None = None, lag_ms: float = 0.0
+    ) -> list[SensorHealth]:
         """Return the health of the sensors, in the order of PLACEMENTS.
 
         Args:
             now_s: time up to which all samples have been added, on their clock, seconds.
             clocks: of the sensors that send a time.
+            lag_ms: delay with which this machine reads packets, see `SensorHealth`.
         """
         self._fold()
         result = []
-        headings, values = self._headings.result(), compare_values(self._sensors)
+        rig, values = self._comparison.result(), compare_values(self._sensors)
         for i, (name, sensor) in enumerate(zip(PLACEMENTS, self._sensors, strict=True)):
-            fields = headings[i] | values[i]
+            fields = rig[i] | values[i] | {"lag_ms": lag_ms}
             if clocks is not None and i in clocks:
                 ppm, error = clocks[i].drift_ppm()
                 fields |= {
@@ -82,4 +85,4 @@ class SensorHealthMonitor:
     def _fold(self) -> None:
         for sensor in self._sensors:
             sensor.fold()
-        self._headings.update(self._sensors)
+        self._comparison.update(self._sensors)

@@ -18,6 +18,7 @@ class SensorHealth:
         jitter_ms: deviation of the intervals, without gaps.
         lost: number of samples missing in the sensor's times; lost_percent: their share of all.
         late_ms: 95 % of the packets come no later than this after the fastest ones.
+        lag_ms: delay that is this machine's: 95 % of its threads' waits end no later than this.
         invalid: number of samples with a NaN or with a quaternion that is not a rotation.
         orientation: whether it sends one; acceleration, gyroscope and magnetometer likewise.
         incomplete_percent: samples without a quantity that others have.
@@ -34,8 +35,10 @@ class SensorHealth:
         field_change_percent: range of that strength from the 5th to the 95th percentile.
         heading_deg: against the median of all sensors, lying side by side or standing in the pose.
         heading_on: "table" or "body".
-        pose_tilt_deg: tilt against the calibration's pose in which the wearer stands.
+        pose_tilt_deg: tilt against the calibration's pose in which the wearer stands, or should.
+        in_pose: whether most sensors say that the wearer stands in it.
         swapped_with: the placement with which it must be swapped to fit that pose.
+        impossible: what is wrong with its bone if that has been in an orientation that no body can take.
         repeated_percent: samples that are the same as the one before, in motion.
         frozen: quantity that does not change while the sensor moves, or "everything" if only the other
             sensors change.
@@ -55,6 +58,7 @@ class SensorHealth:
     lost: int = 0
     lost_percent: float = math.nan
     late_ms: float = math.nan
+    lag_ms: float = 0.0
     invalid: int = 0
     orientation: bool = False
     acceleration: bool = False
@@ -77,7 +81,9 @@ class SensorHealth:
     heading_deg: float = math.nan
     heading_on: str | None = None
     pose_tilt_deg: float = math.nan
+    in_pose: bool | None = None
     swapped_with: str | None = None
+    impossible: str | None = None
     repeated_percent: float = math.nan
     frozen: str | None = None
     saturated: str | None = None

@@ -75,8 +75,8 @@ class Sensor:
             self._gyro.update(rows[-new - 1 :], period_s)
 
     def present_rest(self) -> Rest | None:
-        """Return the current rest of a sensor with orientation; None if it moves."""
-        if not self._completeness.has["orientation"]:
+        """Return the current rest; None if the sensor moves or measures too little."""
+        if not len(self.window):
             return None
         return self._rests.lasting(self.window[-1, TIME] - 3.0 * self._timing.period_s)
 

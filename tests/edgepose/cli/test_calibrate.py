@@ -108,7 +108,7 @@ def test_stdout_gets_the_calibration_and_nothing_else() -> None:
     result = run("--file", REAL, "--out", "-", "--hold", 1, "--from", 41)
     assert result.exit_code == 0, result
     assert json.loads(result.stdout)["metadata"]["from_s"] == 41.0
-    assert "residual deg" in result.stderr
+    assert "residual" in result.stderr
     assert "hold from 41.00 to 42.00 s.\n" in result.stderr
 
 
@@ -133,6 +133,25 @@ def test_a_hold_is_covered_by_the_samples_of_every_sensor(
         message,
     )
     assert not (tmp_path / "c.json").exists()
+
+
+@pytest.mark.parametrize("start", ["11", "+1"])
+def test_a_hold_in_which_all_sensors_are_silent(tmp_path: Path, start: str) -> None:
+    """A gap in the recording is no hold, wherever the samples before and after it are."""
+    path = write_recording(tmp_path / "pose.csv", lambda t: worn(cal.POSES["straight"]))
+    rows = path.read_text().splitlines(keepends=True)
+    path.write_text(
+        "".join(row for row in rows if row[0] == "t" or not 11.8 <= float(row.split(",")[0]) < 12.9)
+    )
+    words = ("--file", path, "--out", tmp_path / "c.json", "--body-frame", "heading:70")
+    message = error_of(run(*words, "--from", start, "--hold", 1.8))
+    assert message.startswith(
+        "silent during a part of the hold: left_forearm for 1.0 s, right_forearm for 1.0 s"
+    )
+    assert error_of(run(*words, "--from", 12, "--hold", 4)).startswith(
+        f"{path}: it does not contain 4 s from 12 s"
+    )
+    assert run(*words, "--from", start, "--hold", 0.8).exit_code == 0
 
 
 def _from(row: str, sensor: str, start_s: float, end_s: float) -> bool:
@@ -466,7 +485,10 @@ def test_a_whole_session_on_a_terminal(wearer: Wearer, tmp_path: Path) -> None:
         process.wait()
         os.close(terminal)
     assert b"Lay all six sensors side by side" in screen
-    assert b"100%" in screen
+    assert b"\a" in screen
+    assert "Hold still. Stand straight" in screen.decode()
+    assert "█" in screen.decode()
+    assert f"Next:\r\n  edgepose run --port {wearer.port} --calibration {out} --view\r\n" in screen.decode()
     calibration = cal.load_calibration(out)
     np.testing.assert_allclose(np.degrees(calibration.heading_offset), np.degrees(ERRORS), atol=0.1)
     assert_recovers(calibration, ERRORS, 0.1)

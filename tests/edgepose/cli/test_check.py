@@ -15,6 +15,7 @@ import termios
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from edgepose.formats.recordings.csv import write_csv
@@ -24,10 +25,11 @@ from edgepose.placements import PLACEMENTS
 from edgepose.sources import open_source
 from tests.support import processes, terminals
 from tests.support.ports import Port
-from tests.support.processes import simulated
-from tests.support.terminals import rest_of
+from tests.support.processes import ROOT, simulated
+from tests.support.terminals import on_a_terminal, rest_of
 
 REAL = Path(__file__).parents[2] / "data" / "imu" / "six-sites-3s.npz"
+CLIP = ROOT / "tools" / "data" / "09_12.bvh"
 
 
 @contextlib.contextmanager
@@ -239,7 +241,7 @@ def test_the_page_is_drawn_in_place_until_it_is_stopped(stop):
     pages = before.split("\033[H")[1:]
     assert all(page.endswith("\033[J") for page in pages[:-1])
     title, headline, *_ = plain(pages[-1]).splitlines()
-    assert title == f"edgepose check  {port}; Ctrl-C ends"
+    assert title == f"edgepose check; Ctrl-C ends it  {port}"
     assert re.match(r"\d+ s: \d of 6 sensors fine; packets \d+ good", headline)
     # The table stays when the page has gone, and the cursor is back.
     assert before.endswith("\033[?25h")
@@ -304,3 +306,27 @@ def test_wrong_use(command, words, code, says):
     assert result.returncode == code
     assert says in result.stderr
     assert "Traceback" not in result.stderr
+
+
+def test_equal_findings_are_said_once_and_the_same_everywhere(command, tmp_path):
+    """On a terminal and in a pipe, with the range of the numbers."""
+    recording = read_recording(REAL)
+    for i, (name, data) in enumerate(recording.sensors.items()):
+        recording.sensors[name] = data._replace(gyr=data.gyr + np.radians(6.0 + i) * (i != 4))
+    write_npz(tmp_path / "biased.npz", recording)
+    words = ("check", "--file", tmp_path / "biased.npz")
+    code, screen = on_a_terminal([sys.executable, "-m", "edgepose", *words])
+    piped = command(*words)
+    assert code == piped.returncode == 1
+    (line,) = [line for line in piped.stdout.splitlines() if "deg/s at rest" in line]
+    names = ", ".join(name for name in PLACEMENTS if name != "head")
+    assert re.fullmatch(rf"{names}: its rate is 10\.\d to 19\.\d deg/s at rest: keep it still .*", line)
+    assert line in " ".join(plain(screen.decode()).replace("\r", "").split())
+
+
+def test_simulated_sensors_are_fine(command):
+    """In motion, too: they have noise."""
+    with simulated(CLIP, "--mounting", 7) as (_, port):
+        result = command("check", "--port", port, "--seconds", 9, "--protocol", "native")
+    assert "6 of 6 sensors fine" in result.stdout
+    assert result.returncode == 0

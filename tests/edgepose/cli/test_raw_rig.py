@@ -23,8 +23,14 @@ from edgepose import rotations as rot
 from edgepose.analysis.metrics import joint_angle_error
 from edgepose.calibration import EXERCISE_S, ROUTINE, load_calibration
 from edgepose.cli.commands.calibrate import calibrate
+from edgepose.diagnostics.rules import diagnose
+from edgepose.diagnostics.sensor_health import SensorHealthMonitor
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.registry import read_poses
+from edgepose.formats.recordings.base import iter_samples
+from edgepose.formats.recordings.npz import write_npz
+from edgepose.formats.recordings.registry import read_recording
+from edgepose.imu import Recording
 from edgepose.placements import PLACEMENTS
 from edgepose.skeleton import local_from_global
 from edgepose_export.mocap import read_motion, resample
@@ -32,7 +38,7 @@ from edgepose_export.mocap.zeroing import Evidence, find_zero
 from edgepose_export.synthesis.heading_routine import with_exercises
 from tests.support import processes
 from tests.support.datagrams import free_address
-from tests.support.recordings import write_part
+from tests.support.recordings import part, write_part
 from tests.support.terminals import own_terminal
 
 SIMULATOR = Path(__file__).parents[3] / "tools" / "simulate.py"
@@ -95,7 +101,7 @@ def test_the_calibration_says_how_it_was_made(rig):
 def test_poses_from_raw_samples_are_true(command, rig, tmp_path):
     """Ideal sensors give 7 degrees; see tools/bench_raw.py."""
     poses = tmp_path / "poses.csv"
-    words = ("--calibration", rig.calibration, "--filter", "kalman", "--model", "rnn", "--csv", poses)
+    words = ("--calibration", rig.calibration, "--model", "rnn", "--csv", poses)
     result = command("run", "--file", rig.raw, *words)
     assert result.returncode == 0, result.stderr
     assert "warning" not in result.stderr
@@ -104,19 +110,32 @@ def test_poses_from_raw_samples_are_true(command, rig, tmp_path):
     assert joint_angle_error(found[moving], true_poses(time_s[moving])).mean() < 9.0
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        ((), "made with --filter kalman, and this run has --filter none: headings would differ"),
-        (("--filter", "vqf"), "made with --filter kalman, and this run has --filter vqf"),
-    ],
-)
-def test_a_run_with_another_filter_is_refused(command, rig, tmp_path, words, says):
-    result = command(
-        "run", "--file", rig.raw, "--calibration", rig.calibration, *words, "--csv", tmp_path / "x.csv"
-    )
+@pytest.mark.parametrize("words", [("run", "--csv", os.devnull), ("check",)], ids=" ".join)
+@pytest.mark.parametrize("other", ["none", "vqf"])
+def test_another_filter_is_refused(command, rig, words, other):
+    flags = ("--file", rig.raw, "--calibration", rig.calibration, "--filter", other)
+    result = command(*words, *flags)
     assert result.returncode == 1
-    assert says in result.stderr
+    assert f"made with --filter kalman, and this run has --filter {other}: headings would" in result.stderr
+
+
+def test_check_compares_raw_sensors_by_gravity(rig):
+    """Without orientations, the tilt of every sensor at rest is known all the same."""
+    recording = part(read_recording(rig.raw), 3.0, 6.0)
+    calibration = load_calibration(rig.calibration)
+
+    def findings(sensors: dict) -> dict[str, str]:
+        monitor = SensorHealthMonitor(calibration)
+        monitor.add(iter_samples(Recording(sensors, {})))
+        return {row.placement: diagnose(row).name for row in monitor.report(6.0)}
+
+    assert set(findings(recording.sensors).values()) == {"ok, raw"}
+    exchanged = recording.sensors | {
+        "head": recording.sensors["pelvis"],
+        "pelvis": recording.sensors["head"],
+    }
+    found = findings(exchanged)
+    assert {name for name, finding in found.items() if finding == "placement"} == {"head", "pelvis"}
 
 
 def test_a_calibration_from_another_recording_is_told(command, rig, tmp_path):
@@ -135,7 +154,9 @@ def test_without_a_filter_the_message_names_it(command, rig, wearer, tmp_path):
         "run", "--file", rig.raw, "--calibration", wearer.calibration, "--csv", tmp_path / "x.csv"
     )
     assert result.returncode == 1
-    assert result.stderr.endswith("or compute it here from gyroscope and accelerometer: --filter kalman\n")
+    assert result.stderr.endswith(
+        "or compute it here from gyroscope and accelerometer: calibrate with --filter kalman\n"
+    )
 
 
 @pytest.mark.parametrize(
@@ -164,6 +185,22 @@ def test_calibrations_that_would_be_wrong_are_refused(rig, tmp_path, words, says
     assert not out.exists()
 
 
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ((), "no orientation from left_forearm, right_forearm, left_lower_leg"),
+        (("--filter", "kalman"), "headings are arbitrary: add --heading-reset motion"),
+    ],
+)
+def test_a_live_wearer_hears_at_once_what_is_missing(rig, tmp_path, monkeypatch, words, says):
+    """Nobody has to stand still for a calibration that cannot be made."""
+    monkeypatch.setattr("edgepose.cli.calibration_session.LISTEN_S", 0.2)
+    result = calibrated("--file", rig.raw, "--realtime", *words, "--out", tmp_path / "c.json")
+    assert says in str(result.exception)
+    assert "All six sensors report." in result.output
+    assert "The hold starts" not in result.output
+
+
 def test_magnetometers_give_a_north_and_make_a_reset_needless(command, tmp_path):
     short, out = tmp_path / "short.npz", tmp_path / "calib.json"
     simulate("--raw", 9, "--write", tmp_path / "whole.npz")
@@ -178,10 +215,17 @@ def test_magnetometers_give_a_north_and_make_a_reset_needless(command, tmp_path)
     assert np.degrees(angles).max() < 8.0
     result = calibrated(*held, "--no-mag", "--out", tmp_path / "other.json")
     assert "headings are arbitrary" in str(result.exception)
-    words = ("--calibration", out, "--filter", "kalman", "--no-mag", "--csv", tmp_path / "x.csv")
-    result = command("run", "--file", short, *words)
+    words = ("--calibration", out, "--file", short)
+    result = command("run", *words, "--no-mag", "--csv", tmp_path / "x.csv")
     assert result.returncode == 1
     assert "made with magnetometers: leave --no-mag out" in result.stderr
+    six_axes = read_recording(short)
+    for name, data in six_axes.sensors.items():
+        six_axes.sensors[name] = data._replace(mag=None)
+    write_npz(short, six_axes)
+    for more in (("run", "--model", "rnn", "--csv", os.devnull), ("check",)):
+        result = command(*more, *words)
+        assert "made with magnetometers, and left_forearm, right_forearm, left_lower_leg" in result.stderr
 
 
 # --- live ---------------------------------------------------------------------------------------------------

@@ -75,7 +75,7 @@ def test_files_are_named_against_the_folder_of_the_rig_file(rig, tmp_path):
     assert (flags.outputs.height, flags.outputs.std, flags.no_mag) == (2.0, True, True)
     assert (flags.outputs.leg_length, flags.outputs.body.leg_length_m, flags.no_place) == (1.0, 1.0, True)
     # What is not there is as on the command line.
-    assert (flags.filter, flags.outputs.rotations, flags.source.realtime) == ("none", "axis-angle", False)
+    assert (flags.filter, flags.outputs.rotations, flags.source.realtime) == (None, "axis-angle", False)
     (flags,) = read_rigs([rig("ben")])
     assert (flags.outputs.leg_length, flags.no_place) == (None, False)
 

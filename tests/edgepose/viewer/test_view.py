@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import base64
 import contextlib
-import io
 import json
 import os
 import re
 import select
-import shutil
 import signal
 import socket
 import subprocess
 import sys
 import time
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import click
-import matplotlib.image
 import numpy as np
 import pytest
 import viser
@@ -45,11 +41,7 @@ from edgepose.viewer.path import PIECES, SEGMENTS
 from edgepose.viewer.stream import UdpPoseStream, plain, sensor_table
 from edgepose.viewer.viewer import Viewer
 from tests.support import processes
-
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "chrome"))), None)
-needs_browser = pytest.mark.skipif(
-    CHROMIUM is None, reason="no browser: install Debian's chromium-headless-shell"
-)
+from tests.support.browser import Browser, needs_browser, until
 
 
 def standing(index: int = 0, status: str = "ok") -> PoseFrame:
@@ -66,14 +58,6 @@ def free_port(kind: int = socket.SOCK_STREAM) -> int:
     with socket.socket(socket.AF_INET, kind) as sock:
         sock.bind(("127.0.0.1", 0))
         return sock.getsockname()[1]
-
-
-def until(asked: Callable[[], object], what: str, seconds: float = 60.0) -> None:
-    """Returns once the answer is true."""
-    end = time.monotonic() + seconds
-    while not asked():
-        assert time.monotonic() < end, what
-        time.sleep(0.05)
 
 
 # --- the solids and the text --------------------------------------------------------------------------------
@@ -202,47 +186,6 @@ def test_datagrams_of_both_kinds_are_read(encode):
 
 PLAY = "[...document.querySelectorAll('input[type=checkbox]')].find(box => !box.id.startsWith('mantine'))"
 """The box beside "play" is the only one of ours; the others are viser's."""
-
-
-class Browser:
-    """A page of a headless Chromium, spoken to by its own protocol."""
-
-    def __init__(self, folder: Path) -> None:
-        command = [CHROMIUM, "--no-sandbox", "--headless", "--enable-unsafe-swiftshader", "--disable-gpu"]
-        command += ["--remote-debugging-port=0", "--window-size=800,500", f"--user-data-dir={folder}"]
-        # In a group of its own: Debian's command is a script, and the browser does not end with it.
-        self.process = subprocess.Popen(
-            [*command, "about:blank"], stderr=subprocess.DEVNULL, start_new_session=True
-        )
-        told = folder / "DevToolsActivePort"
-        until(lambda: told.exists() and "\n" in told.read_text(), "the browser")
-        port = told.read_text().splitlines()[0]
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json") as answer:
-            page = next(target for target in json.load(answer) if target["type"] == "page")
-        self.socket = connect(page["webSocketDebuggerUrl"], max_size=None)
-        self._count = 0
-
-    def call(self, method: str, **words: object) -> dict:
-        self._count += 1
-        self.socket.send(json.dumps({"id": self._count, "method": method, "params": words}))
-        while (answer := json.loads(self.socket.recv(timeout=60))).get("id") != self._count:
-            pass
-        return answer["result"]
-
-    def run(self, script: str) -> object:
-        return self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
-
-    def text(self) -> str:
-        return str(self.run("document.body.innerText"))
-
-    def image(self) -> np.ndarray:
-        data = base64.b64decode(self.call("Page.captureScreenshot")["data"])
-        return matplotlib.image.imread(io.BytesIO(data))[..., :3]
-
-    def close(self) -> None:
-        self.socket.close()
-        os.killpg(self.process.pid, signal.SIGKILL)
-        self.process.wait()
 
 
 @pytest.fixture

@@ -1,0 +1,72 @@
+"""Verdict on a calibration: its table, what to do about a bad one, and the next command."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from edgepose.calibration import Calibration, mounting
+from edgepose.cli.calibration_session import Measured
+from edgepose.config import SourceConfig
+from edgepose.placements import PLACEMENTS
+from edgepose.rotations import Array
+
+GOOD_RESIDUAL_DEG, GOOD_HEADING_DEG = 1.0, 15.0
+
+
+class Judgement(NamedTuple):
+    """A word of at most five letters, and a sentence with what to do."""
+
+    word: str
+    text: str
+
+
+def judge(result: Calibration, measured: Measured, warnings: Sequence[str]) -> Judgement:
+    """Judge a calibration by its residuals, the errors of its headings and the warnings about it."""
+    problems = []
+    if swaying := _over(result.residual_deg, GOOD_RESIDUAL_DEG):
+        problems.append(f"{swaying} swayed: stand with your back against a wall, and calibrate again")
+    if measured.reset is not None and (loose := _over(measured.reset.error_deg, GOOD_HEADING_DEG)):
+        problems.append(f"the heading of {loose} is uncertain: repeat, with movements straight ahead")
+    if warnings:
+        problems.append("see the warnings" if len(warnings) > 1 else f"warning: {warnings[0]}")
+    if not problems:
+        return Judgement("GOOD", "The calibration is good.")
+    return Judgement("FAIR", f"The calibration can be used, but {'; '.join(problems)}.")
+
+
+def _over(angle_deg: Array, limit_deg: float) -> str:
+    return ", ".join(
+        f"{PLACEMENTS[i]} ({angle_deg[i]:.1f} deg)" for i in np.flatnonzero(angle_deg > limit_deg)
+    )
+
+
+def next_command(source: SourceConfig, out: str) -> str:
+    """Return the command that uses the calibration."""
+    words = ["edgepose", "run"]
+    for flag in ("file", "port", "baud", "can", "bitrate", "sensors"):
+        value = getattr(source, flag)
+        words += [] if value is None else [f"--{flag}", str(value)]
+    words += [] if source.protocol == "auto" else ["--protocol", source.protocol]
+    words += [f"--{flag}" for flag in ("fd", "realtime") if getattr(source, flag)]
+    words += ["--calibration", out, *(["--view"] if source.live else ["--csv", "poses.csv"])]
+    return shlex.join(words)
+
+
+def table(result: Calibration, measured: Measured) -> str:
+    """Return a row for each sensor, at most 79 columns wide."""
+    summary, reset = measured.summary, measured.reset
+    lines = ["sensor          samples  residual  m/s^2 heading its error  sits"]
+    for i, (name, sits) in enumerate(zip(PLACEMENTS, mounting(result), strict=True)):
+        force = float(np.linalg.norm(summary.force[i]))
+        heading = "-" if reset is None else f"{math.degrees(reset.offset[i]):.1f}"
+        error = "-" if reset is None else f"{reset.error_deg[i]:.1f}"
+        lines.append(
+            f"{name:16}{summary.samples[i]:7d}{result.residual_deg[i]:10.2f}"
+            f"{'-' if math.isnan(force) else f'{force:.2f}':>7}{heading:>8}{error:>10}  {sits}"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,1 @@
+"""Guidance of a wearer through a calibration: on the terminal, and on a page for a phone."""

@@ -1,0 +1,110 @@
+"""Comparison of worn sensors with the calibration of their wearer."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from edgepose.calibration.fit import POSE_TILT_DEG, PoseFit, fit_pose
+from edgepose.calibration.heading_reset import headings_from_pose
+from edgepose.calibration.impossible import ImpossibleBones
+from edgepose.calibration.sensor_to_segment import Calibration, apply_calibration
+from edgepose.diagnostics.sensor_health.columns import QUAT, TIME
+from edgepose.diagnostics.sensor_health.rest import Rest
+from edgepose.diagnostics.sensor_health.sensor import Sensor
+from edgepose.placements import PLACEMENTS
+from edgepose.rotations import Array
+
+_POSE_OFF_DEG = 30.0  # sum over six sensors: accuracy with which a wearer takes the pose again
+_EVERY_S = 0.5  # time between two checks of the bones
+
+
+class WornComparison:
+    """Sensors against a calibration, which knows how they sat in its pose."""
+
+    def __init__(self, calibration: Calibration) -> None:
+        """Create the comparison with the calibration that the wearer should have."""
+        # Devices' own headings differ from those that a filter computed here.
+        self._own_headings = calibration.filter == "none"
+        self._calibration = calibration
+        self._tilts_only = dataclasses.replace(calibration, north=False)
+        self._fit: PoseFit | None = None
+        self._swaps: list[str | None] = [None] * len(PLACEMENTS)
+        self._off_deg = math.inf
+        self._headings: Array | None = None
+        self._bones = ImpossibleBones()
+        self._impossible: dict[str, str] = {}
+        self._next_s = -math.inf
+
+    def compare_pose(self, rests: Sequence[Rest]) -> None:
+        """Compare six sensors at rest, whose wearer stands in the pose, or should."""
+        oriented = all(np.isfinite(rest.quat).all() for rest in rests) and self._own_headings
+        if not oriented and not all(np.linalg.norm(rest.acc) > 0.0 for rest in rests):
+            return
+        calibration = self._calibration if oriented else self._tilts_only
+        quats = np.stack([rest.quat if oriented else level(rest.acc) for rest in rests])
+        fit = fit_pose(calibration, quats)
+        if not fit.off_deg <= self._off_deg + _POSE_OFF_DEG:
+            return  # the wearer has been nearer to the pose before
+        self._off_deg = min(fit.off_deg, self._off_deg)
+        if fit.in_pose and oriented:
+            self._headings = fit.heading_deg
+        self._swaps = [None] * len(PLACEMENTS)
+        if fit.sits_at is not None:
+            self._swaps = [PLACEMENTS[at] if at != i else None for i, at in enumerate(fit.sits_at)]
+        elif fit.in_pose:
+            self._swaps = _swaps(calibration, quats, fit.tilt_deg)
+        self._fit = fit
+
+    def check_bones(self, sensors: Sequence[Sensor]) -> None:
+        """Look for bones in impossible orientations, in the newest rows of six sensors."""
+        windows = [sensor.window for sensor in sensors]
+        if not self._own_headings or not all(len(window) for window in windows):
+            return
+        first_s, last_s = (f(float(w[i, TIME]) for w in windows) for f, i in ((max, 0), (min, -1)))
+        times = np.arange(max(first_s, self._next_s), last_s, _EVERY_S)
+        if not len(times):
+            return
+        self._next_s = float(times[-1]) + _EVERY_S
+        rows = [np.minimum(np.searchsorted(w[:, TIME], times), len(w) - 1) for w in windows]
+        quats = np.stack([w[row, QUAT] for w, row in zip(windows, rows, strict=True)], axis=1)
+        quats = quats[np.abs(np.linalg.norm(quats, axis=-1) - 1.0).max(axis=1) < 0.01]
+        bones, _ = apply_calibration(self._calibration, quats, np.zeros((*quats.shape[:2], 3)))
+        for instant in bones:
+            self._impossible |= self._bones.update(instant, [False] * len(PLACEMENTS), _EVERY_S)
+
+    def result(self) -> list[dict[str, Any]]:
+        """Return fields for the `SensorHealth` of each sensor."""
+        # A sensor that does not fit the pose makes others look impossible, too.
+        impossible = self._impossible if self._fit is None or self._fit.good else {}
+        fields: list[dict[str, Any]] = [{"impossible": impossible.get(name)} for name in PLACEMENTS]
+        for i, of_sensor in enumerate(fields):
+            if self._fit is not None:
+                of_sensor["pose_tilt_deg"] = float(self._fit.tilt_deg[i])
+                of_sensor["in_pose"], of_sensor["swapped_with"] = self._fit.in_pose, self._swaps[i]
+            if self._headings is not None:
+                of_sensor |= {"heading_deg": float(self._headings[i]), "heading_on": "body"}
+        return fields
+
+
+def level(acc: Array) -> Array:
+    """Return a quaternion (4,) that rotates an acceleration (3,) at rest upwards, with any heading."""
+    x, y, z = acc / np.linalg.norm(acc)
+    quat = np.array([1.0 + z, y, -x, 0.0]) if z > -1.0 + 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])
+    return quat / np.linalg.norm(quat)
+
+
+def _swaps(calibration: Calibration, quats: Array, tilt: Array) -> list[str | None]:
+    """Find for each sensor the one with which it must be swapped so that both fit the pose."""
+    result: list[str | None] = [None] * len(PLACEMENTS)
+    for i, j in combinations(np.flatnonzero(tilt > POSE_TILT_DEG), 2):
+        swapped = quats.copy()
+        swapped[[i, j]] = quats[[j, i]]
+        if headings_from_pose(calibration, swapped).error_deg[[i, j]].max() < POSE_TILT_DEG:
+            result[i], result[j] = PLACEMENTS[j], PLACEMENTS[i]
+    return result

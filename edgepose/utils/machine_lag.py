@@ -1,0 +1,45 @@
+"""How late threads get their turn on this machine, which delays whatever they read."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from types import TracebackType
+
+_STEP_S = 0.02
+_KEPT = 500  # of the last 10 s
+
+
+class MachineLag:
+    """Measures, while it is entered, how much later than asked a thread wakes up."""
+
+    def __init__(self) -> None:
+        """Create the measurement; `__enter__` starts it."""
+        self._late_s: deque[float] = deque([0.0], maxlen=_KEPT)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> MachineLag:
+        """Start to measure."""
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop."""
+        self._stop.set()
+        self._thread.join()
+
+    @property
+    def late_ms(self) -> float:
+        """The delay that 95 % of the last waits did not exceed, milliseconds."""
+        late_s = sorted(list(self._late_s))
+        return 1e3 * late_s[int(0.95 * (len(late_s) - 1))]
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            start_s = time.monotonic()
+            self._stop.wait(_STEP_S)
+            self._late_s.append(max(0.0, time.monotonic() - start_s - _STEP_S))
