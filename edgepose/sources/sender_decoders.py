@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from math import inf
 
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
@@ -121,7 +120,8 @@ class SenderDecoders:
                     samples += decoder.feed([datagram], arrival_s)
                 except EdgeposeError as error:
                     self._turn_away(datagram.sender, str(error))
-                if decoder.protocol is None and arrival_s - (decoder.first_s or inf) > UNDECIDED_S:
+                first_s = decoder.first_s
+                if decoder.protocol is None and first_s is not None and arrival_s - first_s > UNDECIDED_S:
                     self._forget(datagram.sender)
         return samples
 

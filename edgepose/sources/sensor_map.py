@@ -175,11 +175,24 @@ def read_map(path: Path) -> SensorMap:
         raise ConfigError(f"{path}: no entry for {', '.join(missing)}; all six sensors need one")
     devices = {name: _device(f"{path}: {name}", content[name]) for name in PLACEMENTS}
     for (other, before), (name, device) in combinations(devices.items(), 2):
-        lines, senders = {device.line, before.line}, {device.sender, before.sender}
-        same_line = (len(lines) == 1 or None in lines) and (len(senders) == 1 or None in senders)
-        if same_line and (device.id == before.id or (len(lines) == 1 and None in (device.id, before.id))):
+        if _same(device, before):
             raise ConfigError(f"{path}: {name} and {other} are the same device; give each its own port or id")
     return SensorMap(str(path), devices, {n: _port(f"{path}: ports.{n}", t) for n, t in tables.items()})
+
+
+def _same(device: Device, other: Device) -> bool:
+    """Return whether two rows may stand for one device."""
+    if {device.sender, other.sender} == {None}:
+        same_line = device.line == other.line or None in (device.line, other.line)
+    elif None not in (device.sender, other.sender) and device.sender != other.sender:
+        return False
+    else:  # only sockets have senders
+        lines = [each.listen for each in (device, other) if each.line is not None]
+        same_line = None not in lines and len(set(lines)) < 2
+    if not same_line:
+        return False
+    sure = device.line == other.line and device.sender == other.sender
+    return device.id == other.id or (sure and None in (device.id, other.id))
 
 
 def _device(where: str, entry: object) -> Device:
