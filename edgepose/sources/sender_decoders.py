@@ -9,7 +9,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.sources import Device, SourceCounters, sum_counters
 from edgepose.sources.line_decoder import Clock, LineDecoder, PlacementById
-from edgepose.sources.protocol_detection import Datagram
+from edgepose.sources.protocol_detection import Datagram, Detector
 from firmware_protocols.base import Protocol
 
 _log = logging.getLogger(__name__)
@@ -47,7 +47,12 @@ class SenderDecoders:
         clock: Callable[[int], Clock],
         placement_owner: dict[int, str],
     ) -> None:
-        """Start without senders; the arguments are those of `LineDecoder`, placements for each sender."""
+        """Start without senders; the arguments are those of `LineDecoder`, placements for each sender.
+
+        Raises:
+            ConfigError: a package for the only protocol is missing.
+        """
+        Detector(name, protocols)  # imports what decoders need now, not when the first datagram comes
         self.name = name
         self.first_s: float | None = None
         self.amount = 0

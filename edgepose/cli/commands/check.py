@@ -247,7 +247,7 @@ _COLUMNS = (
 )
 
 
-_NOTHING = "no packet came from any sensor: switch them on, and check --port or --can, --baud and --protocol"
+_NOTHING = "no packet came from any sensor: switch them on, and check the lines' names, --baud and --protocol"
 
 
 def _lines(state: State, width: int | None) -> list[str]:

@@ -57,7 +57,7 @@ def record(source: SourceConfig, out: str, seconds: float | None, overwrite: boo
     others = source.listen or (source.can if kind == "port" else streams)
     if kind == "port" and (not streams or "," in streams or others):
         raise click.UsageError(
-            f"{out} stores the bytes of one port: give --port PORT, or name it .csv or .npz"
+            f"{out} stores the bytes of one line: give --port or --connect, or name it .csv or .npz"
         )
     if kind == "bus" and (source.can is None or others):
         raise click.UsageError(f"{out} stores the frames of a CAN bus: give --can, or name it .csv or .npz")

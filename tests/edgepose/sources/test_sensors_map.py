@@ -73,7 +73,7 @@ def test_two_hubs_and_a_bus(read):
     assert [protocol.name for protocol in found[2].protocols] == ["native-can"]
     with pytest.raises(
         EdgeposeError,
-        match=r"left_lower_leg: b is not one of the lines given with --port and --can: a, virtual:x",
+        match=r"left_lower_leg: b is not one of the lines given with --port, --can, --listen and --connect: a, virtual:x",
     ):
         line_specs("a", None, "virtual:x", None, False, "auto", rig)
 
