@@ -34,6 +34,10 @@ class Host(Interface):
         """
         ...
 
+    def identity(self, datagram: bytes, tracker: Hashable) -> str:
+        """Return a tracker's own name, such as its MAC address, as it has sent it; "" if it has not."""
+        ...
+
     def due(self, now_s: float) -> list[tuple[Any, bytes]]:
         """Return the messages that are due at a time, seconds, each with the tracker that it is for."""
         ...

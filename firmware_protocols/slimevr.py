@@ -55,6 +55,7 @@ class SlimevrDecoder(Receiver):
         super().__init__()
         self._version = VERSION
         self._calls = 0  # handshakes so far
+        self._mac = ""
         self._last: int | None = None  # number of the last datagram
         self._jumped = False  # it did not follow the one before it
         self._held: BoundedDict[int, Quaternion] = BoundedDict()
@@ -65,8 +66,8 @@ class SlimevrDecoder(Receiver):
         """See `Decoder.refused`: calls without an answer, or accelerations with the axes of the chip."""
         if self._calls > 1 and not self.counters.packets:
             return (
-                "the tracker calls for a server and gets no answer: give --protocol slimevr, and check that "
-                "no firewall stops what is sent to it"
+                f"the tracker {self._mac} calls for a server and gets no answer: give --protocol slimevr, "
+                "and check that no firewall stops what is sent to it"
             )
         if self._version >= VERSION:
             return None
@@ -115,6 +116,7 @@ class SlimevrDecoder(Receiver):
         version = data[_VERSION_AT : _VERSION_AT + 4]
         self._version = int.from_bytes(version, "big") if len(version) == 4 else 0
         self._calls += 1
+        self._mac = mac_of(data)
         self._last = None
         self._held.clear()
         self.counters.skipped += 1
@@ -194,6 +196,15 @@ class SlimevrDecoder(Receiver):
             self._emit(Sample(sensor, None, quat), samples)
 
 
+def mac_of(datagram: bytes) -> str:
+    """Return the MAC address in a handshake, such as "5c:cf:7f:00:00:01"; "" if it is none or has none."""
+    if int.from_bytes(datagram[:4], "big") != _HANDSHAKE or len(datagram) <= _VERSION_AT + 4:
+        return ""
+    at = _VERSION_AT + 5 + datagram[_VERSION_AT + 4]
+    mac = datagram[at : at + 6]
+    return mac.hex(":") if len(mac) == 6 and any(mac) else ""
+
+
 def _scalar_first(xyzw: tuple[float, ...]) -> tuple[float, float, float, float]:
     x, y, z, w = xyzw
     return w, x, y, z
@@ -259,6 +270,7 @@ class SlimevrHost:
     def __init__(self) -> None:
         """Start without trackers."""
         self._trackers: dict[Hashable, list[float]] = {}  # times of last datagram and next keep-alive
+        self._macs: dict[Hashable, str] = {}
         self._next_s = 0.0
 
     def receive(self, datagram: bytes, tracker: Hashable, now_s: float) -> tuple[bool, bytes]:
@@ -273,6 +285,7 @@ class SlimevrHost:
             if not full or (known is None and len(self._trackers) >= MAX_TRACKERS):
                 return False, b""
             self._trackers[tracker] = [now_s, now_s + KEEP_ALIVE_S]
+            self._macs[tracker] = mac_of(datagram)
             self._next_s = min(self._next_s, now_s + KEEP_ALIVE_S)
             return True, ANSWER
         if known is None:
@@ -282,6 +295,10 @@ class SlimevrHost:
             return True, _SENSOR_INFO.to_bytes(4, "big") + datagram[12:14]
         return True, _BUNDLES if kind == _FEATURES else b""
 
+    def identity(self, datagram: bytes, tracker: Hashable) -> str:
+        """See `Host.identity`: the MAC address that is in the handshake."""
+        return mac_of(datagram) or self._macs.get(tracker, "")
+
     def due(self, now_s: float) -> list[tuple[Hashable, bytes]]:
         """See `Host.due`."""
         if now_s < self._next_s:
@@ -289,7 +306,7 @@ class SlimevrHost:
         messages: list[tuple[Hashable, bytes]] = []
         for tracker, (heard_s, due_s) in list(self._trackers.items()):
             if now_s - heard_s > GONE_S:
-                del self._trackers[tracker]
+                del self._trackers[tracker], self._macs[tracker]
             elif now_s >= due_s:
                 self._trackers[tracker][1] = now_s + KEEP_ALIVE_S
                 messages.append((tracker, _ALIVE))

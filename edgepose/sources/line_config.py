@@ -185,7 +185,7 @@ def udp_line(
         name: address to listen on, HOST:PORT.
         protocol: name of a protocol, or "auto".
         placements: map of ids to placements, given the protocol and a sender.
-        senders: IP addresses of the sensors; None if any may be one.
+        senders: IP and MAC addresses of the sensors; None if any may be one.
 
     Raises:
         ConfigError: no such protocol, an invalid address, or sensors without a placement.

@@ -20,7 +20,7 @@ Transport = Literal["bytes", "can", "udp"]
 
 
 class Datagram(NamedTuple):
-    """A UDP datagram, and the IP address of its sender."""
+    """A UDP datagram, and the IP address of its sender, or the name that it gives itself."""
 
     sender: str
     data: bytes

@@ -24,7 +24,7 @@ UNDECIDED_S = 3.0
 """Time after which a sender whose protocol is not clear is listened to afresh, seconds."""
 
 SenderPlacements = Callable[[str], Callable[[Protocol], PlacementById] | None]
-"""Map of ids to placements for a sender's IP address, see `LineDecoder`; None if it is not a sensor's."""
+"""Map of ids to placements for a sender's address, see `LineDecoder`; None if it is not a sensor's."""
 
 
 class SenderDecoders:

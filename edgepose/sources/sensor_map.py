@@ -21,6 +21,7 @@ LINES = ("port", "can", "listen", "connect")
 
 _DIRECTION = "(left|right|up|down|forward|back)"
 _MOUNTING = re.compile(f"x {_DIRECTION}, z {_DIRECTION}")
+_MAC = re.compile("[0-9A-Fa-f]{2}(:[0-9A-Fa-f]{2}){5}")
 _AXIS = {"left": 0, "right": 0, "up": 1, "down": 1, "forward": 2, "back": 2}
 
 
@@ -32,7 +33,7 @@ class Device(NamedTuple):
         can: its bus, INTERFACE:CHANNEL or the channel alone; None for any line.
         listen: the address at which its datagrams arrive, HOST:PORT; None for any line.
         connect: its address for TCP, HOST:PORT; None for any line.
-        sender: IP address from which its datagrams come; None for any.
+        sender: IP address from which its datagrams come, or the MAC address that they state; None for any.
         id: its id on the line; None if it is the only device there.
         mounting: orientation in which it is worn, in the format of `edgepose calibrate`.
     """
@@ -99,7 +100,7 @@ class SensorMap(NamedTuple):
         }
 
     def senders(self, line: str) -> frozenset[str] | None:
-        """Return the IP addresses that may send to a socket; None for any."""
+        """Return the IP and MAC addresses that may send to a socket; None for any."""
         senders = [device.sender for device in self.devices.values() if device.line in (None, line)]
         return None if None in senders else frozenset(map(str, senders))
 
@@ -211,7 +212,7 @@ def _device(where: str, entry: object) -> Device:
     if device.sender is not None:
         if given not in ([], ["listen"]):
             raise ConfigError(f"{where}: sender is for datagrams; it does not go with {given[0]}")
-        device = device._replace(sender=_ip_address(where, device.sender))
+        device = device._replace(sender=_sender(where, device.sender))
     if device.mounting is not None:
         words = _MOUNTING.fullmatch(device.mounting)
         if words is None or _AXIS[words[1]] == _AXIS[words[2]]:
@@ -222,12 +223,14 @@ def _device(where: str, entry: object) -> Device:
     return device
 
 
-def _ip_address(where: str, text: str) -> str:
-    """Return an IP address as the system writes it."""
+def _sender(where: str, text: str) -> str:
+    """Return an IP address as the system writes it, or a MAC address in lower case."""
+    if _MAC.fullmatch(text):
+        return text.lower()
     try:
         return str(ip_address(text))
     except ValueError:
-        raise ConfigError(f"{where}: sender must be an IP address, not {text!r}") from None
+        raise ConfigError(f"{where}: sender must be an IP address or a MAC address, not {text!r}") from None
 
 
 def _port(where: str, entry: object) -> PortSettings:

@@ -40,7 +40,7 @@ class UdpSocket:
             host: address of this machine to listen on.
             port: UDP port.
             trackers: host that answers the senders, if they need one.
-            senders: IP addresses that are answered; None for all.
+            senders: IP addresses, and names that senders give themselves, that are answered; None for all.
 
         Raises:
             DeviceError: the address does not belong to this machine, or the port is in use.
@@ -76,23 +76,28 @@ class UdpSocket:
                 if not datagrams:
                     raise LineDisconnectedError from None
                 break
-            sender = address[0].removeprefix("::ffff:")
-            if self._trackers is None or self._wanted(data, sender, address):
+            sender: str | None = address[0].removeprefix("::ffff:")
+            if self._trackers is not None and sender is not None:
+                sender = self._answer(data, sender, address)
+            if sender is not None:
                 datagrams.append(Datagram(sender, data if len(data) <= LONGEST else b""))
         if self._trackers is not None:
             for address, message in self._trackers.due(time.monotonic()):
                 self._send(message, address)
         return datagrams, more
 
-    def _wanted(self, data: bytes, sender: str, address: Any) -> bool:
-        """Answer a datagram, and return whether it is for the decoder."""
+    def _answer(self, data: bytes, sender: str, address: Any) -> str | None:
+        """Answer a datagram, and return its sender; None if it is not for the decoder."""
         assert self._trackers is not None
         if self._senders is not None and sender not in self._senders:
-            return True
+            identity = self._trackers.identity(data, address)
+            if identity not in self._senders:
+                return sender
+            sender = identity
         wanted, answer = self._trackers.receive(data, address, time.monotonic())
         if answer:
             self._send(answer, address)
-        return wanted
+        return sender if wanted else None
 
     def _send(self, message: bytes, address: Any) -> None:
         with suppress(OSError):  # a message that is lost on the way is not reported either

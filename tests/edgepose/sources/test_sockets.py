@@ -120,6 +120,30 @@ def test_six_senders_to_one_address(name, protocol, blocking, address, by_sender
         assert each.acc == pytest.approx((0.1, 0.2, 9.81), abs=0.01)
 
 
+def test_trackers_are_known_by_their_mac_addresses(address, tmp_path, caplog):
+    """Whatever address the router gives them; another tracker gets no answer."""
+    rig = tmp_path / "rig.toml"
+    macs = [f"02:00:00:00:00:{5 - i:02X}" for i in range(5)] + ["02:00:00:00:00:77"]
+    rig.write_text(
+        "".join(f'{n} = {{ sender = "{mac}" }}\n' for n, mac in zip(PLACEMENTS, macs, strict=True))
+    )
+    with (
+        open_source(listen=address, protocol="slimevr", sensors=rig) as source,
+        sensors("slimevr", address) as trackers,
+    ):
+        seen = 0
+        for batch in source:
+            seen += len(batch.samples)
+            if len(source.devices) == 5 and caplog.records:
+                break
+        connected = [line._heard_s > 0.0 for line in trackers.lines]
+    assert str(source.devices[0]) == f"slimevr id 0 on {address} from 02:00:00:00:00:05"
+    assert set(source.devices) == set(range(5))
+    assert seen >= 5
+    assert connected == [False, *[True] * 5]
+    assert "ignoring datagrams from 127.0.0.11: it is not in the sensor map" in caplog.text
+
+
 def decoders(protocols, placements, owner=None):
     clocks = []
 
@@ -354,7 +378,7 @@ def test_names(flags, message):
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ('{ sender = "sensor7" }', "pelvis: sender must be an IP address, not 'sensor7'"),
+        ('{ sender = "sensor7" }', "pelvis: sender must be an IP address or a MAC address, not 'sensor7'"),
         ('{ port = "a", sender = "1.2.3.4" }', "pelvis: sender is for datagrams; it does not go with port"),
         ('{ port = "a", listen = "1.2.3.4:5" }', "pelvis: give port or listen, not both"),
         (f'{{ sender = "{SENDERS[0]}" }}', "pelvis and left_forearm are the same device"),
