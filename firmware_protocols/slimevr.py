@@ -66,8 +66,8 @@ class SlimevrDecoder(Receiver):
         """See `Decoder.refused`: calls without an answer, or accelerations with the axes of the chip."""
         if self._calls > 1 and not self.counters.packets:
             return (
-                f"the tracker {self._mac} calls for a server and gets no answer: give --protocol slimevr, "
-                "and check that no firewall stops what is sent to it"
+                f"the tracker {self._mac} calls and gets no answer: give --protocol slimevr, or check the "
+                "firewall"
             )
         if self._version >= VERSION:
             return None
