@@ -1,11 +1,9 @@
 """Sensors in the network: datagrams of several senders, trackers that want an answer, TCP connections."""
 
 import logging
-import runpy
 import socket
 import struct
 import threading
-from pathlib import Path
 
 import pytest
 
@@ -22,8 +20,8 @@ from firmware_protocols.registry import PROTOCOLS
 from firmware_protocols.sample import Sample
 from tests.support.datagrams import free_address
 from tests.support.ports import Sender
+from tools.simulate_network import DatagramLine, SlimevrTracker, TcpServer, network_line
 
-LINES = runpy.run_path(str(Path(__file__).parents[3] / "tools" / "simulate_network.py"))
 QUAT = (0.6, 0.0, 0.8, 0.0)
 SENDERS = [f"127.0.0.{11 + i}" for i in range(6)]
 BY_SENDER = "".join(
@@ -62,7 +60,7 @@ class Sensors(Sender):
 
     def send(self, k):
         for line in self.lines:
-            if isinstance(line, LINES["SlimevrTracker"] | LINES["TcpServer"]):
+            if isinstance(line, SlimevrTracker | TcpServer):
                 line.receive()
         for i in range(6):
             line = i % len(self.lines)
@@ -76,7 +74,7 @@ class Sensors(Sender):
 
 def sensors(name, address):
     host, _, port = address.rpartition(":")
-    make = LINES["network_line"](host, int(port), name)
+    make = network_line(host, int(port), name)
     return Sensors(name, [make(i) for i in range(6)])
 
 
@@ -287,7 +285,7 @@ def test_more_than_can_be_read_stays_with_the_system(address):
 
 
 def test_six_connections_one_of_which_breaks(caplog):
-    servers = [LINES["TcpServer"]("127.0.0.1") for _ in range(6)]
+    servers = [TcpServer("127.0.0.1") for _ in range(6)]
     names = ",".join(server.name for server in servers)
     with open_source(connect=names, protocol="ximu3") as source, Sensors("ximu3", servers):
         batches = iter(source)
@@ -314,11 +312,11 @@ def test_the_vendors_library_reads_the_simulated_devices(tcp):
     """What is tried here without devices is what x-io's own library takes for an x-IMU3."""
     ximu3 = pytest.importorskip("ximu3")
     if tcp:
-        line = LINES["TcpServer"]("127.0.0.1")
+        line = TcpServer("127.0.0.1")
         config = ximu3.TcpConnectionConfig("127.0.0.1", int(line.name.rpartition(":")[2]))
     else:
         port = int(free_address(socket.SOCK_DGRAM).rpartition(":")[2])
-        line = LINES["DatagramLine"]("127.0.0.1", port, 0)
+        line = DatagramLine("127.0.0.1", port, 0)
         config = ximu3.UdpConnectionConfig("127.0.0.11", 9000, port)
     connection = ximu3.Connection(config)
     messages, errors, ready = [], [], threading.Event()
