@@ -1,5 +1,6 @@
 """SlimeVR trackers: packets that the vendor's own library made, bundles, and the talk with a host."""
 
+import random
 import struct
 
 import pytest
@@ -152,6 +153,22 @@ def test_a_host_answers_few_strangers_and_no_short_calls():
     answers = [host.receive(call, number, 0.0)[1] for number in range(200)]
     assert sum(map(bool, answers)) == slimevr.MAX_TRACKERS
     assert host.receive(call, 0, 1.0)[1]  # those that it knows are answered again
+
+
+def test_no_datagram_upsets_a_host():
+    rng = random.Random(5)
+    host = SlimevrHost()
+    whole = [bytes.fromhex(text) for text in (HANDSHAKE, FEATURES, SENSOR_INFO, ROTATION)]
+    for k in range(3000):
+        datagram = bytearray(rng.choice(whole))
+        datagram[rng.randrange(len(datagram))] = rng.randrange(256)
+        data = bytes(datagram[: rng.randrange(len(datagram) + 1)])
+        wanted, answer = host.receive(data, rng.randrange(100), k / 100)
+        assert isinstance(wanted, bool)
+        assert len(answer) <= max(64, len(data))
+        assert len(host.identity(data, k % 100)) in (0, 17)
+        assert len(host.due(k / 100)) <= slimevr.MAX_TRACKERS
+    assert host.due(1000.0) == []
 
 
 def test_calls_without_an_answer_are_reported():
