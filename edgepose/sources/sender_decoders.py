@@ -115,7 +115,8 @@ class SenderDecoders:
             self.first_s = arrival_s
         samples: list[ImuSample] = []
         for datagram in chunk:
-            decoder = self._decoders.get(datagram.sender) or self._new_decoder(datagram.sender)
+            sender = datagram.sender
+            decoder = self._decoders.get(sender) or self._new_decoder(sender, arrival_s)
             if decoder is None:
                 self._ignored += 1
             elif not datagram.data:  # empty, or too long
@@ -124,14 +125,16 @@ class SenderDecoders:
                 try:
                     samples += decoder.feed([datagram], arrival_s)
                 except EdgeposeError as error:
-                    self._turn_away(datagram.sender, str(error))
-                first_s = decoder.first_s
-                if decoder.protocol is None and first_s is not None and arrival_s - first_s > UNDECIDED_S:
-                    self._forget(datagram.sender)
+                    self._turn_away(sender, str(error))
+                if decoder.protocol is None and _is_old(decoder, arrival_s):
+                    self._forget(sender)
         return samples
 
-    def _new_decoder(self, sender: str) -> LineDecoder | None:
-        """Return the decoder of a sender without one; None, and name it once, if it cannot be used."""
+    def _new_decoder(self, sender: str, arrival_s: float) -> LineDecoder | None:
+        """Return the decoder of a sender without one; None, and name it once, if it cannot be used.
+
+        New decoders are costly. A flood of senders therefore gets few of them, and none of those in use.
+        """
         if sender in self._turned_away:
             return None
         placements = self._placements(sender)
@@ -139,11 +142,12 @@ class SenderDecoders:
             self._turn_away(sender, "it is not in the sensor map")
             return None
         if len(self._decoders) >= MOST_SENDERS:
-            idle = next((s for s, decoder in self._decoders.items() if not decoder.counters.packets), None)
-            if idle is None:
-                self._turn_away(sender, f"there are {MOST_SENDERS} others already")
+            useless = [
+                s for s, d in self._decoders.items() if not d.counters.packets and _is_old(d, arrival_s)
+            ]
+            if not useless:
                 return None
-            self._forget(idle)
+            self._forget(useless[0])
         name = f"{self.name} from {sender}"
         try:
             decoder = LineDecoder(name, self._protocols, placements, self._clock, self._placement_owner)
@@ -168,3 +172,8 @@ class SenderDecoders:
         if decoder is not None:
             self._forgotten = sum_counters([self._forgotten, decoder.counters])
             self._bad += decoder.amount if decoder.protocol is None else 0
+
+
+def _is_old(decoder: LineDecoder, now_s: float) -> bool:
+    """Return whether a decoder has had time enough to find its protocol."""
+    return decoder.first_s is not None and now_s - decoder.first_s > UNDECIDED_S
