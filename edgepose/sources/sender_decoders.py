@@ -115,12 +115,13 @@ class SenderDecoders:
             self.first_s = arrival_s
         samples: list[ImuSample] = []
         for datagram in chunk:
+            if not datagram.data:  # empty, or too long
+                self._bad += 1
+                continue
             sender = datagram.sender
             decoder = self._decoders.get(sender) or self._new_decoder(sender, arrival_s)
             if decoder is None:
                 self._ignored += 1
-            elif not datagram.data:  # empty, or too long
-                self._bad += 1
             else:
                 try:
                     samples += decoder.feed([datagram], arrival_s)
@@ -167,13 +168,16 @@ class SenderDecoders:
             _log.warning("%s: ignoring datagrams from more senders, without naming them", self.name)
 
     def _forget(self, sender: str) -> None:
-        """Drop a sender's decoder, and keep its counts."""
+        """Drop a sender's decoder, keep its counts, and free its placements."""
         decoder = self._decoders.pop(sender, None)
         if decoder is not None:
             self._forgotten = sum_counters([self._forgotten, decoder.counters])
             self._bad += decoder.amount if decoder.protocol is None else 0
+            for placement in decoder.devices:
+                if self._placement_owner.get(placement) == decoder.name:
+                    del self._placement_owner[placement]
 
 
 def _is_old(decoder: LineDecoder, now_s: float) -> bool:
     """Return whether a decoder has had time enough to find its protocol."""
-    return decoder.first_s is not None and now_s - decoder.first_s > UNDECIDED_S
+    return decoder.first_s is None or now_s - decoder.first_s > UNDECIDED_S

@@ -202,6 +202,14 @@ def test_two_senders_with_one_id_cost_only_the_second(caplog):
     )
 
 
+def test_a_sender_that_is_turned_away_frees_its_placements():
+    got = decoders([PROTOCOLS["native"]], lambda sender: lambda found: {0: 0, 1: 1})
+    for sender, i, k in (("a", 0, 0), ("b", 1, 0), ("b", 0, 1)):
+        got.feed([Datagram(sender, native(i, k))], 0.1 * k)
+    assert set(got.devices) == {0}  # b is gone, for it claimed what is a's
+    assert len(got.feed([Datagram("c", native(1, 0))], 0.3)) == 1
+
+
 def test_a_flood_of_senders_stays_bounded(caplog):
     caplog.set_level(logging.WARNING)
     got = decoders(AUTO, lambda sender: lambda found: {0: 0, 1: 1})
