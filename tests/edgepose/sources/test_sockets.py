@@ -7,7 +7,9 @@ import threading
 
 import pytest
 
-from edgepose.errors import ConfigError, DeviceError
+from edgepose.cli.conflicts import check_lines
+from edgepose.config import WearerConfig
+from edgepose.errors import ConfigError, DeviceError, EdgeposeError
 from edgepose.placements import PLACEMENTS
 from edgepose.sources import open_source
 from edgepose.sources.clock_sync import HostClocks
@@ -429,3 +431,16 @@ def test_lines_that_only_the_map_names(tmp_path):
 def test_senders_without_a_socket(by_sender):
     with pytest.raises(ConfigError, match=r"nothing listens for the datagrams of 127.0.0.11; give --listen"):
         line_specs("/dev/ttyUSB0", sensor_map=read_map(by_sender))
+
+
+def test_rig_files_name_addresses(tmp_path):
+    for name, line in (("anna", "listen"), ("ben", "listen"), ("cleo", "connect")):
+        (tmp_path / f"{name}.toml").write_text(
+            f'{line} = "127.0.0.1:9000"\nprotocol = "native"\ncalibration = "c.json"\ncsv = "{name}.csv"\n'
+        )
+    anna, ben, cleo = (WearerConfig.from_toml(tmp_path / f"{name}.toml") for name in ("anna", "ben", "cleo"))
+    assert anna.source.listen == cleo.source.connect == anna.source.name == "127.0.0.1:9000"
+    assert anna.source.live
+    with pytest.raises(EdgeposeError, match=r"both use the address 127.0.0.1:9000; give each its own"):
+        check_lines([anna, ben])
+    check_lines([anna, cleo])
