@@ -25,7 +25,10 @@ from edgepose.utils.sockets import parse_host_and_port
 from edgepose.utils.text_files import read_toml
 
 ANY_OUTPUT = "give at least one output, such as --csv FILE, --udp HOST:PORT or --view"
-ONE_SOURCE = "give one source: --port PORT, --can INTERFACE:CHANNEL or --file PATH"
+ONE_SOURCE = (
+    "give one source: --port PORT, --can INTERFACE:CHANNEL, --listen HOST:PORT, --connect HOST:PORT "
+    "or --file PATH"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +45,8 @@ class SourceConfig:
         realtime: replay the file at its own pace.
         protocol: name of a wire format, a TOML file that describes text lines, or "auto".
         sensors: TOML file that maps devices to placements.
+        listen: addresses of this machine to receive datagrams on, HOST:PORT, separated by commas.
+        connect: devices to connect to over TCP, HOST:PORT, separated by commas.
     """
 
     port: str | None = None
@@ -53,6 +58,8 @@ class SourceConfig:
     realtime: bool = False
     protocol: str = "auto"
     sensors: Path | None = None
+    listen: str | None = None
+    connect: str | None = None
 
     def __post_init__(self) -> None:
         """Raise ConfigError unless the fields name exactly one source and are in their ranges."""
@@ -63,7 +70,7 @@ class SourceConfig:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ConfigError(f"{name}: {value} is not in the range x>=1")
-        lines = self.port is not None or self.can is not None
+        lines = any(name is not None for name in self.lines)
         if (self.file is not None and lines) or not (lines or self.file or self.sensors):
             raise ConfigError(ONE_SOURCE)
 
@@ -73,11 +80,14 @@ class SourceConfig:
         return self.file is None or self.realtime
 
     @property
+    def lines(self) -> tuple[str | None, ...]:
+        """Names of the live lines, by kind."""
+        return self.port, self.can, self.listen, self.connect
+
+    @property
     def name(self) -> str:
         """Name of the source for messages and metadata."""
-        return ",".join(
-            str(name) for name in (self.file, self.port, self.can, self.sensors) if name is not None
-        )
+        return ",".join(str(name) for name in (self.file, *self.lines, self.sensors) if name is not None)
 
     def arguments(self) -> dict[str, Any]:
         """Return the arguments for `edgepose.sources.open_source`."""
@@ -316,6 +326,8 @@ _KEYS = {
     "realtime": _SWITCH,
     "protocol": _TEXT,
     "sensors": _TEXT,
+    "listen": _TEXT,
+    "connect": _TEXT,
     "filter": _TEXT,
     "no-mag": _SWITCH,
     "calibration": _TEXT,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Literal
@@ -16,6 +16,31 @@ Frame = tuple[int, bytes, bool, bool]
 
 Encode = Callable[[Sample, int], Any]
 """Encodes a sample, given the number of samples its sensor sent before: bytes, or a list of Frames on CAN."""
+
+
+class Host(Interface):
+    """The side that trackers over UDP call for before they send anything.
+
+    Trackers are told apart by any hashable value, such as their socket addresses.
+    """
+
+    def receive(self, datagram: bytes, tracker: Hashable, now_s: float) -> tuple[bool, bytes]:
+        """Return whether a datagram is for the decoder, and the answer to it, empty if there is none.
+
+        Args:
+            datagram: what came.
+            tracker: who sent it.
+            now_s: time, seconds.
+        """
+        ...
+
+    def identity(self, datagram: bytes, tracker: Hashable) -> str:
+        """Return a tracker's own name, such as its MAC address, as it has sent it; "" if it has not."""
+        ...
+
+    def due(self, now_s: float) -> list[tuple[Any, bytes]]:
+        """Return the messages that are due at a time, seconds, each with the tracker that it is for."""
+        ...
 
 
 class DeviceInfo(Interface):
@@ -49,7 +74,12 @@ class Decoder(ABC):
         """Return the samples completed by the next input, in order of arrival.
 
         Byte streams: `feed(data: bytes)`. CAN: `feed(can_id: int, data: bytes, extended: bool = False)`.
+        Formats that exist over UDP only: `feed(data: bytes)`, one datagram at a time.
         """
+
+    def feed_datagram(self, data: bytes) -> list[Sample]:
+        """Return the samples completed by a datagram; formats whose packets end there override it."""
+        return self.feed(data)
 
     def flush(self) -> list[Sample]:
         """Return the samples still held back at the end of a recording; by default there are none."""
@@ -67,8 +97,9 @@ class Protocol:
 
     Attributes:
         name: the name that users type.
-        transport: "bytes" on a serial line or frames on a "can" bus.
-        default_bitrate: usual baud or bit rate of the devices as delivered, bit/s.
+        transport: "bytes" on a serial line, over TCP or in datagrams, frames on a "can" bus, or "udp" if the
+            format exists in datagrams only.
+        default_bitrate: usual baud or bit rate of the devices as delivered, bit/s; 0 for "udp".
         description: one line that describes the sensors and the format.
         decoder: creates a decoder. Two protocols may share one and then differ by name only: detection
             reports the first of them.
@@ -80,13 +111,14 @@ class Protocol:
             with a heading of its own.
         request: for devices that send only on request: returns the request for one sample of the device with
             an id, and the length of the answer in bytes.
+        host: for trackers over UDP that send only to a host that answers them: creates it.
         lacks: what its samples never have: "time", "quat", "acc".
         setup: what a device must be set to, as text for users; empty if it is right as delivered.
         page: its page in `docs/`, without ".md"; by default its name.
     """
 
     name: str
-    transport: Literal["bytes", "can"]
+    transport: Literal["bytes", "can", "udp"]
     default_bitrate: int
     description: str
     decoder: Callable[[], Decoder]
@@ -95,6 +127,7 @@ class Protocol:
     single_device: bool = False
     common_heading: bool = True
     request: Callable[[int], tuple[bytes, int]] | None = None
+    host: Callable[[], Host] | None = None
     lacks: Sequence[Literal["time", "quat", "acc"]] = ()
     setup: str = ""
     page: str = ""
@@ -116,7 +149,7 @@ class Protocol:
 
 
 def uncounted(encode: Callable[[Sample], bytes]) -> Callable[[], Encode]:
-    """Return the `Protocol.encoder` of a serial format without a sample counter."""
+    """Return the `Protocol.encoder` of a format in bytes without a sample counter."""
     return lambda: lambda sample, seq: encode(sample)
 
 

@@ -34,6 +34,7 @@ BUILT_IN = {
     "witmotion-modbus": "witmotion_modbus:PROTOCOL",
     "witmotion-can": "witmotion_can:PROTOCOL",
     "ximu3": "ximu3:PROTOCOL",
+    "slimevr": "slimevr:PROTOCOL",
     "haritorax": "haritorax:PROTOCOL",
     "lpms": "lpms:PROTOCOL",
     "bno08x-rvc": "bno08x:PROTOCOL",

@@ -103,6 +103,10 @@ class TextDecoder(Receiver):
         self._rest = rest[-MAX_LINE:]
         return samples
 
+    def feed_datagram(self, data: bytes) -> list[Sample]:
+        """Return the samples of a datagram, whose end is the end of a line."""
+        return self.feed(data if data.endswith((b"\n", b"\r")) else data + b"\n")
+
     def _line(self, line: str) -> Sample | None:
         self._line_number += 1
         # `feed` passes a line that is too long as an empty one.

@@ -58,7 +58,7 @@ def microseconds(protocol: Protocol, packets: list[Any]) -> float:
         feed = decoder.feed
         count = 0
         start = time.perf_counter()
-        if protocol.transport == "bytes":
+        if protocol.transport != "can":
             for wire in packets:
                 count += len(feed(wire))
         else:
@@ -72,7 +72,7 @@ def microseconds(protocol: Protocol, packets: list[Any]) -> float:
 
 def line_bits(protocol: Protocol, packets: list[Any]) -> float:
     """Return the bits per sample on the line: 8N1, or CAN frames before stuffing."""
-    if protocol.transport == "bytes":
+    if protocol.transport != "can":
         return 10 * sum(map(len, packets)) / SAMPLES
     return sum(CAN_BITS[extended] + 8 * len(data) for _, data, extended, _ in chain(*packets)) / SAMPLES
 

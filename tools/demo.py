@@ -176,7 +176,7 @@ def report(begin: float, end: float, listener: Listener, truth: Truth, out: Path
 )
 @click.option(
     "--protocol",
-    type=click.Choice(list(PROTOCOLS)),
+    type=click.Choice([name for name, each in PROTOCOLS.items() if each.transport != "udp"]),
     default="native",
     show_default=True,
     help="Wire format of the sensors.",

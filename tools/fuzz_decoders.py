@@ -90,7 +90,7 @@ class Sender:
         """Create the encoder."""
         self._encode = protocol.encoder()
         self._ids = [0] if protocol.single_device else list(protocol.ids)
-        self._bytes = protocol.transport == "bytes"
+        self._bytes = protocol.transport != "can"
         self._count = 0
 
     def round(self) -> list[list[Any]]:
@@ -155,7 +155,7 @@ def foreign_frame(rng: random.Random, used: set[tuple[int, bool]]) -> Any:
 
 def noise(rng: random.Random, protocol: Protocol, pieces: list[list[Any]]) -> Iterator[Any]:
     """Yield random input: arbitrary bytes, bytes that occur in the format, or arbitrary frames."""
-    if protocol.transport == "bytes":
+    if protocol.transport != "can":
         alphabet = b"".join(chain.from_iterable(pieces[:20]))
         for _ in range(10):
             yield rng.randbytes(rng.randint(1, 300))
@@ -201,11 +201,12 @@ def damaged(rng: random.Random, protocol: Protocol, pieces: list[list[Any]]) -> 
 class Feeder:
     """Feeds a decoder in pieces of random size and records the longest time per byte."""
 
-    def __init__(self, decoder: Decoder, rng: random.Random) -> None:
-        """Wrap a decoder; `rng` chooses the sizes of the pieces."""
+    def __init__(self, protocol: Protocol, rng: random.Random) -> None:
+        """Create a decoder; `rng` chooses the sizes of the pieces."""
         self.fed = 0
         self.slowest_us = 0.0
-        self._decoder = decoder
+        self._decoder: Decoder = protocol.decoder()
+        self._datagrams = protocol.transport == "udp"
         self._rng = rng
 
     def feed(self, pieces: list[Any]) -> list[Sample]:
@@ -217,8 +218,12 @@ class Feeder:
             for can_id, data, extended, _ in pieces:
                 result += self._timed(len(data), can_id, data, extended)
             return result
-        stream = b"".join(pieces)
         result = []
+        if self._datagrams:
+            for piece in pieces:
+                result += self._timed(len(piece), piece)
+            return result
+        stream = b"".join(pieces)
         at = 0
         while at < len(stream):
             size = self._rng.choice((1, 7, 64, 1024, 4096))
@@ -240,7 +245,7 @@ def fuzz(protocol: Protocol, size: int, seed: int) -> Result:
     """Feed at least `size` bytes to a new decoder: rounds of damaged packets, with noise between them."""
     rng = random.Random(seed)
     sender = Sender(protocol)
-    feeder = Feeder(protocol.decoder(), rng)
+    feeder = Feeder(protocol, rng)
     first = list(chain.from_iterable(sender.round()[:REST]))  # with the header, if the format has one
     feeder.feed(first)
     judged = missed = held = rounds = 0
@@ -276,7 +281,7 @@ def held_bytes() -> int:
 
 def expected(protocol: Protocol, first: list[Any], pieces: list[list[Any]]) -> set[int]:
     """Return the numbers of the samples that come out of an undamaged round."""
-    feeder = Feeder(protocol.decoder(), random.Random(0))
+    feeder = Feeder(protocol, random.Random(0))
     feeder.feed(first)
     return {number_of(sample) for sample in feeder.feed(list(chain.from_iterable(pieces)))}
 

@@ -132,7 +132,7 @@ def line_ids(protocol: Protocol) -> list[int]:
         packet = encode(
             Sample(sensor, 10_000 * number, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 9.81), (0.0,) * 3), number
         )
-        for words in [[packet]] if protocol.transport == "bytes" else [frame[:3] for frame in packet]:
+        for words in [[packet]] if protocol.transport != "can" else [frame[:3] for frame in packet]:
             found |= {sample.sensor for sample in decoder.feed(*words)}
     return list(protocol.ids) if found == set(protocol.ids) and found else [0]
 
@@ -215,10 +215,12 @@ def pose_kinds(folder: Path, recording: Path, run: Run) -> Iterator[Kind]:
 def wire_kinds(folder: Path, recording: Recording) -> Iterator[Kind]:
     """Yield captures and logs of all protocols, and logs of all kinds."""
     for name, protocol in PROTOCOLS.items():
+        if protocol.transport == "udp":  # no file holds datagrams
+            continue
         (folder / f"{name}.toml").write_text(id_map(line_ids(protocol)))
         sensors = f" --sensors {{seeds}}/{name}.toml"
         more = f"{sensors} --protocol {name}"
-        if protocol.transport == "bytes":
+        if protocol.transport != "can":
             inside = folder / name
             inside.mkdir()
             write_capture(inside / "walk.bin", protocol, recording)

@@ -40,8 +40,8 @@ def _row(protocol: Protocol) -> Sequence[str]:
     return (
         protocol.description,
         f"[`{protocol.name}`]({page})",
-        "serial" if protocol.transport == "bytes" else "CAN",
-        str(protocol.default_bitrate),
+        {"bytes": "serial", "can": "CAN", "udp": "UDP"}[protocol.transport],
+        str(protocol.default_bitrate or "-"),
         _first_id(protocol),
         protocol.setup or "-",
     )

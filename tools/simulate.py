@@ -6,12 +6,16 @@
     simulate.py walk.bvh --protocol xsens             six ptys with one device each
     simulate.py walk.bvh --protocol native-can        CAN frames of a slcan adapter on a pty
     simulate.py walk.bvh --protocol native-can --can socketcan:can0
+    simulate.py walk.bvh --udp 127.0.0.1:9000         native packets in datagrams, from one sender
+    simulate.py walk.bvh --protocol slimevr --udp 127.0.0.1:6969    six SlimeVR trackers
+    simulate.py walk.bvh --protocol ximu3 --tcp 127.0.0.1    six devices with a TCP server each
     simulate.py walk.bvh --exercises --mounting 7 --raw 6    sensors without a filter at random angles
 
-Prints `port NAME[,NAME...]` for use with --port (or `can NAME` for --can), `started UNIX_TIME` and `ended
-UNIX_TIME`. Before a clip, the wearer stands straight for 6 s. Sensors have the noise of a data sheet;
-with --ideal only while they rest before and after the recording. Ends at Ctrl-C, or when standard input
-closes and the recording, if it has started, is over.
+Prints `port NAME[,NAME...]` for use with --port (or `can NAME` for --can, `listen ADDRESS` for --listen,
+`connect ADDRESS[,ADDRESS...]` for --connect), `senders ADDRESS,...` if there are several, `started UNIX_TIME`
+and `ended UNIX_TIME`. Before a clip, the wearer stands straight for 6 s. Sensors have the noise of a data
+sheet; with --ideal only while they rest before and after the recording. Ends at Ctrl-C, or when standard
+input closes and the recording, if it has started, is over.
 """
 
 from __future__ import annotations
@@ -32,6 +36,7 @@ from typing import Any, NamedTuple, Protocol
 import can
 import click
 import numpy as np
+from simulate_network import DatagramLine, TcpServer, network_line
 
 from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.npz import write_npz
@@ -39,6 +44,7 @@ from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import Recording, SensorData
 from edgepose.placements import PLACEMENTS
 from edgepose.skeleton import default_body
+from edgepose.utils.sockets import parse_host_and_port
 from firmware_protocols.registry import PROTOCOLS, Frame
 from firmware_protocols.registry import Protocol as Format
 from firmware_protocols.rotation import rotate_back
@@ -199,9 +205,15 @@ def with_noise(sample: Sample, rng: random.Random) -> Sample:
 
 
 class Line(Protocol):
-    """A line that packets are sent over."""
+    """A line that packets are sent over.
+
+    Attributes:
+        name: its name for users.
+        master: file to watch for what the other side sends; None if it sends nothing.
+    """
 
     name: str
+    master: int | None
 
     def send(self, wire: Any) -> None:
         """Send a packet, or lose it if no one reads the line."""
@@ -263,6 +275,7 @@ class Bus:
         """
         interface, _, channel = name.partition(":")
         self.name = name
+        self.master = None
         try:
             self._bus = can.Bus(
                 channel=channel, interface=interface, bitrate=bitrate, receive_own_messages=False
@@ -299,13 +312,46 @@ def slcan_line(frame: Frame) -> bytes:
     )
 
 
-def open_lines(wire_format: Format, bus: str | None) -> list[Line]:
+class Target(NamedTuple):
+    """Where packets go; the fields are the command's flags. Without any, to ptys."""
+
+    bus: str | None = None
+    udp: tuple[str, int] | None = None
+    tcp: str | None = None
+
+
+def open_lines(wire_format: Format, target: Target) -> list[Line]:
     """Open one line for all six sensors, or six lines."""
-    if bus is not None:
-        return [Bus(bus, wire_format.default_bitrate)]
+    if target.bus is not None:
+        return [Bus(target.bus, wire_format.default_bitrate)]
     if wire_format.transport == "can":
         return [Pty(slcan=True)]
-    return [Pty() for _ in range(len(PLACEMENTS) if wire_format.single_device else 1)]
+    count = len(PLACEMENTS) if wire_format.single_device else 1
+    if target.tcp is not None:
+        return [TcpServer(target.tcp) for _ in range(count)]
+    if target.udp is not None:
+        sender = network_line(*target.udp, wire_format.name)
+        return [sender(number if count > 1 else None) for number in range(count)]
+    return [Pty() for _ in range(count)]
+
+
+def print_lines(wire_format: Format, target: Target, lines: list[Line]) -> None:
+    """Print the names of the lines, as flags of edgepose want them."""
+    names = ",".join(line.name for line in lines)
+    if target.udp is not None:
+        print("listen", lines[0].name, flush=True)
+        if len(lines) > 1:
+            print(
+                "senders",
+                ",".join(line.sender for line in lines if isinstance(line, DatagramLine)),
+                flush=True,
+            )
+    elif target.tcp is not None:
+        print("connect", names, flush=True)
+    elif wire_format.transport == "bytes":
+        print("port", names, flush=True)
+    else:
+        print("can", names if target.bus else f"slcan:{names}", flush=True)
 
 
 # --- playing ------------------------------------------------------------------------------------------------
@@ -450,12 +496,12 @@ class Player:
     def _wait(self, watched: list[Any]) -> str | None:
         """Wait until something is due or arrives; return a line of standard input, "" at its end, or None."""
         dues = [sensor.due for sensor in self._sensors] + [queue[0][0] for queue in self._queues if queue]
-        ptys = {line.master: i for i, line in enumerate(self._lines) if isinstance(line, Pty)}
+        files = {line.master: i for i, line in enumerate(self._lines) if line.master is not None}
         timeout = max(0.0, min(dues) - time.monotonic())
-        ready, _, _ = select.select([*watched, *ptys], [], [], timeout)
+        ready, _, _ = select.select([*watched, *files], [], [], timeout)
         for file in ready:
-            if file in ptys:
-                self._answer(ptys[file])
+            if file in files:
+                self._answer(files[file])
         return sys.stdin.readline() if sys.stdin in ready else None
 
     def _measure(self, sensor: Sensor) -> None:
@@ -512,8 +558,16 @@ def parse_kill(ctx: click.Context, param: click.Parameter, values: Sequence[str]
     return tuple(result)
 
 
+def parse_udp(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, int] | None:
+    """Return host and port of --udp."""
+    try:
+        return None if value is None else parse_host_and_port(value)
+    except EdgeposeError as error:
+        raise click.BadParameter(str(error)) from None
+
+
 def simulate(
-    recording: Recording, wire_format: Format, bus: str | None, stand: bool, noisy: bool, faults: Faults
+    recording: Recording, wire_format: Format, target: Target, stand: bool, noisy: bool, faults: Faults
 ) -> None:
     """Open the lines and play the recording on them."""
     start_s = min(float(data.time_s[0]) for data in recording.sensors.values())
@@ -526,12 +580,8 @@ def simulate(
         sensor = Sensor(index, data, start_s, noisy, encoders[index % len(encoders)])
         sensor.prepare(wire_format, ids[index])
         sensors.append(sensor)
-    lines = open_lines(wire_format, bus)
-    name = ",".join(line.name for line in lines)
-    if wire_format.transport == "bytes":
-        print("port", name, flush=True)
-    else:
-        print("can", name if bus else f"slcan:{name}", flush=True)
+    lines = open_lines(wire_format, target)
+    print_lines(wire_format, target, lines)
     try:
         Player(sensors, lines, wire_format, faults).play(stand)
     finally:
@@ -546,6 +596,13 @@ def simulate(
 @click.option(
     "--can", "bus", metavar="INTERFACE:CHANNEL", help="Send CAN frames here  [default: slcan on a pty]"
 )
+@click.option(
+    "--udp",
+    metavar="HOST:PORT",
+    callback=parse_udp,
+    help="Send datagrams here, several senders from 127.0.0.11 on.",
+)
+@click.option("--tcp", metavar="HOST", help="Be a TCP server at this address for each line.")
 @click.option("--loss", type=click.FloatRange(0, 1), default=0.0, help="Share of packets that are lost.")
 @click.option(
     "--corrupt", type=click.FloatRange(0, 1), default=0.0, help="Share of packets with a wrong bit."
@@ -595,6 +652,8 @@ def main(
     stand: bool,
     protocol: str,
     bus: str | None,
+    udp: tuple[str, int] | None,
+    tcp: str | None,
     loss: float,
     corrupt: float,
     jitter: float,
@@ -612,6 +671,10 @@ def main(
     wire_format = PROTOCOLS[protocol]
     if bus is not None and wire_format.transport != "can":
         raise click.UsageError(f"{protocol} is not a CAN protocol")
+    if (udp or tcp) and wire_format.transport == "can":
+        raise click.UsageError(f"{protocol} is a CAN protocol")
+    if wire_format.transport == "udp" and not udp:
+        raise click.UsageError(f"{protocol} needs --udp HOST:PORT")
     if corrupt and wire_format.transport == "can":
         raise click.UsageError("CAN controllers drop frames with wrong bits; use --loss")
     if duplicate_id and wire_format.single_device:
@@ -625,7 +688,7 @@ def main(
             return
         noisy = not ideal and raw is None  # chips without a filter have their own noise
         faults = Faults(loss, corrupt, jitter, drift, kill, duplicate_id)
-        simulate(played, wire_format, bus, stand, noisy, faults)
+        simulate(played, wire_format, Target(bus, udp, tcp), stand, noisy, faults)
     except EdgeposeError as error:
         raise click.ClickException(str(error)) from error
     except KeyboardInterrupt:

@@ -95,14 +95,15 @@ def _lines(wearer: WearerConfig) -> dict[str, list[int | None]]:
     with prefix_errors(wearer.name):
         sensor_map = _sensor_map(wearer)
         specs = line_specs(
-            *(source.port, source.baud, source.can, source.bitrate, source.fd, source.protocol), sensor_map
+            *(source.port, source.baud, source.can, source.bitrate, source.fd, source.protocol),
+            *(sensor_map, source.listen, source.connect),
         )
     lines: dict[str, list[int | None]] = {}
     for spec in specs:
-        if spec.unit == "bytes":
-            lines[f"port {spec.name}"] = []  # a port can only be opened once
-        else:
+        if spec.unit == "frames":
             lines[f"bus {spec.name}"] = [] if sensor_map is None else list(sensor_map.places(spec.name))
+        else:  # it can only be opened once
+            lines[f"{'port' if spec.unit == 'bytes' else 'address'} {spec.name}"] = []
     return lines
 
 

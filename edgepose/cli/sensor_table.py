@@ -85,7 +85,7 @@ _COLUMNS = (
 )
 
 
-_NOTHING = "no packet came from any sensor: switch them on, and check --port or --can, --baud and --protocol"
+_NOTHING = "no packet came from any sensor: switch them on, and check the lines' names, --baud and --protocol"
 
 
 def page_lines(name: str, state: State, warnings: Sequence[str], width: int) -> list[str]:

@@ -6,7 +6,6 @@ Over UDP they are the texts `rezero` and `origin`, or the OSC messages /edgepose
 from __future__ import annotations
 
 import math
-import socket
 import struct
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -14,8 +13,7 @@ from functools import partial
 from math import inf
 from typing import Literal, NamedTuple
 
-from edgepose.errors import DeviceError
-from edgepose.utils.sockets import resolve
+from edgepose.utils.sockets import bound_socket
 
 Action = Literal["rezero", "origin"]
 
@@ -50,20 +48,7 @@ class Control:
             DeviceError: the address does not belong to this machine, or is in use.
         """
         self.ignored = 0
-        try:
-            family, address = resolve(host, port, socket.SOCK_DGRAM)
-            self._socket = socket.socket(family, socket.SOCK_DGRAM)
-        except (OSError, UnicodeError) as error:
-            raise DeviceError(f"cannot find {host!r} to listen on: {error}") from error
-        self._socket.setblocking(False)
-        try:
-            self._socket.bind(address)
-        except OSError as error:
-            self._socket.close()
-            raise DeviceError(
-                f"cannot listen on {host} port {port}: {error.strerror or error}; "
-                "give an address of this machine and a free port"
-            ) from error
+        self._socket = bound_socket(host, port)
 
     def requests(self) -> list[Request]:
         """Return the requests received since the last call."""

@@ -27,8 +27,8 @@ class Batch(NamedTuple):
     Attributes:
         now_s: time on the source's clock up to which everything has been delivered, seconds.
         samples: the samples, in order of arrival.
-        raw: the undecoded data of live lines: Unix time of arrival, s, and bytes or a CAN message; empty for
-            files.
+        raw: the undecoded data of live lines: Unix time of arrival, s, and bytes, a CAN message or a
+            datagram; empty for files.
         backlog_s: longest time that the batch may have waited before it was read, seconds; 0 for files unless
             they are replayed at their own pace.
         ahead_s: time by which the newest samples came after `now_s`, seconds: another line may hold older
@@ -70,7 +70,7 @@ class Device(NamedTuple):
 
     Attributes:
         protocol: name of its wire format.
-        line: its port or bus; None for a file, which does not always name it.
+        line: its port, bus or address; None for a file, which does not always name it.
         id: its id on the line.
     """
 
@@ -132,6 +132,8 @@ def open_source(
     sensors: Path | str | None = None,
     lenient: bool = False,
     blocking: bool = True,
+    listen: str | None = None,
+    connect: str | None = None,
 ) -> Source:
     """Return the source that the options describe; nothing is opened before it is entered.
 
@@ -145,17 +147,20 @@ def open_source(
             bus.
         realtime: replay a file at its own pace.
         protocol: name of a wire format, a TOML file that describes text lines, or "auto".
-        sensors: map of devices to placements; ports and buses that it names need no `port` or `can`.
+        sensors: map of devices to placements; lines that it names need no `port`, `can`, `listen` or
+            `connect`.
         lenient: accept incomplete input: the good rows of a recording, with any number of sensors, and the
             lines that send; lines that do not are warned about and waited for.
         blocking: wait for a batch as the module's docstring describes; if false, return one at once, empty if
             nothing has come, for callers that read several sources.
+        listen: addresses of this machine to receive datagrams on, HOST:PORT, separated by commas.
+        connect: devices to connect to over TCP, HOST:PORT, separated by commas.
 
     Raises:
         EdgeposeError: no input or more than one; an unknown protocol or kind of file; an invalid map.
     """
-    if file is not None and (port is not None or can is not None):
-        raise EdgeposeError("give one input: --port or --can, or --file")
+    if file is not None and any(name is not None for name in (port, can, listen, connect)):
+        raise EdgeposeError("give one input: --port, --can, --listen or --connect, or --file")
     # Imported only here: each kind of input has dependencies of its own.
     from edgepose.sources.sensor_map import read_map
 
@@ -167,4 +172,5 @@ def open_source(
     from edgepose.sources.line_config import line_specs
     from edgepose.sources.live import LiveSource
 
-    return LiveSource(line_specs(port, baud, can, bitrate, fd, protocol, sensor_map), lenient, blocking)
+    specs = line_specs(port, baud, can, bitrate, fd, protocol, sensor_map, listen, connect)
+    return LiveSource(specs, lenient, blocking)

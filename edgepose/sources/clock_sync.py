@@ -210,9 +210,9 @@ class HostClocks:
         devices: clocks of the sensors that send a time.
     """
 
-    def __init__(self, wrap_us: int) -> None:
-        """Create the clocks; device times wrap at wrap_us."""
-        self.devices: dict[int, DeviceClock] = {}
+    def __init__(self, wrap_us: int, devices: dict[int, DeviceClock] | None = None) -> None:
+        """Create the clocks; device times wrap at wrap_us, and `devices` gets the clocks."""
+        self.devices = {} if devices is None else devices
         self._arrivals: dict[int, ArrivalClock] = {}
         self._wrap_us = wrap_us
 

@@ -40,15 +40,11 @@ def check_start(line: LineReader, now_s: float, start_s: float) -> None:
     passed_s = now_s - decoder.first_s
     if decoder.counters.packets or passed_s <= REFUSED_S:
         return
-    if decoder.refused is not None and not decoder.unknown_ids:
+    if decoder.refused is not None and decoder.unknown is None:
         raise DeviceError(f"{spec.name}: {decoder.refused}")
     if passed_s > NOISE_S:
-        if decoder.unknown_ids:
-            ids = ", ".join(map(str, decoder.unknown_ids))
-            raise DeviceError(
-                f"{spec.name}: packets come only from sensor ids {ids}; set the ids to {decoder.ids}, "
-                "or assign them to placements with --sensors"
-            )
+        if decoder.unknown is not None:
+            raise DeviceError(f"{spec.name}: {decoder.unknown}")
         kind = "" if decoder.protocol is None else f"{decoder.protocol.name} "
         raise DeviceError(
             f"{spec.name}: {decoder.amount} {spec.unit} in {NOISE_S:g} s but no valid {kind}packet; "
@@ -69,8 +65,7 @@ def warn_about_clock_resets(line: LineReader) -> None:
 
     Two devices with one id look like a single clock that jumps back and forth; that is reported once.
     """
-    devices = {} if line.clocks is None else line.clocks.devices
-    for placement, clock in devices.items():
+    for placement, clock in line.clocks.items():
         before = line.clock_resets.get(placement, 0)
         if clock.resets - before >= messages.JUMPS_OF_TWO and not line.duplicate_ids:
             line.duplicate_ids = True

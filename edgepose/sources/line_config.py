@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
+from typing import NamedTuple
 
 from edgepose.errors import ConfigError
 from edgepose.sources.line_decoder import PlacementById
 from edgepose.sources.line_reader import LineSpec, Transport
 from edgepose.sources.protocol_detection import candidate_protocols
 from edgepose.sources.sensor_map import PortSettings, SensorMap, channel, default_places
+from edgepose.utils.sockets import parse_host_and_port
 from firmware_protocols.registry import Protocol
 
 BAUD = 115200
@@ -18,59 +20,106 @@ BITRATE = 500_000
 """Default speed of a CAN bus, bit/s."""
 
 
+QUEUE = 512
+"""Number of arrivals from a socket that may wait: most of a second of the packets of six sensors."""
+
+
+class Lines(NamedTuple):
+    """Names of the lines to read from, by kind.
+
+    Attributes:
+        port: serial ports.
+        can: CAN buses, INTERFACE:CHANNEL.
+        listen: addresses to listen on for datagrams, HOST:PORT.
+        connect: devices to connect to over TCP, HOST:PORT.
+    """
+
+    port: Sequence[str] = ()
+    can: Sequence[str] = ()
+    listen: Sequence[str] = ()
+    connect: Sequence[str] = ()
+
+    @property
+    def all(self) -> list[str]:
+        """All names, in the order of the placements."""
+        return [name for names in self for name in names]
+
+
 def line_specs(
-    port: str | None,
-    baud: int | None,
-    can: str | None,
-    bitrate: int | None,
-    fd: bool,
-    protocol: str,
-    sensor_map: SensorMap | None,
+    port: str | None = None,
+    baud: int | None = None,
+    can: str | None = None,
+    bitrate: int | None = None,
+    fd: bool = False,
+    protocol: str = "auto",
+    sensor_map: SensorMap | None = None,
+    listen: str | None = None,
+    connect: str | None = None,
 ) -> list[LineSpec]:
-    """Return the ports and buses to read from; the arguments are those of `open_source`.
+    """Return the lines to read from; the arguments are those of `open_source`.
 
     Raises:
         ConfigError: there are none, a name is invalid, or the map names a line that the flags do not.
     """
-    ports = _split_names("--port", port)
-    buses = _split_names("--can", can)
+    lines = Lines(
+        *(
+            _split_names(f"--{kind}", text)
+            for kind, text in zip(Lines._fields, (port, can, listen, connect), strict=True)
+        )
+    )
     if sensor_map is not None:
-        if not ports and not buses:
-            ports, buses = sensor_map.lines("port"), sensor_map.lines("can")
-        known = {*ports, *map(channel, buses)}
-        for name, device in sensor_map.devices.items():
-            if device.line is not None and device.line not in known:
-                raise ConfigError(
-                    f"{sensor_map.path}: {name}: {device.port or device.can} is not one of the lines given "
-                    f"with --port and --can: {', '.join([*ports, *buses])}"
-                )
-        for name in sensor_map.ports:
-            if name not in ports and name not in buses:
-                raise ConfigError(
-                    f"{sensor_map.path}: ports.{name}: no such line, only {', '.join([*ports, *buses])}"
-                )
-    count = len(ports) + len(buses)
+        if not lines.all:
+            lines = Lines(*map(sensor_map.lines, Lines._fields))
+        _check_map(sensor_map, lines)
+    count = len(lines.all)
     if not count:
-        raise ConfigError("give one input: --port, --can or --file")
-    for bus in buses:
+        raise ConfigError("give one input: --port, --can, --listen, --connect or --file")
+    for bus in lines.can:
         if ":" not in bus:
             raise ConfigError(f"{bus}: give --can as INTERFACE:CHANNEL, such as socketcan:can0")
 
-    def placements(line: str, index: int) -> Callable[[Protocol], PlacementById]:
-        if sensor_map is not None:
-            return lambda found: sensor_map.places(line)
-        return lambda found: default_places(line, found, index, count)
-
-    result = []
-    for index, name in enumerate([*ports, *buses]):
+    def spec(kind: str, name: str, index: int) -> LineSpec:
         settings = PortSettings() if sensor_map is None else sensor_map.settings(name)
-        line_protocol = settings.protocol or protocol
-        if index < len(ports):
-            spec = serial_line(name, line_protocol, settings.baud or baud, placements(name, index))
-        else:
-            spec = can_line(name, line_protocol, settings.baud or bitrate, fd, placements(name, index))
-        result.append(spec)
-    return result
+        found = settings.protocol or protocol
+
+        def placements(protocol: Protocol, sender: str | None = None) -> PlacementById:
+            if sensor_map is not None:
+                return sensor_map.places(name, sender)
+            return default_places(name, protocol, index, count, kind)
+
+        if kind == "port":
+            return serial_line(name, found, settings.baud or baud, placements)
+        if kind == "can":
+            return can_line(name, found, settings.baud or bitrate, fd, placements)
+        if kind == "connect":
+            return tcp_line(name, found, placements)
+        return udp_line(name, found, placements, None if sensor_map is None else sensor_map.senders(name))
+
+    named = [(kind, name) for kind in Lines._fields for name in getattr(lines, kind)]
+    return [spec(kind, name, index) for index, (kind, name) in enumerate(named)]
+
+
+def _check_map(sensor_map: SensorMap, lines: Lines) -> None:
+    """Check that all lines that a map names are read.
+
+    Raises:
+        ConfigError: one is not.
+    """
+    known = {*lines.all, *map(channel, lines.can)}
+    for name, device in sensor_map.devices.items():
+        if device.line is not None and device.line not in known:
+            raise ConfigError(
+                f"{sensor_map.path}: {name}: {device.name} is not one of the lines given "
+                f"with --port, --can, --listen and --connect: {', '.join(lines.all)}"
+            )
+        if device.sender is not None and not lines.listen:
+            raise ConfigError(
+                f"{sensor_map.path}: {name}: nothing listens for the datagrams of {device.sender}; "
+                "give --listen HOST:PORT"
+            )
+    for name in sensor_map.ports:
+        if name not in lines.all:
+            raise ConfigError(f"{sensor_map.path}: ports.{name}: no such line, only {', '.join(lines.all)}")
 
 
 def serial_line(
@@ -122,6 +171,77 @@ def can_line(
         "--protocol, --fd and the ids that the devices are set to",
     )
     return LineSpec(name, open_bus, protocols, placements, "frames", check)
+
+
+def udp_line(
+    name: str,
+    protocol: str,
+    placements: Callable[[Protocol, str | None], PlacementById],
+    senders: Collection[str] | None,
+) -> LineSpec:
+    """Return the specification of a UDP socket.
+
+    Args:
+        name: address to listen on, HOST:PORT.
+        protocol: name of a protocol, or "auto".
+        placements: map of ids to placements, given the protocol and a sender.
+        senders: IP and MAC addresses of the sensors; None if any may be one.
+
+    Raises:
+        ConfigError: no such protocol, an invalid address, or sensors without a placement.
+    """
+    host, port = parse_host_and_port(name)
+    protocols = candidate_protocols(protocol, "udp", live=True)
+    named = protocols[0] if len(protocols) == 1 else None
+    if named is not None and senders is None:
+        placements(named, None)  # raises if it cannot be known which sensor is where
+
+    def open_socket() -> Transport:
+        from edgepose.sources.udp_socket import UdpSocket
+
+        trackers = None if named is None or named.host is None else named.host()
+        return UdpSocket(host, port, trackers, senders)
+
+    def by_sender(sender: str) -> Callable[[Protocol], PlacementById] | None:
+        if senders is not None and sender not in senders:
+            return None
+        return lambda found: placements(found, sender)
+
+    check = (
+        f"that the sensors send to this machine's port {port}, that no firewall stops them"
+        + ("" if host in ("0.0.0.0", "::") else ", and listen on 0.0.0.0 for broadcasts"),
+        "--protocol",
+    )
+    return LineSpec(
+        name,
+        open_socket,
+        protocols,
+        lambda found: placements(found, None),
+        "datagrams",
+        check,
+        by_sender,
+        QUEUE,
+    )
+
+
+def tcp_line(name: str, protocol: str, placements: Callable[[Protocol], PlacementById]) -> LineSpec:
+    """Return the specification of a TCP connection to a device, HOST:PORT.
+
+    Raises:
+        ConfigError: no such protocol, or an invalid address.
+    """
+    host, port = parse_host_and_port(name)
+    protocols = candidate_protocols(protocol, "bytes", live=True)
+    if len(protocols) == 1 and protocols[0].request is not None:
+        raise ConfigError(f"{name}: {protocols[0].name} devices are polled; connect them to a serial port")
+
+    def open_connection() -> Transport:
+        from edgepose.sources.tcp_connection import TcpConnection
+
+        return TcpConnection(host, port)
+
+    check = ("that the device is set to send over this connection", "--protocol")
+    return LineSpec(name, open_connection, protocols, placements, "bytes", check, None, QUEUE)
 
 
 def _split_names(flag: str, text: str | None) -> Sequence[str]:

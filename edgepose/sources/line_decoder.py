@@ -21,6 +21,9 @@ LISTEN_S = 1.0
 LISTEN_BYTES = 1 << 16
 """Amount of data with the same effect, for captures without times."""
 
+MOST_UNKNOWN = 16
+"""Number of ids without a placement that are named: a sender can make up any number of them."""
+
 PlacementById = Mapping[int | None, int]
 """Index into PLACEMENTS by device id on the line; the key None is the only device, whatever its id."""
 
@@ -71,6 +74,7 @@ class LineDecoder:
         self._placements: PlacementById = {}
         self._known: dict[int, int] = {}  # placement by id, for the ids seen so far
         self._unknown: dict[int, int] = {}  # packets by id
+        self._more_unknown = 0  # packets of more ids than are named
         if len(protocols) == 1:
             self._set_protocol(protocols[0], self._detector.decoders[0])
 
@@ -80,7 +84,7 @@ class LineDecoder:
         if self._decoder is None:
             return SourceCounters()
         c = self._decoder.counters
-        unknown = sum(self._unknown.values())
+        unknown = sum(self._unknown.values()) + self._more_unknown
         return SourceCounters(c.packets - unknown, c.lost, c.bad, unknown)
 
     @property
@@ -102,6 +106,17 @@ class LineDecoder:
     def unknown_ids(self) -> list[int]:
         """Sensor ids seen that belong to no placement."""
         return sorted(self._unknown)
+
+    @property
+    def unknown(self) -> str | None:
+        """Text about packets that belong to no placement, if all are such; None if there are none."""
+        if not self._unknown:
+            return None
+        ids = ", ".join(map(str, self.unknown_ids))
+        return (
+            f"packets come only from sensor ids {ids}; set the ids to {self.ids}, "
+            "or assign them to placements with --sensors"
+        )
 
     @property
     def ids(self) -> str:
@@ -178,11 +193,15 @@ class LineDecoder:
         if placement is None and not self._known:
             placement = self._placements.get(None)
         if placement is None:
-            if sensor not in self._unknown:
+            if sensor not in self._unknown and len(self._unknown) < MOST_UNKNOWN:
                 _log.warning(
                     "%s: ignoring packets of sensor id %d; expected ids are %s", self.name, sensor, self.ids
                 )
-            self._unknown[sensor] = self._unknown.get(sensor, 0) + 1
+                self._unknown[sensor] = 0
+            if sensor in self._unknown:
+                self._unknown[sensor] += 1
+            else:
+                self._more_unknown += 1
             return None
         other = self._placement_owner.setdefault(placement, self.name)
         if other != self.name:

@@ -1,4 +1,4 @@
-"""One live line: the interface of an open port or bus, and the reader that collects its data."""
+"""One live line: the interface of an open port, bus or socket, and the reader that collects its data."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from queue import SimpleQueue
 from typing import Any, NamedTuple, Protocol
 
 from edgepose.errors import DeviceError, EdgeposeError
-from edgepose.sources.clock_sync import HostClocks
+from edgepose.sources.clock_sync import DeviceClock, HostClocks
 from edgepose.sources.line_decoder import Clock, LineDecoder, PlacementById
 from edgepose.sources.protocol_detection import Chunk
+from edgepose.sources.sender_decoders import SenderDecoders, SenderPlacements
 from firmware_protocols import registry
 
 _log = logging.getLogger(__name__)
@@ -32,12 +33,16 @@ _SETTLE_S = 0.1
 """Shortest time spent discarding: data that the system has buffered comes in several pieces."""
 
 
+_FULL_S = 0.001
+"""Time between two looks at a queue that is too long, seconds."""
+
+
 class LineDisconnectedError(Exception):
-    """The port or bus has disappeared."""
+    """The port or bus has disappeared, or the connection has ended."""
 
 
 class Transport(Protocol):
-    """An open port or bus."""
+    """An open port, bus or socket."""
 
     def read(self) -> tuple[Chunk, bool]:
         """Return the available data, waiting up to POLL_S for the first of it, and whether more is waiting.
@@ -47,7 +52,7 @@ class Transport(Protocol):
         """
 
     def close(self) -> None:
-        """Release the port or bus."""
+        """Release it."""
 
     @property
     def waiting(self) -> Callable[[], tuple[Chunk, bool]] | None:
@@ -65,8 +70,11 @@ class LineSpec(NamedTuple):
         open: opens it.
         protocols: wire formats that the line may use.
         placements: the line's map from ids to placements, once the protocol is known.
-        unit: "bytes" or "frames", for messages.
+        unit: "bytes", "frames" or "datagrams", for messages.
         check: advice for the user if no data comes, and if none of it can be decoded.
+        senders: for sockets, the maps of `placements` by sender; None for lines without senders.
+        most_waiting: number of arrivals from which on the rest stays in the system's buffer. Only sockets
+            have a limit: no other line can be flooded faster than it is decoded.
     """
 
     name: str
@@ -75,6 +83,8 @@ class LineSpec(NamedTuple):
     placements: Callable[[registry.Protocol], PlacementById]
     unit: str
     check: tuple[str, str]
+    senders: SenderPlacements | None = None
+    most_waiting: float = inf
 
 
 class Arrival(NamedTuple):
@@ -103,7 +113,7 @@ class LineReader:
     Attributes:
         spec: the line's name, protocols and advice.
         transport: the open port or bus; None while it is disconnected.
-        clocks: clocks of the line's devices; None until the protocol is known.
+        clocks: clocks of the line's devices that send a time, by placement.
         decoder: turns the line's data into samples.
         clock_resets: resets of each device's clock at the last check, by placement.
         duplicate_ids: the user has been warned about two devices with one id.
@@ -132,8 +142,16 @@ class LineReader:
         """
         self.spec = spec
         self.transport: Transport | None = transport
-        self.clocks: HostClocks | None = None
-        self.decoder = LineDecoder(spec.name, spec.protocols, spec.placements, self._clock, placement_owner)
+        self.clocks: dict[int, DeviceClock] = {}
+        self.decoder: LineDecoder | SenderDecoders
+        if spec.senders is None:
+            self.decoder = LineDecoder(
+                spec.name, spec.protocols, spec.placements, self._clock, placement_owner
+            )
+        else:
+            self.decoder = SenderDecoders(
+                spec.name, spec.protocols, spec.senders, self._clock, placement_owner
+            )
         self.clock_resets: dict[int, int] = {}
         self.duplicate_ids = False
         self.warned = False
@@ -147,8 +165,7 @@ class LineReader:
         self._thread = self._thread_from(self._drain)
 
     def _clock(self, wrap_us: int) -> Clock:
-        self.clocks = HostClocks(wrap_us)
-        return self.clocks.time
+        return HostClocks(wrap_us, self.clocks).time
 
     def _thread_from(self, first: Callable[[], None]) -> threading.Thread:
         return threading.Thread(target=self._run, args=(first,), daemon=True, name=self.spec.name)
@@ -183,6 +200,9 @@ class LineReader:
                 if not self._blocking and self.transport.waiting is not None:
                     self._poll = self.transport.waiting
                     return
+                if self._queue.qsize() > self.spec.most_waiting:
+                    self._stop.wait(_FULL_S)
+                    continue
                 try:
                     chunk, more = self.transport.read()
                     self._queue.put(self._arrival(chunk, more))

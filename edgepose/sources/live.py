@@ -1,4 +1,4 @@
-"""Live samples from any number of serial ports and CAN buses."""
+"""Live samples from any number of serial ports, CAN buses and sockets."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class _ReadTime:
 
 
 class LiveSource:
-    """Samples from serial ports and CAN buses. A line that disappears is reopened once it is back."""
+    """Samples from serial ports, CAN buses and sockets. Lines that disappear are reopened."""
 
     def __init__(
         self,
@@ -96,12 +96,7 @@ class LiveSource:
     @property
     def clocks(self) -> Mapping[int, DeviceClock]:
         """Clocks of the sensors that send a time, by placement."""
-        return {
-            placement: clock
-            for line in self._lines
-            if line.clocks is not None
-            for placement, clock in line.clocks.devices.items()
-        }
+        return {placement: clock for line in self._lines for placement, clock in line.clocks.items()}
 
     @property
     def devices(self) -> Mapping[int, Device]:

@@ -1,19 +1,24 @@
-"""Detection of the devices on a port or bus, by listening to it."""
+"""Detection of the devices on a line, by listening to it."""
 
 from __future__ import annotations
 
 import time
 from collections import Counter
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 from edgepose.errors import EdgeposeError
-from edgepose.sources.line_config import BAUD, can_line, serial_line
+from edgepose.sources.line_config import BAUD, can_line, serial_line, tcp_line, udp_line
 from edgepose.sources.line_decoder import LISTEN_S
 from edgepose.sources.line_reader import LineDisconnectedError, LineSpec, discard_backlog
 from edgepose.sources.protocol_detection import DecodedChunks, Detector
+from edgepose.sources.sender_decoders import MOST_SENDERS
 
 BAUDS = (BAUD, 921600, 460800, 230400, 57600, 38400, 9600)
 """Speeds to try, the most likely first, bit/s."""
+
+CALLS_S = 2.5
+"""Time to listen to a socket, seconds: trackers call once a second."""
 
 
 class ProbeResult(NamedTuple):
@@ -21,7 +26,7 @@ class ProbeResult(NamedTuple):
 
     Attributes:
         protocol: name of the wire format; None if none could be decoded.
-        amount: bytes or frames received.
+        amount: bytes, frames or datagrams received.
         rates_hz: samples per second by sensor id.
         refused: input that could be understood but not used, see `Decoder.refused`.
     """
@@ -56,29 +61,71 @@ def probe_bus(name: str, bitrate: int | None = None) -> ProbeResult:
     return probe_line(can_line(name, "auto", bitrate, False, lambda found: {}))
 
 
+def probe_connection(name: str) -> ProbeResult:
+    """Probe a device by a TCP connection to HOST:PORT.
+
+    Raises:
+        EdgeposeError: it cannot be connected to, or formats fit equally well.
+    """
+    return probe_line(tcp_line(name, "auto", lambda found: {}))
+
+
+def probe_socket(name: str) -> dict[str, ProbeResult]:
+    """Listen for datagrams at HOST:PORT, and return the findings about each sender.
+
+    Raises:
+        EdgeposeError: it cannot be listened at, or formats fit equally well.
+    """
+    spec = udp_line(name, "auto", lambda found, sender: {}, None)
+    detectors: dict[str, Detector] = {}
+    amounts: Counter[str] = Counter()
+    for arrival_s, datagrams in _listen(spec, CALLS_S):
+        for datagram in datagrams:
+            if datagram.sender not in detectors:
+                if len(detectors) == MOST_SENDERS:
+                    continue
+                detectors[datagram.sender] = Detector(f"{name} from {datagram.sender}", spec.protocols)
+            amounts[datagram.sender] += 1
+            detectors[datagram.sender].feed([datagram], arrival_s)
+    return {sender: _result(detector, amounts[sender]) for sender, detector in sorted(detectors.items())}
+
+
 def probe_line(spec: LineSpec) -> ProbeResult:
     """Listen to a line for a little more than a second.
 
     Raises:
         EdgeposeError: the line cannot be opened, or formats fit equally well.
     """
-    transport = spec.open()
     detector = Detector(spec.name, spec.protocols)
     amount = 0
+    for arrival_s, chunk in _listen(spec):
+        amount += len(chunk)
+        detector.feed(chunk, arrival_s)
+    return _result(detector, amount)
+
+
+def _listen(spec: LineSpec, seconds: float | None = None) -> Iterator[tuple[float, Any]]:
+    """Yield arrival, seconds, and data of what comes over a line, from the first of it on for some time."""
+    seconds = LISTEN_S if seconds is None else seconds
+    transport = spec.open()
+    heard = False
     try:
         discard_backlog(transport)
-        end_s = time.monotonic() + LISTEN_S
+        end_s = time.monotonic() + seconds
         while (now_s := time.monotonic()) < end_s:
             chunk, _ = transport.read()
-            if chunk and not amount:
-                end_s = now_s + LISTEN_S
-            amount += len(chunk)
-            if chunk:
-                detector.feed(chunk, time.monotonic())
+            if not chunk:
+                continue
+            if not heard:
+                heard, end_s = True, now_s + seconds
+            yield time.monotonic(), chunk
     except LineDisconnectedError:
         raise EdgeposeError(f"{spec.name}: disconnected while it was being probed") from None
     finally:
         transport.close()
+
+
+def _result(detector: Detector, amount: int) -> ProbeResult:
     found = detector.best(True)
     if found is None:
         return ProbeResult(None, amount, {}, detector.refused)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from edgepose.errors import ConfigError
 from edgepose.utils.similar_names import choices
@@ -13,7 +13,18 @@ from firmware_protocols.registry import PROTOCOLS, Decoder, Protocol
 from firmware_protocols.sample import Sample
 
 Chunk = bytes | list[Any]
-"""Bytes of a serial line, or messages (`can.Message`) of a bus."""
+"""Bytes of a stream, messages (`can.Message`) of a bus, or datagrams (`Datagram`)."""
+
+Transport = Literal["bytes", "can", "udp"]
+"""Kind of a line: a stream of bytes, a CAN bus, or a UDP socket."""
+
+
+class Datagram(NamedTuple):
+    """A UDP datagram, and the IP address of its sender, or the name that it gives itself."""
+
+    sender: str
+    data: bytes
+
 
 DecodedChunks = list[tuple[float, list[Sample]]]
 """Arrival time, seconds, and samples of each chunk that completed any."""
@@ -31,7 +42,10 @@ def decode(decoder: Decoder, chunk: Chunk) -> list[Sample]:
         return decoder.feed(chunk)
     samples: list[Sample] = []
     for message in chunk:
-        samples += decoder.feed(message.arbitration_id, bytes(message.data), message.is_extended_id)
+        if isinstance(message, Datagram):
+            samples += decoder.feed_datagram(message.data)
+        else:
+            samples += decoder.feed(message.arbitration_id, bytes(message.data), message.is_extended_id)
     return samples
 
 
@@ -53,31 +67,38 @@ def protocol_named(name: str) -> Protocol:
     return PROTOCOLS[name]
 
 
-def candidate_protocols(name: str, transport: Literal["bytes", "can"], live: bool) -> list[Protocol]:
+def candidate_protocols(name: str, transport: Transport, live: bool) -> list[Protocol]:
     """Return the protocols that a line may use.
 
     Args:
         name: name of a protocol, or "auto".
-        transport: kind of line.
+        transport: kind of line. Datagrams may hold the packets of any protocol in bytes.
         live: the line has devices on it; listening cannot find those that have to be polled.
 
     Raises:
         ConfigError: no such protocol, it is for another transport, or a package for it is missing.
     """
+    possible = ("bytes", "udp") if transport == "udp" else (transport,)
     if name != "auto":
         protocol = protocol_named(name)
-        if protocol.transport != transport:
-            transport_name = "CAN buses" if protocol.transport == "can" else "serial lines"
-            flag = "--can" if protocol.transport == "can" else "--port"
-            raise ConfigError(f"protocol {name} is for {transport_name}; use it with {flag} or a log of one")
+        if protocol.transport not in possible:
+            raise ConfigError(f"protocol {name} is for {_LINES[protocol.transport]}")
         return [protocol]
     # Two names can stand for one decoder.
     first = {
         protocol.decoder: protocol
         for protocol in reversed(list(PROTOCOLS.values()))
-        if protocol.transport == transport and not (live and protocol.request)
+        if protocol.transport in possible and not (live and protocol.request)
     }
     return list(reversed(first.values()))
+
+
+_LINES = {
+    "bytes": "serial lines; use it with --port, --listen or --connect, or a log of one",
+    "can": "CAN buses; use it with --can or a log of one",
+    "udp": "datagrams; use it with --listen",
+}
+"""The lines of a protocol, for a message."""
 
 
 class Detector:

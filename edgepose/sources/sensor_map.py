@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from ipaddress import ip_address
 from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,8 +16,12 @@ from edgepose.utils.similar_names import choices
 from edgepose.utils.text_files import read_toml
 from firmware_protocols.registry import Protocol
 
+LINES = ("port", "can", "listen", "connect")
+"""Keys that name a line."""
+
 _DIRECTION = "(left|right|up|down|forward|back)"
 _MOUNTING = re.compile(f"x {_DIRECTION}, z {_DIRECTION}")
+_MAC = re.compile("[0-9A-Fa-f]{2}(:[0-9A-Fa-f]{2}){5}")
 _AXIS = {"left": 0, "right": 0, "up": 1, "down": 1, "forward": 2, "back": 2}
 
 
@@ -26,19 +31,30 @@ class Device(NamedTuple):
     Attributes:
         port: its serial port; None for any line.
         can: its bus, INTERFACE:CHANNEL or the channel alone; None for any line.
+        listen: the address at which its datagrams arrive, HOST:PORT; None for any line.
+        connect: its address for TCP, HOST:PORT; None for any line.
+        sender: IP address from which its datagrams come, or the MAC address that they state; None for any.
         id: its id on the line; None if it is the only device there.
         mounting: orientation in which it is worn, in the format of `edgepose calibrate`.
     """
 
     port: str | None = None
     can: str | None = None
+    listen: str | None = None
+    connect: str | None = None
+    sender: str | None = None
     id: int | None = None
     mounting: str | None = None
 
     @property
+    def name(self) -> str | None:
+        """The line as the file names it; None for any."""
+        return self.port or self.can or self.listen or self.connect
+
+    @property
     def line(self) -> str | None:
-        """Port or channel; None for any."""
-        return self.port or (None if self.can is None else channel(self.can))
+        """Port, channel or address; None for any."""
+        return self.name if self.can is None else channel(self.can)
 
 
 class PortSettings(NamedTuple):
@@ -67,7 +83,7 @@ class SensorMap(NamedTuple):
     ports: Mapping[str, PortSettings]
 
     def lines(self, key: str) -> list[str]:
-        """Return the ports ("port") or buses ("can") that the devices name, each once."""
+        """Return the lines of a kind that the devices name, each once: "port", "can", "listen", "connect"."""
         named = [getattr(device, key) for device in self.devices.values()]
         return [name for name in dict.fromkeys(named) if name is not None]
 
@@ -75,14 +91,18 @@ class SensorMap(NamedTuple):
         """Return the settings of a line."""
         return self.ports.get(line, PortSettings())
 
-    def places(self, line: str) -> PlacementById:
-        """Return the placements by id on one line."""
+    def places(self, line: str, sender: str | None = None) -> PlacementById:
+        """Return the placements by id on one line, for the datagrams of one sender if it is a socket."""
         return {
             device.id: i
             for i, device in enumerate(self.devices.values())
-            if (device.port is None or device.port == line)
-            and (device.can is None or channel(device.can) == channel(line))
+            if device.line in (None, line, channel(line)) and device.sender in (None, sender)
         }
+
+    def senders(self, line: str) -> frozenset[str] | None:
+        """Return the IP and MAC addresses that may send to a socket; None for any."""
+        senders = [device.sender for device in self.devices.values() if device.line in (None, line)]
+        return None if None in senders else frozenset(map(str, senders))
 
     def serial_numbers(self) -> dict[int, str]:
         """Return the placements by id, for sessions whose files are named after serial numbers."""
@@ -108,7 +128,9 @@ def channel(bus: str) -> str:
     return bus.split(":", 1)[-1]
 
 
-def default_places(line: str, protocol: Protocol, index: int, count: int) -> PlacementById:
+def default_places(
+    line: str, protocol: Protocol, index: int, count: int, kind: str = "port"
+) -> PlacementById:
     """Return the placements by id on one line, without a map.
 
     Args:
@@ -116,6 +138,7 @@ def default_places(line: str, protocol: Protocol, index: int, count: int) -> Pla
         protocol: protocol of the line.
         index: number of the line, from 0.
         count: total number of lines.
+        kind: kind of the line, for the message: "port", "can", "listen" or "connect".
 
     Raises:
         ConfigError: there is no default for such a line.
@@ -124,10 +147,13 @@ def default_places(line: str, protocol: Protocol, index: int, count: int) -> Pla
         return {None: index}
     if protocol.ids:
         return {sensor: i for i, sensor in enumerate(protocol.ids)}
+    row = '{ sender = "192.168.1.21" }' if kind == "listen" else f'{{ {kind} = "{line}" }}'
+    lines = {"port": "ports", "can": "buses"}.get(kind, "addresses")
     raise ConfigError(
-        f"{line}: which sensor is where? {protocol.name} has one sensor per line: give six ports in the "
+        f"{line}: which sensor is where? {protocol.name} has one sensor per "
+        f"{'sender' if kind == 'listen' else 'line'}: give six {lines} in the "
         f"order {', '.join(PLACEMENTS)},\nor --sensors MAP.toml with a row for each, such as  "
-        f'{PLACEMENTS[0]} = {{ port = "{line}" }}'
+        f"{PLACEMENTS[0]} = {row}"
     )
 
 
@@ -150,25 +176,43 @@ def read_map(path: Path) -> SensorMap:
         raise ConfigError(f"{path}: no entry for {', '.join(missing)}; all six sensors need one")
     devices = {name: _device(f"{path}: {name}", content[name]) for name in PLACEMENTS}
     for (other, before), (name, device) in combinations(devices.items(), 2):
-        lines = {device.line, before.line}
-        same_line = len(lines) == 1 or None in lines
-        if same_line and (device.id == before.id or (len(lines) == 1 and None in (device.id, before.id))):
+        if _same(device, before):
             raise ConfigError(f"{path}: {name} and {other} are the same device; give each its own port or id")
     return SensorMap(str(path), devices, {n: _port(f"{path}: ports.{n}", t) for n, t in tables.items()})
+
+
+def _same(device: Device, other: Device) -> bool:
+    """Return whether two rows may stand for one device."""
+    if {device.sender, other.sender} == {None}:
+        same_line = device.line == other.line or None in (device.line, other.line)
+    elif None not in (device.sender, other.sender) and device.sender != other.sender:
+        return False
+    else:  # only sockets have senders
+        lines = [each.listen for each in (device, other) if each.line is not None]
+        same_line = None not in lines and len(set(lines)) < 2
+    if not same_line:
+        return False
+    sure = device.line == other.line and device.sender == other.sender
+    return device.id == other.id or (sure and None in (device.id, other.id))
 
 
 def _device(where: str, entry: object) -> Device:
     table = _table(where, entry, Device._fields)
     device = Device(**table)
-    for key in ("port", "can", "mounting"):
+    for key in (*LINES, "sender", "mounting"):
         _check_type(where, table, key, str, "text in quotes")
     _check_type(where, table, "id", int, "a whole number")
     if device.id is not None and device.id < 0:
         raise ConfigError(f"{where}: id must be 0 or more, not {device.id}")
-    if device.port is not None and device.can is not None:
-        raise ConfigError(f"{where}: give port or can, not both")
-    if device.port is None and device.can is None and device.id is None:
-        raise ConfigError(f"{where}: no device named; give its port, can or id")
+    given = [key for key in LINES if getattr(device, key) is not None]
+    if given[1:]:
+        raise ConfigError(f"{where}: give {' or '.join(given)}, not both")
+    if not given and device.id is None and device.sender is None:
+        raise ConfigError(f"{where}: no device named; give its port, can, listen, connect, sender or id")
+    if device.sender is not None:
+        if given not in ([], ["listen"]):
+            raise ConfigError(f"{where}: sender is for datagrams; it does not go with {given[0]}")
+        device = device._replace(sender=_sender(where, device.sender))
     if device.mounting is not None:
         words = _MOUNTING.fullmatch(device.mounting)
         if words is None or _AXIS[words[1]] == _AXIS[words[2]]:
@@ -177,6 +221,16 @@ def _device(where: str, entry: object) -> Device:
                 f"not {device.mounting!r}"
             )
     return device
+
+
+def _sender(where: str, text: str) -> str:
+    """Return an IP address as the system writes it, or a MAC address in lower case."""
+    if _MAC.fullmatch(text):
+        return text.lower()
+    try:
+        return str(ip_address(text))
+    except ValueError:
+        raise ConfigError(f"{where}: sender must be an IP address or a MAC address, not {text!r}") from None
 
 
 def _port(where: str, entry: object) -> PortSettings:

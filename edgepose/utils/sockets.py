@@ -6,7 +6,7 @@ import socket
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from edgepose.errors import ConfigError
+from edgepose.errors import ConfigError, DeviceError
 
 
 def resolve(host: str, port: int, kind: socket.SocketKind) -> tuple[socket.AddressFamily, Any]:
@@ -21,6 +21,29 @@ def resolve(host: str, port: int, kind: socket.SocketKind) -> tuple[socket.Addre
     found = socket.getaddrinfo(host, port, type=kind)
     family, _, _, _, address = min(found, key=lambda entry: entry[0] != socket.AF_INET)
     return family, address
+
+
+def bound_socket(host: str, port: int) -> socket.socket:
+    """Return a UDP socket that listens on an address and does not block.
+
+    Raises:
+        DeviceError: the address does not belong to this machine, or the port is in use.
+    """
+    try:
+        family, address = resolve(host, port, socket.SOCK_DGRAM)
+        bound = socket.socket(family, socket.SOCK_DGRAM)
+    except (OSError, UnicodeError) as error:
+        raise DeviceError(f"cannot find {host!r} to listen on: {error}") from error
+    bound.setblocking(False)
+    try:
+        bound.bind(address)
+    except OSError as error:
+        bound.close()
+        raise DeviceError(
+            f"cannot listen on {host} port {port}: {error.strerror or error}; "
+            "give an address of this machine and a free port"
+        ) from error
+    return bound
 
 
 CASTS = ("broadcast", "multicast")

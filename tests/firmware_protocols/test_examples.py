@@ -114,3 +114,16 @@ def test_sketch_on_a_can_bus(run_sketch):
     good(samples, decoder.counters, [4, 5], 500)
     steps = [(b.time_us - a.time_us) % decoder.WRAP_US for a, b in pairwise(samples[::2])]
     assert set(steps) == {10_000}
+
+
+def test_sketch_over_wifi(run_sketch):
+    decoder = NativeDecoder()
+    samples = []
+    for line in run_sketch(LINK="LINK_ESP32_WIFI", FIRST_ID=2).decode().splitlines():
+        address, data = line.split(" ")
+        assert address == "192.168.1.10:9000"
+        found = decoder.feed_datagram(bytes.fromhex(data))
+        assert len(found) <= 1  # one packet a datagram
+        samples += found
+    good(samples, decoder.counters, [2], 500)
+    assert decoder.infos[2].firmware == "edgepose_sketch 1 made-up data"

@@ -34,9 +34,7 @@ def test_samples_can_be_told_apart(name):
     protocol = PROTOCOLS[name]
     sender = TOOL["Sender"](protocol)
     pieces = [piece for sample in sender.round() for piece in sample]
-    numbers = [
-        TOOL["number_of"](s) for s in TOOL["Feeder"](protocol.decoder(), random.Random(1)).feed(pieces)
-    ]
+    numbers = [TOOL["number_of"](s) for s in TOOL["Feeder"](protocol, random.Random(1)).feed(pieces)]
     assert len(set(numbers)) == len(numbers) > TOOL["ROUND"] - TOOL["REST"]
     assert set(numbers) <= set(range(TOOL["ROUND"]))
 

@@ -34,7 +34,7 @@ def sent_and_read(name, quat):
     # Some decoders have to see first what a sensor sends.
     for seq in range(5):
         wire = encode(still._replace(time_us=1_000_000 + 10_000 * seq), seq)
-        if protocol.transport == "bytes":
+        if protocol.transport != "can":
             samples += decoder.feed(wire)
         else:
             for can_id, data, extended, _ in wire:

@@ -33,6 +33,6 @@ def test_every_protocol_has_a_row_and_a_page():
     rows = make_tables.protocols().splitlines()[2:]
     for row, name in zip(rows, BUILT_IN, strict=True):
         assert f"`{name}`" in row
-        assert f" {PROTOCOLS[name].default_bitrate} " in row
+        assert f" {PROTOCOLS[name].default_bitrate or '-'} " in row
         (link,) = re.findall(r"\]\((.*?)\)", row)
         assert (make_tables.ROOT / "docs" / "guide" / link).is_file(), link

@@ -8,6 +8,7 @@ import os
 import runpy
 import select
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -26,11 +27,13 @@ from edgepose.formats.recordings.npz import write_npz
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import ImuSample
 from edgepose.placements import PLACEMENTS
+from edgepose.sources import open_source
 from firmware_protocols.native import cobs_decode
 from firmware_protocols.native_packet import decode_body
 from firmware_protocols.registry import PROTOCOLS
 from firmware_protocols.rotation import rotate
 from tests.support import processes
+from tests.support.datagrams import free_address
 
 SIMULATOR = Path(__file__).parents[2] / "tools" / "simulate.py"
 CLIP = SIMULATOR.parent / "data" / "09_12.bvh"
@@ -326,7 +329,34 @@ def test_can_frames_on_a_bus_of_python_can(recording):
     assert lines[0].startswith(b"0CFF34018")
 
 
-def test_every_format_takes_the_samples_of_a_clip():
+@pytest.mark.parametrize(
+    ("name", "flags"), [("slimevr", ("--udp",)), ("ximu3", ("--tcp", "127.0.0.1")), ("native", ("--udp",))]
+)
+def test_devices_in_the_network(recording, tmp_path, name, flags):
+    if flags == ("--udp",):
+        flags = ("--udp", free_address(socket.SOCK_DGRAM))
+    rig = None
+    with start(recording, "--stand", "--protocol", name, *flags) as process:
+        flag, address = process.stdout.readline().split()
+        if name == "slimevr":
+            _, senders = process.stdout.readline().split()
+            pairs = zip(PLACEMENTS, senders.split(","), strict=True)
+            rig = tmp_path / "rig.toml"
+            rig.write_text("".join(f'{place} = {{ sender = "{sender}" }}\n' for place, sender in pairs))
+        quats = {}
+        with open_source(**{flag: address}, protocol=name, sensors=rig) as source:
+            for batch in source:
+                quats |= {sample.sensor: sample.quat for sample in batch.samples}
+                if len(quats) == 6:
+                    break
+        process.stdin.close()
+        assert process.wait(20) == 0
+    for sensor, data in enumerate(read_recording(recording).sensors.values()):
+        assert abs(data.quat[0] @ quats[sensor]) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_every_format_takes_the_samples_of_a_clip(monkeypatch):
+    monkeypatch.syspath_prepend(SIMULATOR.parent)
     tool = runpy.run_path(str(SIMULATOR))
     recording = tool["read_input"](CLIP)
     for name, spoken in PROTOCOLS.items():
@@ -387,6 +417,9 @@ def test_broken_and_late_packets_and_two_sensors_with_one_id(recording):
         (["--can", "slcan:x"], "native is not a CAN protocol"),
         (["--protocol", "native-can", "--corrupt", "0.1"], "use --loss"),
         (["--protocol", "xsens", "--duplicate-id"], "one sensor per line"),
+        (["--protocol", "native-can", "--udp", "127.0.0.1:9000"], "native-can is a CAN protocol"),
+        (["--protocol", "slimevr"], "slimevr needs --udp HOST:PORT"),
+        (["--udp", "9000"], "no port in '9000'"),
         (["--kill", "nose@1..2"], "'nose@1..2' is not SENSOR@T..T"),
         (["--kill", "head"], "'head' is not SENSOR@T..T"),
         (["--protocol", "native-can", "--can", "slcan:/nowhere"], "slcan:/nowhere: cannot be opened"),

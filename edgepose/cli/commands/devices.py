@@ -24,7 +24,17 @@ if TYPE_CHECKING:
     help="Listen to each for some seconds, to ports at the usual speeds, and report protocol, sensor ids and "
     "rates. Nothing is sent to the sensors.",
 )
-def devices(names: tuple[str, ...], probe: bool) -> None:
+@click.option(
+    "--listen",
+    metavar="HOST:PORT[,...]",
+    help="Listen for UDP datagrams at this address of this machine, and report the senders.",
+)
+@click.option(
+    "--connect",
+    metavar="HOST:PORT[,...]",
+    help="Connect to sensors over TCP, and report what they send.",
+)
+def devices(names: tuple[str, ...], probe: bool, listen: str | None, connect: str | None) -> None:
     """List the serial ports and CAN interfaces of this machine, or only the named ones.
 
     \b
@@ -32,11 +42,17 @@ def devices(names: tuple[str, ...], probe: bool) -> None:
       edgepose devices
       edgepose devices --probe
       edgepose devices --probe /dev/ttyUSB0 slcan:/dev/ttyACM0
+      edgepose devices --listen 0.0.0.0:9000
     """
+    failed: list[str] = []
+    if listen is not None or connect is not None:
+        _show_network(listen, connect, failed)
+        if not names and not probe:
+            _check_failed(failed)
+            return
     names = tuple(name for text in names for name in text.split(",") if name)  # as --port names several
     ports = dict.fromkeys((name for name in names if not _is_bus(name)), "") if names else _ports()
     buses = [name for name in names if _is_bus(name)] if names else None
-    failed: list[str] = []
     if ports or not names:
         show("Serial ports (edgepose run --port NAME):")
         width = max(map(len, ports), default=0)
@@ -61,7 +77,24 @@ def devices(names: tuple[str, ...], probe: bool) -> None:
                 show(f"    {_probe(name, _probe_bus, failed)}")
         if not buses:
             show("  none found; adapters on a serial port are named slcan:PORT")
-    if names and failed:
+    if names or listen or connect:
+        _check_failed(failed)
+
+
+def _show_network(listen: str | None, connect: str | None, failed: list[str]) -> None:
+    """Show what is sent to addresses of this machine, and by devices over TCP."""
+    for flag, text, probe in (("listen", listen, _probe_socket), ("connect", connect, _probe_connection)):
+        if text is None:
+            continue
+        show(f"Network (edgepose run --{flag} ADDRESS):")
+        for name in text.split(","):
+            show(f"  {name}")
+            for line in _probe(name, probe, failed).splitlines():
+                show(f"    {line}")
+
+
+def _check_failed(failed: list[str]) -> None:
+    if failed:
         raise EdgeposeError(f"cannot listen to {', '.join(failed)}")
 
 
@@ -117,6 +150,20 @@ def _probe_bus(name: str) -> str:
     return _describe(probe_bus(name), "frames", "")
 
 
+def _probe_socket(name: str) -> str:
+    from edgepose.sources.probe import probe_socket
+
+    senders = probe_socket(name)
+    lines = [f"{sender}: {_describe(finding, 'datagrams', '')}" for sender, finding in senders.items()]
+    return "\n".join(lines) or "nothing arrives"
+
+
+def _probe_connection(name: str) -> str:
+    from edgepose.sources.probe import probe_connection
+
+    return _describe(probe_connection(name), "bytes", "")
+
+
 def _describe(finding: ProbeResult, unit: str, speed: str) -> str:
     if finding.protocol is None:
         if not finding.amount:
@@ -124,7 +171,8 @@ def _describe(finding: ProbeResult, unit: str, speed: str) -> str:
         if finding.refused is not None:
             return f"{finding.refused}{speed and ' (' + speed.strip() + ')'}"
         return (
-            f"{finding.amount} {unit} arrived, in no known protocol; the device may be set to another speed"
+            f"{finding.amount} {unit} arrived, in no known protocol"
+            f"{'' if unit == 'datagrams' else '; the device may be set to another speed'}"
         )
     ids = ", ".join(f"id {sensor} at {rate:.0f} Hz" for sensor, rate in finding.rates_hz.items())
     return f"--protocol {finding.protocol}{speed}: {ids}"

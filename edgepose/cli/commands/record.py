@@ -53,11 +53,13 @@ def record(source: SourceConfig, out: str, seconds: float | None, overwrite: boo
     from edgepose.sources import open_source
 
     kind = recorder.kind(out)
-    if kind == "port" and (source.port is None or "," in source.port or source.can is not None):
+    streams = ",".join(filter(None, (source.port, source.connect)))
+    others = source.listen or (source.can if kind == "port" else streams)
+    if kind == "port" and (not streams or "," in streams or others):
         raise click.UsageError(
-            f"{out} stores the bytes of one port: give --port PORT, or name it .csv or .npz"
+            f"{out} stores the bytes of one line: give --port or --connect, or name it .csv or .npz"
         )
-    if kind == "bus" and (source.can is None or source.port is not None):
+    if kind == "bus" and (source.can is None or others):
         raise click.UsageError(f"{out} stores the frames of a CAN bus: give --can, or name it .csv or .npz")
     with ExitStack() as stack:
         outputs = {"OUT": out, "OUT (while it grows)": recorder.growing(out)}

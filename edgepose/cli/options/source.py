@@ -40,8 +40,8 @@ protocol_option = click.option(
 sensors_option = click.option(
     "--sensors",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="TOML file that says which port, bus and id is worn where; see docs/guide/sensors.md in the "
-    "repository. Ports and buses named in it need no --port or --can.  [default: ids in the usual order]",
+    help="TOML file that says which port, bus, sender and id is worn where; see docs/guide/sensors.md in the "
+    "repository. Lines named in it need no flag of their own.  [default: ids in the usual order]",
 )
 """The flag --sensors."""
 
@@ -73,6 +73,17 @@ def source_options(command: Callable[..., Any]) -> Callable[..., Any]:
             "protocol's usual speed, or 500000]",
         ),
         click.option("--fd", is_flag=True, help="Accept CAN FD frames, too."),
+        click.option(
+            "--listen",
+            metavar="HOST:PORT[,...]",
+            help="Receive the sensors' UDP datagrams at this address of this machine, such as "
+            "192.168.1.10:9000; 0.0.0.0 is all of its addresses.",
+        ),
+        click.option(
+            "--connect",
+            metavar="HOST:PORT[,...]",
+            help="Connect to the sensors over TCP, such as 192.168.1.21:7000, in the order of --port.",
+        ),
         click.option(
             "--file",
             type=click.Path(path_type=Path),

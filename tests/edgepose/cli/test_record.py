@@ -412,8 +412,8 @@ def test_nothing_is_overwritten_unasked(command, tmp_path):
     [
         ("walk.csv", 2, "give one source"),
         ("walk.txt --file REAL", 1, "unknown kind of recording; names end in .csv or .npz"),
-        ("walk.bin --file REAL", 2, "stores the bytes of one port"),
-        ("walk.bin --port a,b", 2, "stores the bytes of one port"),
+        ("walk.bin --file REAL", 2, "stores the bytes of one line"),
+        ("walk.bin --port a,b", 2, "stores the bytes of one line"),
         ("walk.blf --port a", 2, "stores the frames of a CAN bus"),
         ("walk.csv --file REAL --seconds 0", 2, "--seconds"),
         ("nowhere/walk.csv --file REAL", 1, "its folder does not exist, create it first"),

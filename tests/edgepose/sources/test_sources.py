@@ -676,9 +676,9 @@ def test_a_recording_at_its_own_pace_says_how_late_it_is_taken(tmp_path, kind):
 
 def test_options():
     for options in ({"port": "a", "file": "b.csv"}, {"can": "a:b", "file": "b.csv"}):
-        with pytest.raises(EdgeposeError, match="--port or --can, or --file"):
+        with pytest.raises(EdgeposeError, match="--listen or --connect, or --file"):
             open_source(**options)
-    with pytest.raises(EdgeposeError, match="--port, --can or --file"):
+    with pytest.raises(EdgeposeError, match="--listen, --connect or --file"):
         open_source()
     for options in ({"port": "a"}, {"can": "virtual:a"}, {"file": "a.csv"}):
         with pytest.raises(EdgeposeError, match="unknown protocol 'x'; known are auto, native, "):

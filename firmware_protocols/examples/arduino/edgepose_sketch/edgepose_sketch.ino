@@ -3,7 +3,7 @@
  *   1. Copy edgepose_packet.h (firmware_protocols/c) into the folder of this sketch.
  *   2. Choose SENSOR and LINK below; for a sensor of your own, fill in the two functions of SENSOR_OWN.
  *   3. edgepose needs six sensors, ids 0 to 5: left forearm, right forearm, left lower leg, right lower leg, head, pelvis.
- *      All on one board: SENSOR_COUNT 6 and a serial link. One per board: FIRST_ID 0 to 5 and a CAN bus.
+ *      All on one board: SENSOR_COUNT 6 and a serial link. One per board: FIRST_ID 0 to 5 and a CAN bus or Wi-Fi.
  *
  * The project's tests compile and run this with stand-ins for the libraries. It has not been run on a board.
  */
@@ -15,6 +15,7 @@
 #define SENSOR_BNO085 1 /* Adafruit_BNO08x on I2C; that library supports one sensor per board */
 #define LINK_SERIAL 0   /* USB or UART */
 #define LINK_ESP32_CAN 1 /* CAN 2.0, 1 Mbit/s, with the ESP32's own controller and a transceiver */
+#define LINK_ESP32_WIFI 2 /* UDP datagrams over Wi-Fi: edgepose run --listen 0.0.0.0:9000 */
 
 #ifndef SENSOR
 #define SENSOR SENSOR_OWN
@@ -149,6 +150,39 @@ static void sendPacket(const edgepose_packet *p) {
 }
 
 static void sendInfo(const edgepose_info *) {} /* CAN 2.0 has no INFO */
+
+#elif LINK == LINK_ESP32_WIFI
+
+#include <WiFi.h>
+#include <WiFiUdp.h>
+
+static const char NETWORK[] = "name of your network", PASSWORD[] = "its password";
+static const IPAddress COMPUTER(192, 168, 1, 10); /* where edgepose runs */
+static const uint16_t UDP_PORT = 9000;
+static WiFiUDP udp;
+
+static void beginLine() {
+    WiFi.mode(WIFI_STA);
+    WiFi.setSleep(false); /* the radio would hold packets back for up to a tenth of a second */
+    WiFi.begin(NETWORK, PASSWORD);
+    while (WiFi.status() != WL_CONNECTED) delay(100);
+}
+
+static void sendDatagram(const uint8_t *wire, size_t n) {
+    if (!udp.beginPacket(COMPUTER, UDP_PORT)) return; /* not connected: the receiver detects the loss */
+    udp.write(wire, n);
+    udp.endPacket();
+}
+
+static void sendPacket(const edgepose_packet *p) {
+    uint8_t wire[EDGEPOSE_MAX_WIRE];
+    sendDatagram(wire, edgepose_encode(p, wire));
+}
+
+static void sendInfo(const edgepose_info *info) {
+    uint8_t wire[EDGEPOSE_MAX_WIRE];
+    sendDatagram(wire, edgepose_encode_info(info, wire));
+}
 
 #else
 
