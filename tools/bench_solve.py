@@ -157,8 +157,8 @@ class Sample(NamedTuple):
     path: Array | None = None
 
 
-def takes(data: Path, part: str, every: int, body: Body) -> Iterator[Sample]:
-    """Yield every `every`-th take of a part of the split, on the wearer's body."""
+def takes(data: Path, part: str, every: int, body: Body, frames: int | None = None) -> Iterator[Sample]:
+    """Yield every `every`-th take of a part, or so many frames of its middle, on the wearer's body."""
     from edgepose_export.training.dataset import take_paths
 
     for number, path in enumerate(take_paths(data, part)[::every]):
@@ -166,6 +166,9 @@ def takes(data: Path, part: str, every: int, body: Body) -> Iterator[Sample]:
             pose = rot.rotvec_to_matrix(file["poses"].reshape(-1, 24, 3).astype(float))
             # The recordings are of the default body; longer legs take longer steps.
             translation = file["trans"].astype(float) * (body.leg_length_m / default_body().leg_length_m)
+        if frames is not None:
+            start = max(0, (len(pose) - frames) // 2)
+            pose, translation = pose[start : start + frames], translation[start : start + frames]
         yield Sample(sensors_of(pose, translation, body, np.random.default_rng(number)), pose, translation)
 
 
@@ -291,6 +294,10 @@ def main() -> None:
     source.add_argument("--published", type=Path, help="folder of DIP-IMU or TotalCapture")
     good.add_argument("--part", default="cmu-walk-run", help="part of the split")
     good.add_argument("--every", type=int, default=1, metavar="N", help="use every Nth take only")
+    good.add_argument("--frames", type=int, metavar="N", help="use the middle N frames of each take only")
+    good.add_argument(
+        "--rows", type=lambda text: text.split(";"), help="names of rows, separated by semicolons"
+    )
     good.add_argument(
         "--prior", type=Path, help="file written by edgepose learn-prior, instead of the shipped prior"
     )
@@ -307,8 +314,10 @@ def main() -> None:
         else:
             body = own_body(np.random.default_rng(0))
             described = shaped_body(HEIGHT_M, SEX, WEIGHT_KG, WORDS)
-            samples = takes(flags.data, flags.part, flags.every, body)
-            table(samples, body, methods(prior, body, described, weights))
+            samples = takes(flags.data, flags.part, flags.every, body, flags.frames)
+            rows = methods(prior, body, described, weights)
+            chosen = {name: row for name, row in rows.items() if not flags.rows or name in flags.rows}
+            table(samples, body, chosen)
 
 
 if __name__ == "__main__":
