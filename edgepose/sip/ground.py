@@ -9,11 +9,14 @@ from edgepose.skeleton import JOINTS, forward_kinematics
 
 Array = NDArray[np.float64]
 
-STEP = 0.13
+STEP = 0.14
 """Smallest step of the ground from one stance to the next, metres; less is an error of the poses."""
 
 DRIFT = 0.4
-"""Largest vertical velocity, m/s, of a path that drifts; the ground does not change so slowly."""
+"""Largest vertical velocity, m/s, of a path that drifts while no foot stands for longer than a step takes."""
+
+STRIDE_S = 0.3
+"""Time without a stance after which a path drifts, seconds."""
 
 STANCE_S = 0.1
 """Shortest stance, seconds."""
@@ -107,7 +110,7 @@ def _levels(heights: Array, stances: list[tuple[slice, int]], rate: float) -> li
         if not levels:
             drift = height
         ground, last = height - drift, levels[-1] if levels else 0.0
-        least = STEP + DRIFT * max(frames.start - end, 0) / rate
+        least = STEP + DRIFT * max((frames.start - end) / rate - STRIDE_S, 0.0)
         if abs(ground - last) >= least:
             nearest = min(levels, key=lambda level: abs(ground - level))
             last = nearest if abs(ground - nearest) < STEP / 2.0 else ground
