@@ -108,6 +108,7 @@ def test_a_network_is_the_prior_unless_another_is_named(command, wearer, tmp_pat
     assert errors["network"] < 0.9 * errors["statistics"]
     assert errors["resampled"] < 0.95 * errors["statistics"]
     assert frames == {"network": 180, "resampled": 150, "statistics": 180}
+    assert "contact_left_ankle" in (tmp_path / "network.csv").read_text().splitlines()[0]
 
 
 def test_without_all_six_sensors_the_prior_is_statistical(command, wearer, tmp_path):
@@ -274,8 +275,8 @@ def test_wrong_use(command, wearer, tmp_path, words, message):
     assert message in " ".join(result.stderr.split())
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_ctrl_c_keeps_what_is_done(wearer, tmp_path, jobs):
+@pytest.mark.parametrize(("jobs", "prior"), [(1, "birnn"), (2, "default")])
+def test_ctrl_c_keeps_what_is_done(wearer, tmp_path, jobs, prior):
     long = read_recording(wearer.recording).sensors
     # Twelve seconds again and again: many chunks.
     repeated = {
@@ -290,7 +291,7 @@ def test_ctrl_c_keeps_what_is_done(wearer, tmp_path, jobs):
     path, out = tmp_path / "long.npz", tmp_path / "poses.csv"
     write_npz(path, Recording(repeated, {}))
     words = [sys.executable, "-m", "edgepose", "solve", path, "--calibration", wearer.calibration]
-    words += ["--csv", out, "--jobs", jobs, "--evaluations", 6, "--prior", "default"]
+    words += ["--csv", out, "--jobs", jobs, "--evaluations", 6, "--prior", prior]
     master, slave = os.openpty()  # a terminal, on which progress shows
     process = processes.Popen([str(word) for word in words], stderr=slave, start_new_session=True)
     os.close(slave)
