@@ -10,6 +10,7 @@ from edgepose.place import Place, PlaceTracker, Way
 from edgepose.pose import PoseFrame
 from edgepose.skeleton import Body
 
+
 LOWER_BODY = frozenset({"left_lower_leg", "right_lower_leg", "pelvis"})
 """Sensors of which one must measure for the place to be followed."""
 

@@ -45,7 +45,9 @@ def ankle_heights(path: Array, joints: Array, offsets: Array) -> Array:
     return path[:, 1:2] + joints[:, _ANKLES, 1] - (straight[_ANKLES] - straight.min())
 
 
-def grounded(path: Array, heights: Array, acceleration: Array, standing: Array, rate: float) -> Array:
+def grounded(
+    path: Array, heights: Array, acceleration: Array, standing: Array, rate: float, steps: bool = True
+) -> Array:
     """Return the height of the pelvis (T,) with which standing ankles are on the ground, metres.
 
     By least squares: its second difference is the acceleration, ankles that stand are as high as the ground,
@@ -57,6 +59,7 @@ def grounded(path: Array, heights: Array, acceleration: Array, standing: Array, 
         acceleration: (T,) upward acceleration of the pelvis, m/s^2; NaN where it is unknown.
         standing: (T - 1, 2) 0 to 1, whether each ankle stands still between frames.
         rate: frames a second.
+        steps: whether the ground may have steps; where stances are only guessed, it would climb errors.
     """
     from scipy.linalg import solveh_banded
 
@@ -66,7 +69,8 @@ def grounded(path: Array, heights: Array, acceleration: Array, standing: Array, 
         return path
     # The unknown is the correction of the path.
     weight, right = np.full(frames, 1e-9), np.zeros(frames)
-    for (rows, foot), level in zip(stances, _levels(heights, stances, rate), strict=True):
+    levels = _levels(heights, stances, rate) if steps else [0.0] * len(stances)
+    for (rows, foot), level in zip(stances, levels, strict=True):
         share = standing[rows, foot] / HEIGHT_ERROR**2
         weight[rows] += share
         right[rows] += share * (level - heights[rows, foot])

@@ -67,3 +67,9 @@ def test_without_stances_the_path_stays():
     path = np.linspace(0.0, 1.0, 50)
     unknown = np.full(50, np.nan)
     np.testing.assert_array_equal(grounded(path, np.zeros((50, 2)), unknown, np.zeros((49, 2)), RATE), path)
+
+
+def test_guessed_stances_climb_no_steps():
+    true, path, heights, standing = walk([0.0] * 6 + [0.3] * 6, 0.0)
+    found = grounded(path, heights, acceleration(true), standing, RATE, steps=False)
+    assert np.abs(found[-24:] - 0.9).max() < 0.1
