@@ -16,6 +16,7 @@ import argparse
 import resource
 import time
 from collections.abc import Callable, Iterable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -194,13 +195,17 @@ def solver(method: str, rig: PoseParameterisation, body: Body, weights: Weights)
     return lambda measurements: np.concatenate([p.rotations for p in solve(measurements, settings)])
 
 
+@cache
+def _model(name: str) -> Model:
+    return Model(name, precision="f32")
+
+
 def with_network(name: str, body: Body) -> Callable[[Measurements], tuple[Solution, Array | None]]:
     """Return SIP with a network's poses as the prior, as a function that also returns the network's place."""
     rig, points = network_rig(load_prior(), BONES), sensor_points(body, PLACEMENTS)
-    model = Model(name, precision="f32")
 
     def run(measurements: Measurements) -> tuple[Solution, Array | None]:
-        expected = network_prior(model, measurements, measurements.time_s)
+        expected = network_prior(_model(name), measurements, measurements.time_s)
         settings = Settings("sip", rig, points, WITH_NETWORK, network=expected)
         return concatenate(list(solve(measurements, settings))), expected.place
 

@@ -1,7 +1,7 @@
 """Path of the pelvis over a whole recording, from its acceleration, from contacts and from the ground.
 
-Assumptions: what is in contact stands still; the wearer starts on the ground, which is level except for steps,
-and without a network's contacts throughout.
+Assumptions: what is in contact stands still; the wearer starts on the ground; the ground is level except for
+steps, and without a network's contacts throughout.
 """
 
 from __future__ import annotations
