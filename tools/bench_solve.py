@@ -16,6 +16,7 @@ import argparse
 import resource
 import time
 from collections.abc import Callable, Iterable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -157,8 +158,8 @@ class Sample(NamedTuple):
     path: Array | None = None
 
 
-def takes(data: Path, part: str, every: int, body: Body) -> Iterator[Sample]:
-    """Yield every `every`-th take of a part of the split, on the wearer's body."""
+def takes(data: Path, part: str, every: int, body: Body, frames: int | None = None) -> Iterator[Sample]:
+    """Yield every `every`-th take of a part, or so many frames of its middle, on the wearer's body."""
     from edgepose_export.training.dataset import take_paths
 
     for number, path in enumerate(take_paths(data, part)[::every]):
@@ -166,6 +167,9 @@ def takes(data: Path, part: str, every: int, body: Body) -> Iterator[Sample]:
             pose = rot.rotvec_to_matrix(file["poses"].reshape(-1, 24, 3).astype(float))
             # The recordings are of the default body; longer legs take longer steps.
             translation = file["trans"].astype(float) * (body.leg_length_m / default_body().leg_length_m)
+        if frames is not None:
+            start = max(0, (len(pose) - frames) // 2)
+            pose, translation = pose[start : start + frames], translation[start : start + frames]
         yield Sample(sensors_of(pose, translation, body, np.random.default_rng(number)), pose, translation)
 
 
@@ -191,13 +195,17 @@ def solver(method: str, rig: PoseParameterisation, body: Body, weights: Weights)
     return lambda measurements: np.concatenate([p.rotations for p in solve(measurements, settings)])
 
 
+@cache
+def _model(name: str) -> Model:
+    return Model(name, precision="f32")
+
+
 def with_network(name: str, body: Body) -> Callable[[Measurements], tuple[Solution, Array | None]]:
     """Return SIP with a network's poses as the prior, as a function that also returns the network's place."""
     rig, points = network_rig(load_prior(), BONES), sensor_points(body, PLACEMENTS)
-    model = Model(name, precision="f32")
 
     def run(measurements: Measurements) -> tuple[Solution, Array | None]:
-        expected = network_prior(model, measurements, measurements.time_s)
+        expected = network_prior(_model(name), measurements, measurements.time_s)
         settings = Settings("sip", rig, points, WITH_NETWORK, network=expected)
         return concatenate(list(solve(measurements, settings))), expected.place
 
@@ -291,6 +299,10 @@ def main() -> None:
     source.add_argument("--published", type=Path, help="folder of DIP-IMU or TotalCapture")
     good.add_argument("--part", default="cmu-walk-run", help="part of the split")
     good.add_argument("--every", type=int, default=1, metavar="N", help="use every Nth take only")
+    good.add_argument("--frames", type=int, metavar="N", help="use the middle N frames of each take only")
+    good.add_argument(
+        "--rows", type=lambda text: text.split(";"), help="names of rows, separated by semicolons"
+    )
     good.add_argument(
         "--prior", type=Path, help="file written by edgepose learn-prior, instead of the shipped prior"
     )
@@ -307,8 +319,10 @@ def main() -> None:
         else:
             body = own_body(np.random.default_rng(0))
             described = shaped_body(HEIGHT_M, SEX, WEIGHT_KG, WORDS)
-            samples = takes(flags.data, flags.part, flags.every, body)
-            table(samples, body, methods(prior, body, described, weights))
+            samples = takes(flags.data, flags.part, flags.every, body, flags.frames)
+            rows = methods(prior, body, described, weights)
+            chosen = {name: row for name, row in rows.items() if not flags.rows or name in flags.rows}
+            table(samples, body, chosen)
 
 
 if __name__ == "__main__":

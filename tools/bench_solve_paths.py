@@ -125,13 +125,14 @@ def main() -> None:
     paths.add_argument("--data", type=Path, required=True, help="folder written by edgepose synthesize")
     paths.add_argument("--part", default="cmu-walk-run", help="part of the split")
     paths.add_argument("--every", type=int, default=1, metavar="N", help="use every Nth take only")
+    paths.add_argument("--frames", type=int, metavar="N", help="use the middle N frames of each take only")
     commands.add_parser("real", help="poses and paths of real wearers")
     flags = parser.parse_args()
     if flags.command == "real":
         real()
     else:
         body = own_body(np.random.default_rng(0))
-        place_table(takes(flags.data, flags.part, flags.every, body), body)
+        place_table(takes(flags.data, flags.part, flags.every, body, flags.frames), body)
 
 
 if __name__ == "__main__":

@@ -9,11 +9,14 @@ from edgepose.skeleton import JOINTS, forward_kinematics
 
 Array = NDArray[np.float64]
 
-STEP = 0.13
+STEP = 0.14
 """Smallest step of the ground from one stance to the next, metres; less is an error of the poses."""
 
 DRIFT = 0.4
-"""Largest vertical velocity, m/s, of a path that drifts; the ground does not change so slowly."""
+"""Largest vertical velocity, m/s, of a path that drifts while no foot stands for longer than a step takes."""
+
+STRIDE_S = 0.3
+"""Time without a stance after which a path drifts, seconds."""
 
 STANCE_S = 0.1
 """Shortest stance, seconds."""
@@ -42,7 +45,9 @@ def ankle_heights(path: Array, joints: Array, offsets: Array) -> Array:
     return path[:, 1:2] + joints[:, _ANKLES, 1] - (straight[_ANKLES] - straight.min())
 
 
-def grounded(path: Array, heights: Array, acceleration: Array, standing: Array, rate: float) -> Array:
+def grounded(
+    path: Array, heights: Array, acceleration: Array, standing: Array, rate: float, steps: bool = True
+) -> Array:
     """Return the height of the pelvis (T,) with which standing ankles are on the ground, metres.
 
     By least squares: its second difference is the acceleration, ankles that stand are as high as the ground,
@@ -54,6 +59,7 @@ def grounded(path: Array, heights: Array, acceleration: Array, standing: Array, 
         acceleration: (T,) upward acceleration of the pelvis, m/s^2; NaN where it is unknown.
         standing: (T - 1, 2) 0 to 1, whether each ankle stands still between frames.
         rate: frames a second.
+        steps: whether the ground may have steps; where stances are only guessed, it would climb errors.
     """
     from scipy.linalg import solveh_banded
 
@@ -63,7 +69,8 @@ def grounded(path: Array, heights: Array, acceleration: Array, standing: Array, 
         return path
     # The unknown is the correction of the path.
     weight, right = np.full(frames, 1e-9), np.zeros(frames)
-    for (rows, foot), level in zip(stances, _levels(heights, stances, rate), strict=True):
+    levels = _levels(heights, stances, rate) if steps else [0.0] * len(stances)
+    for (rows, foot), level in zip(stances, levels, strict=True):
         share = standing[rows, foot] / HEIGHT_ERROR**2
         weight[rows] += share
         right[rows] += share * (level - heights[rows, foot])
@@ -107,7 +114,7 @@ def _levels(heights: Array, stances: list[tuple[slice, int]], rate: float) -> li
         if not levels:
             drift = height
         ground, last = height - drift, levels[-1] if levels else 0.0
-        least = STEP + DRIFT * max(frames.start - end, 0) / rate
+        least = STEP + DRIFT * max((frames.start - end) / rate - STRIDE_S, 0.0)
         if abs(ground - last) >= least:
             nearest = min(levels, key=lambda level: abs(ground - level))
             last = nearest if abs(ground - nearest) < STEP / 2.0 else ground

@@ -1,6 +1,7 @@
 """Path of the pelvis over a whole recording, from its acceleration, from contacts and from the ground.
 
-Assumptions: what is in contact stands still; the ground is level except for steps; the wearer starts on it.
+Assumptions: what is in contact stands still; the wearer starts on the ground; the ground is level except for
+steps, and without a network's contacts throughout.
 """
 
 from __future__ import annotations
@@ -99,7 +100,8 @@ def pelvis_path(solution: Solution, offsets: Array, rate: float, place: Array | 
     start = standing_pelvis_position(offsets)
     path = start + np.concatenate([np.zeros((1, 3)), np.cumsum(speed, axis=0) / rate])
     heights = ankle_heights(path, joints, offsets)
-    path[:, 1] = grounded(path[:, 1], heights, solution.acceleration[:, 1], standing, rate)
+    vertical = solution.acceleration[:, 1]
+    path[:, 1] = grounded(path[:, 1], heights, vertical, standing, rate, steps=place is not None)
     return PelvisPath(path, contacts)
 
 

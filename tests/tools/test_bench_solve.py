@@ -46,6 +46,7 @@ def test_table_of_a_held_out_take(tmp_path):
     errors = {line[:32].strip(): float(line[32:].split()[0]) for line in lines[3:-1]}
     assert errors["SIP"] < errors["SIP-M"]
     assert errors["SIP"] < errors["SOP"]
+    assert errors["SIP, prior birnn"] < errors["birnn, online, 5 future frames"]
     assert errors["SIP-110"] < errors["SOP"]
     assert set(errors) >= {"SIP-BW", "SIP-120", "rnn, online", "birnn, online, 5 future frames"}
     assert "240 frames" in lines[-1]

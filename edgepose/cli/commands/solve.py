@@ -188,17 +188,21 @@ def solve(
     measurements = measure(data, mounts, solver.rate)
     network = _network(solver, body.hinges, data, mounts, measurements)
     settings = _settings(solver, body.hinges, wearer_body, measurements, network)
+    place = None if network is None else network.place
     interrupted = False
     with ExitStack() as stack:
         # Opened before the work, so that a wrong name is reported at once.
         sinks = open_outputs(
-            stack, outputs, solver.rate, lambda: interrupted, body=wearer_body, translation=True
+            *(stack, outputs, solver.rate, lambda: interrupted),
+            body=wearer_body,
+            translation=True,
+            contacts=place is not None,
         )
         solutions, interrupted = _collect(solve_all(measurements, settings, solver.jobs, _progress()))
         if not solutions:
             raise KeyboardInterrupt
         solution = residuals.concatenate(solutions)
-        place = None if network is None else network.place
+        place = None if place is None else place[: len(solution.rotations)]
         path = pelvis_path(solution, settings.body.offsets, solver.rate, place)
         _write(sinks, solution, measurements, path)
         for sink in sinks:

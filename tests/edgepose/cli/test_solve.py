@@ -24,7 +24,7 @@ from firmware_protocols import native
 from firmware_protocols.native_packet import Packet
 from tests.support import processes
 
-PLAIN = ("--evaluations", 12)
+PLAIN = ("--evaluations", 12, "--prior", "default")
 
 
 def moving_part(wearer, tmp_path, **changes):
@@ -67,7 +67,7 @@ def test_sip_is_nearer_than_sop(command, wearer, tmp_path):
         out = tmp_path / f"{method}.csv"
         result = command(
             *("solve", wearer.short, "--calibration", wearer.calibration, "--method", method, "--csv", out),
-            *("--rate", 100),
+            *("--rate", 100, "--prior", "default"),
         )
         assert result.returncode == 0, result.stderr
         poses = read_poses(out)
@@ -75,6 +75,58 @@ def test_sip_is_nearer_than_sop(command, wearer, tmp_path):
         true = rotvec_to_matrix(synthesized["poses"][rows].reshape(-1, 24, 3).astype(float))
         errors[method] = metrics.sip_error(poses.rotations, true).mean()
     assert errors["sip"] < errors["sop"]
+
+
+def test_a_network_is_the_prior_unless_another_is_named(command, wearer, tmp_path):
+    synthesized = np.load(wearer.recording.parent / "whole" / "09_12.npz")
+    errors, frames = {}, {}
+    for name, rate, words in (
+        ("network", 60, ()),
+        ("resampled", 50, ("--prior", "birnn")),
+        ("statistics", 60, ("--prior", "default")),
+    ):
+        out = tmp_path / f"{name}.csv"
+        result = command(
+            *(
+                "solve",
+                wearer.short,
+                "--calibration",
+                wearer.calibration,
+                "--csv",
+                out,
+                "--rate",
+                rate,
+                *words,
+            )
+        )
+        assert result.returncode == 0, result.stderr
+        poses = read_poses(out)
+        rows = np.clip(np.searchsorted(synthesized["t"], poses.time_s), 0, len(synthesized["t"]) - 1)
+        true = rotvec_to_matrix(synthesized["poses"][rows].reshape(-1, 24, 3).astype(float))
+        errors[name] = metrics.sip_error(poses.rotations, true).mean()
+        frames[name] = len(rows)
+    assert errors["network"] < 0.9 * errors["statistics"]
+    assert errors["resampled"] < 0.95 * errors["statistics"]
+    assert frames == {"network": 180, "resampled": 150, "statistics": 180}
+    assert "contact_left_ankle" in (tmp_path / "network.csv").read_text().splitlines()[0]
+
+
+def test_without_all_six_sensors_the_prior_is_statistical(command, wearer, tmp_path):
+    part = moving_part(wearer, tmp_path, head=None)
+    words = ("solve", part, "--calibration", wearer.calibration, "--csv", tmp_path / "o.csv", "--overwrite")
+    result = command(*words, "--evaluations", 4)
+    assert result.returncode == 0, result.stderr
+    assert result.stderr.splitlines()[0] == (
+        "no accelerations of head: the prior is the statistical one, not a network"
+    )
+    assert "--prior rnn needs the accelerations of head; use --prior default" in one_line(
+        command(*words, "--prior", "rnn")
+    )
+    for other in (("--method", "sop"), ("--body", "hinges")):
+        assert "takes no network as its prior: leave out --prior rnn" in one_line(
+            command(*words, "--prior", "rnn", *other)
+        )
+    assert "brnn: no such model" in one_line(command(*words[:1], wearer.short, *words[2:], "--prior", "brnn"))
 
 
 def test_bodies_of_every_kind(command, wearer, tmp_path):
@@ -91,7 +143,7 @@ def test_bodies_of_every_kind(command, wearer, tmp_path):
         out = tmp_path / "poses.csv"
         result = command(
             *("solve", part, "--calibration", wearer.calibration, "--csv", out, "--overwrite"),
-            *("--evaluations", 4, *words),
+            *("--evaluations", 4, "--prior", "default", *words),
         )
         assert result.returncode == 0, (words, result.stderr)
         assert len(read_poses(out).rotations) == 180
@@ -199,7 +251,7 @@ def test_one_frame_is_solved(command, wearer, tmp_path):
     }
     part = moving_part(wearer, tmp_path, **one)
     out = tmp_path / "poses.csv"
-    result = command("solve", part, "--calibration", wearer.calibration, "--csv", out)
+    result = command("solve", part, "--calibration", wearer.calibration, "--csv", out, *PLAIN)
     assert result.returncode == 0, result.stderr
     assert len(read_poses(out).rotations) == 1
 
@@ -223,8 +275,8 @@ def test_wrong_use(command, wearer, tmp_path, words, message):
     assert message in " ".join(result.stderr.split())
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_ctrl_c_keeps_what_is_done(wearer, tmp_path, jobs):
+@pytest.mark.parametrize(("jobs", "prior"), [(1, "birnn"), (2, "default")])
+def test_ctrl_c_keeps_what_is_done(wearer, tmp_path, jobs, prior):
     long = read_recording(wearer.recording).sensors
     # Twelve seconds again and again: many chunks.
     repeated = {
@@ -239,7 +291,7 @@ def test_ctrl_c_keeps_what_is_done(wearer, tmp_path, jobs):
     path, out = tmp_path / "long.npz", tmp_path / "poses.csv"
     write_npz(path, Recording(repeated, {}))
     words = [sys.executable, "-m", "edgepose", "solve", path, "--calibration", wearer.calibration]
-    words += ["--csv", out, "--jobs", jobs, "--evaluations", 6]
+    words += ["--csv", out, "--jobs", jobs, "--evaluations", 6, "--prior", prior]
     master, slave = os.openpty()  # a terminal, on which progress shows
     process = processes.Popen([str(word) for word in words], stderr=slave, start_new_session=True)
     os.close(slave)

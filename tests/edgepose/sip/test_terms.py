@@ -10,9 +10,10 @@ from edgepose.sip import levenberg_marquardt as minimise
 from edgepose.sip.bodies import sensor_points
 from edgepose.sip.energy import Problem, Weights
 from edgepose.sip.kinematics import orientation_jacobian
+from edgepose.sip.network_prior import NetworkPrior
 from edgepose.sip.parameterisation import hinge_rig, smpl_rig
 from edgepose.sip.prior import load_prior
-from edgepose.skeleton import default_body
+from edgepose.skeleton import default_body, forward_kinematics
 
 FRAMES = 6
 
@@ -65,7 +66,7 @@ def test_orientation_residuals_change_as_their_jacobian_says(hinges):
     this, at = problem(hinges=hinges)
     here = terms.evaluate(this, at)
     turns = rot.inverse_left_jacobian(here.orientation_residual) @ orientation_jacobian(
-        here.states, this.body
+        here.states, this.body.bones
     ).reshape(FRAMES, -1, 3, 72)
     analytic = block_diagonal((turns @ this.rig.basis).reshape(FRAMES, -1, at.shape[1]))
     assert (
@@ -81,8 +82,18 @@ def test_sensors_move_as_their_jacobian_says(hinges):
     assert relative_error(analytic, reference) < 1e-6
 
 
-def test_the_gradient_is_that_of_the_cost():
+def expected_by_a_network(seed=1):
+    rng = np.random.default_rng(seed)
+    local = rot.rotvec_to_matrix(0.4 * rng.normal(size=(FRAMES, 24, 3)))
+    joints = np.array([1, 2, 3, 16])
+    orientation = forward_kinematics(local, np.zeros((24, 3)))[0][:, joints]
+    return NetworkPrior(joints, local, orientation, rng.uniform(1.0, 20.0, (FRAMES, len(joints))), None)
+
+
+@pytest.mark.parametrize("network", [None, expected_by_a_network()])
+def test_the_gradient_is_that_of_the_cost(network):
     this, at = problem()
+    this = this._replace(network=network)
     at[2, 10:14] = 3.0  # beyond the limits
     here = terms.evaluate(this, at)
     assert here.costs.limits[2] > 0.1
