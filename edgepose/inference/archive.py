@@ -186,6 +186,21 @@ def _check_metadata(path: Path, metadata: Any) -> None:
             raise ModelError(f"{path}: the archive's number of {name} frames {frames!r} is not valid")
 
 
+def read_content(info: ArchiveInfo) -> bytes:
+    """Return the bytes of an archive.
+
+    Raises:
+        ModelError: the file cannot be read, or is not the one that `info` describes any more.
+    """
+    try:
+        content = info.path.read_bytes()
+    except OSError as error:
+        raise ModelError(f"{info.path}: {error.strerror or error}") from error
+    if hashlib.sha256(content).hexdigest() != info.sha256:
+        raise ModelError(f"{info.path}: the archive changed while it was being loaded; run again")
+    return content
+
+
 def load(info: ArchiveInfo, trust: bool = False) -> torch.jit.ScriptModule:
     """Load a trusted archive for the CPU, ready to run on one thread.
 
@@ -207,13 +222,11 @@ def load(info: ArchiveInfo, trust: bool = False) -> torch.jit.ScriptModule:
     torch.set_num_threads(1)
     # torch.nn.LSTM and small products are slower through oneDNN at batch 1.
     torch.backends.mkldnn.enabled = False  # type: ignore[assignment]
+    content = read_content(info)
     try:
-        content = info.path.read_bytes()
-        if hashlib.sha256(content).hexdigest() != info.sha256:
-            raise ModelError(f"{info.path}: the archive changed while it was being loaded; run again")
         with suppress_quantisation_warning():
             module: torch.jit.ScriptModule = torch.jit.load(io.BytesIO(content), map_location="cpu")
-    except (RuntimeError, ValueError, OSError) as error:
+    except (RuntimeError, ValueError) as error:
         reason = str(error).strip().splitlines()
         raise ModelError(
             f"{info.path}: torch cannot load the archive ({reason[0] if reason else type(error).__name__})"

@@ -236,7 +236,7 @@ class BirnnArchive(RecurrentArchive):
         size = self.forward1.size
         zero, waiting = torch.zeros(batch, size), torch.zeros(batch, 0, 4 * size)
         state = [zero, zero, zero, zero, waiting, waiting, waiting, torch.zeros(batch, 0, 9, 3, 3)]
-        return state + self.ends.start(batch) + [torch.zeros(future)]  # noqa: RUF005
+        return state + self.ends.start(batch) + [torch.zeros(future)]
 
     def oldest(
         self, state: list[Tensor], count: int, future: int
@@ -260,7 +260,7 @@ class BirnnArchive(RecurrentArchive):
             seen.flatten(0, 1), torch.cat([past, later], dim=1), state[8:10], count, count
         )
         left = [state[4].narrow(1, count, future), waiting, state[6].narrow(1, count, future), waiting_seen]
-        return rotations, std, place, [state[0], state[1], h2, c2] + left + lowpass + state[10:]
+        return rotations, std, place, [state[0], state[1], h2, c2] + left + lowpass + state[10:]  # noqa: RUF005
 
     def advanced(
         self, orientation: Tensor, acceleration: Tensor, frames: int, state: list[Tensor]

@@ -67,7 +67,7 @@ class LstmCell(nn.Module):
     def run(self, products: list[Tensor]) -> list[Tensor]:
         """Return outputs (B, hidden) for the inputs' products (B, 4 hidden) of frames, from a zero state."""
         h, c = self.first(products[0])
-        return [h] + self.over(products[1:], h, c)[0]  # noqa: RUF005 - TorchScript has no starred lists
+        return [h] + self.over(products[1:], h, c)[0]
 
     @torch.jit.export
     def carry(self, products: Tensor, h: Tensor, c: Tensor, frames: int) -> tuple[Tensor, Tensor, Tensor]:

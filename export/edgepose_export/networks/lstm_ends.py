@@ -8,10 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from edgepose.inference.features import nearest_rotation
-from edgepose.skeleton import PARENTS
-from edgepose_export.networks.lstm_frames import SEEN, SEEN_ROOT, SeenFromRoot, input_weights
+from edgepose.inference.rotation_rows import rotation_rows
+from edgepose_export.networks.lstm_frames import SeenFromRoot, input_weights
 from edgepose_export.networks.packed_linear import PackedLinear
-from edgepose_export.networks.shape import SIGMA_FLOOR, NetworkShape, PoseDecoder, PoseNetwork, sources
+from edgepose_export.networks.shape import SIGMA_FLOOR, PoseDecoder, PoseNetwork
 
 TINY = 1e-12
 """Smallest length that a vector is divided by."""
@@ -56,12 +56,12 @@ class NormalisationAndDecoding(nn.Module):
         self.heads = PackedLinear(torch.cat(weights), torch.cat(biases))
         self.register_buffer("variances", decoder.variances)
         self.register_buffer("source", decoder.source)
-        child, above = chain(shape)
+        child, above = rotation_rows(shape.joints, decoder.passed)
         self.register_buffer("child", torch.tensor(child))
         self.register_buffer("above", torch.tensor(above))
 
     def forward(self, orientation: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the first hidden layer (N, hidden) of calibrated frames, and the frames as `pose` needs them.
+        """Return the first hidden layer (N, hidden) of frames, and the frames as `pose` needs them.
 
         Args:
             orientation: (N, 6, 3, 3).
@@ -155,15 +155,3 @@ class NormalisationAndDecoding(nn.Module):
 def last(x: Tensor, frames: int, count: int) -> Tensor:
     """Return the last `count` of each wearer's `frames` frames (N, ...)."""
     return x.unflatten(0, (-1, frames))[:, frames - count :].flatten(0, 1)
-
-
-def chain(shape: NetworkShape) -> tuple[list[int], list[int]]:
-    """Return for each of the 24 joints the rows of its own and of its parent's rotation.
-
-    They are rows of [frames seen from the root..., predicted rotations..., identity], all transposed apart
-    from the root's orientation. That one counts as the parent of joint 0, whose own rotation is the identity.
-    """
-    joints = len(shape.joints)
-    rows = [SEEN + joints, *range(SEEN, SEEN + joints), *range(SEEN)]
-    child = [rows[source] for source in sources(shape)]
-    return child, [SEEN_ROOT, *(child[parent] for parent in PARENTS[1:])]

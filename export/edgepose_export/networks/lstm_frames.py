@@ -5,22 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from edgepose.inference.rotation_rows import SEEN, SEEN_ROOT
 from edgepose.placements import PLACEMENTS, ROOT
 from edgepose_export.networks.normalisation import heading_of
 
-SEEN = 9
-"""Matrices of a frame seen from its root, see `SeenFromRoot`."""
-
-SEEN_ROOT = 8
-"""The one of them that is the root's orientation."""
-
 
 class SeenFromRoot(nn.Module):
-    """Frames in the root's frame, (N, 9, 3, 3), from N frames (N, 6, 3, 3) and (N, 6, 3).
-
-    The rows of 0 to 5 are the columns of the sensors' orientations, those of 6 and 7 the accelerations of the
-    six sensors; 8 is the root's orientation. Each row of 0 to 7 is a vector in the root's frame.
-    """
+    """Frames (N, 9, 3, 3) in the root's frame, see `rotation_rows.SEEN`, from (N, 6, 3, 3) and (N, 6, 3)."""
 
     def __init__(self, scheme: str) -> None:
         """Store the normalisation, one of `normalisation.SCHEMES`."""

@@ -197,7 +197,7 @@ class PoseDecoder(nn.Module):
         self.numbers = shape.numbers
         self.register_buffer("target_mean", target_mean)
         self.register_buffer("target_std", target_std)
-        self.register_buffer("source", torch.tensor(sources(shape)))
+        self.register_buffer("source", torch.tensor(_sources(shape)))
         self.register_buffer("parents", torch.tensor(PARENTS[1:]))
         scale = torch.ones(len(PARENTS)) if std_scale is None else std_scale
         self.register_buffer("variances", _variances(shape, target_std, scale))
@@ -240,7 +240,7 @@ class PoseDecoder(nn.Module):
         return local_rotations(relative, root, self.parents)
 
 
-def sources(shape: NetworkShape) -> list[int]:
+def _sources(shape: NetworkShape) -> list[int]:
     """Return for each of the 24 joints the row of [identity, predicted..., measured...] with its rotation."""
     rows = {joint: 1 + i for i, joint in enumerate(shape.joints)}
     if shape.measured == "passed":
