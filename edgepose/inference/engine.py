@@ -170,8 +170,8 @@ class StreamEngine:
         self._network, self._past, self._frames_per_step = as_runtime(module, place), past, frames_per_step
         self._frames: list[tuple[Array, Array]] = []
         self._stream = _StreamState(self._network.start(1, future))
-        for _ in range(WARM_UP + future):
-            self._frames = [_at_rest()] * frames_per_step
+        for _ in range(WARM_UP + future if frames_per_step == 1 else 0):  # no one waits for several
+            self._frames = [_at_rest()]
             self._run()
         self._stream = _StreamState(self._network.start(1, future))
 

@@ -14,31 +14,14 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from edgepose.errors import ModelError
-from edgepose.inference.archive import ArchiveInfo, read_content
-from edgepose.inference.rotation_rows import SEEN, SEEN_ROOT, rotation_rows
-from edgepose.inference.runtime import Array, Results
+from edgepose.inference.archive import ArchiveInfo
+from edgepose.inference.numpy_ends import Ends, State, rows
+from edgepose.inference.rotation_rows import SEEN
+from edgepose.inference.runtime import Array, Results, Runtime
 from edgepose.inference.weights import Recipe, read_weights, recipe_of
-from edgepose.placements import ROOT
-from edgepose.pose import CONTACTS
 
-State = list[Array]
-
-_TINY = np.float32(1e-12)
 _BLOCK = 64
 """Columns of a block of weights. BLAS takes a third of the time for six rows if it finds small matrices."""
-
-_IDENTITY = np.eye(3, dtype=np.float32).reshape(1, 1, 3, 3)
-_ONES = np.ones((3, 1), np.float32)
-_YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
-_CONTACTS = len(CONTACTS)
-
-# Sums of a rotation's entries that are sine and cosine of its turn about Y, times a number. Where that is
-# zero, the root is upside down, and counts as not turned.
-_TURN = np.array([[0, 0, 1, 0, 0, 0, -1, 0, 0], [1, 0, 0, 0, 0, 0, 0, 0, 1]], np.float32).T.copy()
-_NO_TURN = np.array([0.0, 1e-12], np.float32)
-# The rotation that takes a turn back, from its sine and cosine.
-_BACK = np.array([[0, 0, -1, 0, 0, 0, 1, 0, 0], [1, 0, 0, 0, 0, 0, 0, 0, 1]], np.float32)
-_VERTICAL = np.array([0, 0, 0, 0, 1, 0, 0, 0, 0], np.float32)
 
 
 def load(info: ArchiveInfo) -> Rnn | Birnn:
@@ -47,102 +30,30 @@ def load(info: ArchiveInfo) -> Rnn | Birnn:
     Raises:
         ModelError: numpy cannot run the network, or the archive is damaged or lacks the weights.
     """
-    content = read_content(info)
     try:
         recipe = recipe_of(info.metadata)
-        weights = read_weights(content, recipe.shapes())
+        # One by one, so that few are in memory twice.
+        weights = {
+            name: array if name.startswith("ends.") else _prepared(array, recipe.hidden)
+            for name, array in read_weights(info.path, recipe.shapes())
+        }
     except ModelError as error:
         raise ModelError(f"{info.path}: {error}") from error
     return (Rnn if recipe.kind == "rnn" else Birnn)(recipe, weights)
 
 
-class _Ends:
-    """The layers before and after the recurrent ones."""
-
-    def __init__(self, recipe: Recipe, weights: Mapping[str, Array]) -> None:
-        self._weights = {name.removeprefix("ends."): array for name, array in weights.items()}
-        self.vectors = 2 * len(recipe.joints)
-        self._smoothing, self.place = recipe.smoothing, recipe.place
-        self._own, self._above = map(np.array, rotation_rows(recipe.joints, recipe.passed))
-
-    def with_place(self, place: bool) -> _Ends:
-        """See `NumpyNetwork.with_place`."""
-        ends = copy(self)
-        ends.place = self.place if place else 0
-        return ends
-
-    def inputs(self, orientation: Array, acceleration: Array) -> tuple[Array, Array]:
-        """Return the first hidden layer (N, hidden) of N frames, and the frames seen from the root."""
-        count, root = len(orientation), orientation[:, ROOT]
-        columns, rows = orientation.swapaxes(2, 3), acceleration.reshape(count, 2, 3, 3)
-        vectors = np.concatenate([columns, rows, _IDENTITY.repeat(count, axis=0)], axis=1)
-        seen = vectors.reshape(count, -1, 3) @ root
-        x = seen.reshape(count, -1) @ self._weights["dense.weight"]
-        x += self._weights["dense.bias"]
-        return np.maximum(x, 0.0, out=x), seen.reshape(count, SEEN, 3, 3)
-
-    def poses(self, seen: Array, hidden: Array, lowpass: State, count: int) -> tuple[Results, State]:
-        """Return the results for the last `count` frames, and the new state of the low-pass.
-
-        Args:
-            seen: (B, T, 9, 3, 3) frames, from `inputs`.
-            hidden: (B, T, units) recurrent outputs.
-            lowpass: outputs (B, vectors, 3) of both stages of the low-pass.
-            count: number of frames.
-        """
-        batch, frames = hidden.shape[:2]
-        numbers = _rows(hidden) @ self._weights["heads.weight"]
-        numbers += self._weights["heads.bias"]
-        numbers, size = numbers.reshape(batch, frames, -1), 3 * self.vectors
-        vectors = numbers[:, :, :size].reshape(batch, frames, -1, 3)
-        if self._smoothing:
-            vectors, lowpass = self._smoothed(vectors, seen[:, :, SEEN_ROOT], lowpass)
-        rotations = self._rotations(_rows(seen[:, -count:]), _rows(vectors[:, -count:]))
-        deviation = np.logaddexp(numbers[:, -count:, size : 2 * size], 0.0)  # SoftPlus
-        deviation += self._weights["floor"]
-        std = np.sqrt(_rows(deviation * deviation) @ self._weights["variances"])
-        place = None
-        if self.place:
-            place = numbers[:, -count:, 2 * size :]
-            place[:, :, :_CONTACTS] = 0.5 + 0.5 * np.tanh(0.5 * place[:, :, :_CONTACTS])
-        shape = (batch, count, 24)
-        return Results(rotations.reshape(*shape, 3, 3), std.reshape(shape), place), lowpass
-
-    def _smoothed(self, vectors: Array, root: Array, lowpass: State) -> tuple[Array, State]:
-        """Apply the low-pass to vectors (B, T, N, 3) in the level frame of roots (B, T, 3, 3)."""
-        level, (first, second) = _level(root), lowpass
-        vectors = vectors @ level.swapaxes(-1, -2)
-        for t in range(vectors.shape[1]):
-            first = vectors[:, t] + self._smoothing * (first - vectors[:, t])
-            vectors[:, t] = second = first + self._smoothing * (second - first)
-        return vectors @ level, [first, second]
-
-    def _rotations(self, seen: Array, vectors: Array) -> Array:
-        """Return local rotations (N, 24, 3, 3) from vectors (N, 2 joints, 3), first all first columns."""
-        count, joints = len(seen), self.vectors // 2
-        # Transposed, as in `seen`: the rows of each matrix are its rotation's columns.
-        axes = np.empty((count, joints, 3, 3), np.float32)
-        axes[:, :, 0] = first = vectors[:, :joints]
-        axes[:, :, 2] = third = _cross(first, vectors[:, joints:])
-        axes[:, :, 1] = _cross(third, first)
-        axes /= np.maximum(_lengths(axes), _TINY)
-        known = np.concatenate([seen, axes, _IDENTITY.repeat(count, axis=0)], axis=1)
-        return known.take(self._above, axis=1) @ known.take(self._own, axis=1).swapaxes(2, 3)
-
-
 class _Cell:
     """One direction of an LSTM layer, without the product of its inputs."""
 
-    def __init__(self, weight: Array) -> None:
-        self.size = len(weight)
-        self._weight = _in_blocks(_for_tanh(weight, self.size))
+    def __init__(self, weight: Array, size: int) -> None:
+        self._weight, self._size = weight, size
 
     def run(self, products: Array, h: Array | None, c: Array | None) -> tuple[Array, Array, Array]:
         """Return outputs (B, T, hidden) for the inputs' products (B, T, 4 hidden), and the last h and c.
 
         Without h and c, the state before is zero.
         """
-        (batch, frames, _), size = products.shape, self.size
+        (batch, frames, _), size = products.shape, self._size
         outputs = np.empty((batch, frames, size), np.float32)
         for t in range(frames):
             gates = products[:, t].copy() if h is None else _times(h, self._weight)
@@ -162,29 +73,21 @@ class _Cell:
         return outputs, h, c
 
 
-class NumpyNetwork:
+class NumpyNetwork(Runtime):
     """What both networks share. The methods are those of `runtime.Runtime`."""
 
     def __init__(self, recipe: Recipe, weights: Mapping[str, Array]) -> None:
-        """Use weights of the shapes that `Recipe.shapes` returns."""
-        self._ends = _Ends(recipe, weights)
+        """Use weights as `load` prepares them."""
+        self._ends = Ends(recipe, weights)
+        self._weights = weights
         self._cells = {
-            name.removesuffix(".state.weight"): _Cell(weight)
+            name.removesuffix(".state.weight"): _Cell(weight, recipe.hidden)
             for name, weight in weights.items()
             if name.endswith(".state.weight")
         }
-        layers = {
-            name: _for_tanh(weight, recipe.hidden)
-            for name, weight in weights.items()
-            if not name.startswith("ends.") and ".state." not in name
-        }
-        self._biases = {name.removesuffix(".bias"): x for name, x in layers.items() if x.ndim == 1}
-        self._weights = {
-            name.removesuffix(".weight"): _in_blocks(x) for name, x in layers.items() if x.ndim == 2
-        }
         self._zero = np.zeros((1, recipe.hidden), np.float32)
 
-    def with_place(self, place: bool) -> NumpyNetwork:
+    def with_place(self, place: bool) -> Runtime:
         """Return this network with or without the place among its results, if it estimates the place."""
         network = copy(self)
         network._ends = self._ends.with_place(place)
@@ -192,15 +95,15 @@ class NumpyNetwork:
 
     def _product(self, name: str, x: Array) -> Array:
         """Return the products of inputs (B, T, N) with the weights of a layer, with its bias if any."""
-        product = _times(_rows(x), self._weights[name])
-        if name in self._biases:
-            product += self._biases[name]
+        product = _times(rows(x), self._weights[f"{name}.weight"])
+        if f"{name}.bias" in self._weights:
+            product += self._weights[f"{name}.bias"]
         return product.reshape(*x.shape[:2], -1)
 
     def _inputs(self, orientation: Array, acceleration: Array) -> tuple[Array, Array]:
         """Return the first hidden layer (B, T, hidden) of frames, and the frames seen from the root."""
         shape = orientation.shape[:2]
-        x, seen = self._ends.inputs(_rows(orientation), _rows(acceleration))
+        x, seen = self._ends.inputs(rows(orientation), rows(acceleration))
         return x.reshape(*shape, -1), seen.reshape(*shape, SEEN, 3, 3)
 
     def _start(self, batch: int) -> tuple[State, State]:
@@ -318,8 +221,9 @@ class Birnn(NumpyNetwork):
         while left := state[4].shape[1]:
             result, state = self._oldest(state, 1, left - 1)
             results.append(result)
-        columns = zip(*results, strict=True)
-        return Results(*(None if column[0] is None else np.concatenate(column, axis=1) for column in columns))
+        rotations, std, places = zip(*results, strict=True)
+        place = np.concatenate(places, axis=1) if self._ends.place else None
+        return Results(np.concatenate(rotations, axis=1), np.concatenate(std, axis=1), place)
 
     def _oldest(self, state: State, count: int, future: int) -> tuple[Results, State]:
         """Return the results for the `count` oldest waiting frames, and the state without them.
@@ -339,11 +243,6 @@ class Birnn(NumpyNetwork):
         return results, [*state[:2], h2, c2, *waiting, *lowpass, state[10]]
 
 
-def _rows(x: Array) -> Array:
-    """Return (B, T, ...) as (B T, ...)."""
-    return x.reshape(-1, *x.shape[2:])
-
-
 def _reversed(x: Array) -> Array:
     """Return (B, T, ...) with the last frame first."""
     return x[:, ::-1]
@@ -352,47 +251,23 @@ def _reversed(x: Array) -> Array:
 def _fields(waiting: Array, future: int) -> Array:
     """Return the frames that each frame of (B, T, N) uses, (B count, future + 1, N), the last first."""
     fields = sliding_window_view(waiting, future + 1, axis=1).swapaxes(2, 3)
-    return _reversed(_rows(fields))
+    return _reversed(rows(fields))
 
 
-def _for_tanh(weight: Array, size: int) -> Array:
-    """Return weights or biases (..., 4 size k) of gates i, f, g, o in the order i, f, o, g, all halved.
+def _prepared(weight: Array, size: int) -> Array:
+    """Return weights (N, M) or biases (M,) of gates i, f, g, o in the order i, f, o, g, all halved.
 
     Exports double those of g, so tanh of a product is the candidate, and gives the gates, see `_Cell.run`.
+    Weights come as blocks (M / 64, N, 64), or (1, N, M) if there are no such blocks.
     """
-    gates = weight.reshape(*weight.shape[:-1], -1, 4, size)
-    return 0.5 * gates.take([0, 1, 3, 2], axis=-2).reshape(weight.shape)
-
-
-def _in_blocks(weight: Array) -> Array:
-    """Return weights (N, M) as blocks (M / 64, N, 64), or (1, N, M) if there are no such blocks."""
+    gates = weight.reshape(*weight.shape[:-1], -1, 4, size).take([0, 1, 3, 2], axis=-2)
+    gates *= 0.5
+    if weight.ndim == 1:
+        return gates.reshape(-1)
     width = _BLOCK if weight.shape[1] % _BLOCK == 0 else weight.shape[1]
-    return np.ascontiguousarray(weight.reshape(len(weight), -1, width).swapaxes(0, 1))
+    return np.ascontiguousarray(gates.reshape(len(weight), -1, width).swapaxes(0, 1))
 
 
 def _times(x: Array, blocks: Array) -> Array:
     """Return the product (N, M) of rows (N, K) and weights in blocks."""
     return np.matmul(x, blocks).swapaxes(0, 1).reshape(len(x), -1)
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Return cross products of vectors (..., 3); numpy's takes five times as long for a few."""
-    product: Array = a.take(_YZX, -1) * b.take(_ZXY, -1)
-    product -= a.take(_ZXY, -1) * b.take(_YZX, -1)
-    return product
-
-
-def _lengths(vectors: Array) -> Array:
-    """Return the lengths (..., 1) of vectors (..., 3)."""
-    squares: Array = (vectors * vectors) @ _ONES
-    return np.sqrt(squares, out=squares)
-
-
-def _level(root: Array) -> Array:
-    """Return roots (..., 3, 3) without their turn about Y."""
-    turn = root.reshape(*root.shape[:-2], 9) @ _TURN
-    turn += _NO_TURN
-    turn /= np.hypot(turn[..., :1], turn[..., 1:])
-    back = turn @ _BACK
-    back += _VERTICAL
-    return back.reshape(root.shape) @ root

@@ -6,10 +6,10 @@ torch stores each tensor of an archive as raw numbers in a file of its own, and 
 
 from __future__ import annotations
 
-import io
 import json
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,10 +61,9 @@ class Recipe(NamedTuple):
             "ends.variances": (outputs, 24),
             "ends.floor": (),
         }
-        if self.kind == "rnn":
-            layers, cells = {"inputs1": 4, "inputs2": 4}, ("cell1", "cell2")
-        else:
-            layers, cells = {"inputs1": 8, "ahead2": 8}, ("forward1", "backward1", "forward2", "backward2")
+        layers, cells = {"inputs1": 4, "inputs2": 4}, ["cell1", "cell2"]
+        if self.kind == "birnn":
+            layers, cells = {"inputs1": 8, "ahead2": 8}, ["forward1", "backward1", "forward2", "backward2"]
             shapes |= {f"back2_{name}.weight": (size, 4 * size) for name in ("forward", "backward")}
         for name, count in layers.items():
             shapes |= {f"{name}.weight": (size, count * size), f"{name}.bias": (count * size,)}
@@ -111,11 +110,11 @@ def recipe_of(metadata: Mapping[str, Any]) -> Recipe:
     )
 
 
-def read_weights(content: bytes, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
-    """Return weights of an archive by name.
+def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> Iterator[tuple[str, Array]]:
+    """Yield the names and arrays of an archive's weights, one after the other.
 
     Args:
-        content: the archive.
+        path: the archive.
         shapes: the names of the weights to read, and the shapes that they must have.
 
     Raises:
@@ -123,11 +122,12 @@ def read_weights(content: bytes, shapes: Mapping[str, tuple[int, ...]]) -> dict[
             message does not name the archive.
     """
     try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        with zipfile.ZipFile(path) as archive:
             index = _read_index(archive)
-            return {name: _read(archive, index, name, shape) for name, shape in shapes.items()}
+            for name, shape in shapes.items():
+                yield name, _read(archive, index, name, shape)
     # RuntimeError: passwords, unknown compression, deeply nested JSON.
-    except (zipfile.BadZipFile, EOFError, KeyError, ValueError, RuntimeError) as error:
+    except (zipfile.BadZipFile, EOFError, KeyError, ValueError, RuntimeError, OSError) as error:
         raise ModelError(f"its weights cannot be read ({error}); get or export it again") from error
 
 

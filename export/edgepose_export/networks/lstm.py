@@ -270,12 +270,12 @@ class BirnnArchive(RecurrentArchive):
         ahead, back = self.inputs1(x).split_with_sizes(self.directions, 1)
         ahead, h1, c1 = self.forward1.carry(ahead, state[0], state[1], frames)
         ahead, later = self.ahead2(ahead).split_with_sizes(self.directions, 1)
-        batch = (-1, frames)
+        width = self.directions[0]
         waiting = [
-            torch.cat([state[4], back.unflatten(0, batch)], dim=1),
-            torch.cat([state[5], ahead.unflatten(0, batch)], dim=1),
-            torch.cat([state[6], later.unflatten(0, batch)], dim=1),
-            torch.cat([state[7], seen.unflatten(0, batch)], dim=1),
+            torch.cat([state[4], back.view(-1, frames, width)], dim=1),
+            torch.cat([state[5], ahead.view(-1, frames, width)], dim=1),
+            torch.cat([state[6], later.view(-1, frames, width)], dim=1),
+            torch.cat([state[7], seen.view(-1, frames, 9, 3, 3)], dim=1),
         ]
         state = [h1, c1] + state[2:4] + waiting + state[8:]  # noqa: RUF005
         future = state[10].shape[0]
@@ -303,7 +303,7 @@ class BirnnPlaceArchive(PlaceMethods, BirnnArchive):
 
 def rows(x: Tensor, frames: int) -> list[Tensor]:
     """Return sequences (B frames, N) as a list of (B, N), one for each frame."""
-    return x.unflatten(0, (-1, frames)).unbind(1)
+    return x.view(-1, frames, x.shape[1]).unbind(1)
 
 
 def joined(outputs: list[Tensor]) -> Tensor:

@@ -99,10 +99,9 @@ class NormalisationAndDecoding(nn.Module):
         if count < frames:
             pose, deviation = last(pose, frames, count), last(deviation, frames, count)
             seen, place = last(seen, frames, count), last(place, frames, count)
-        batch = (-1, count)
-        rotations = self.rotations(seen, pose).unflatten(0, batch)
-        std = self.deviations(deviation).unflatten(0, batch)
-        return rotations, std, place.unflatten(0, batch), lowpass
+        rotations = self.rotations(seen, pose).view(-1, count, 24, 3, 3)
+        std = self.deviations(deviation).view(-1, count, 24)
+        return rotations, std, place.view(-1, count, place.shape[1]), lowpass
 
     def smoothed(
         self, pose: Tensor, root: Tensor, lowpass: list[Tensor], frames: int
