@@ -89,7 +89,7 @@ def recipe_of(metadata: Mapping[str, Any]) -> Recipe:
     for key, values in wanted.items():
         if metadata.get(key) not in values:
             raise ModelError(
-                f"numpy runs networks with {key} {' or '.join(values)}, not {str(metadata.get(key))[:40]}; "
+                f"numpy runs networks with {key} {' or '.join(values)}, not {repr(metadata.get(key))[:40]}; "
                 "use --runtime torch"
             )
     hidden, joints, smoothing = (metadata.get(key) for key in ("hidden", "joints", "smoothing"))
@@ -123,15 +123,16 @@ def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> Iterator[
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            index = _read_index(archive)
+            folder, index = _read_index(archive)
             for name, shape in shapes.items():
-                yield name, _read(archive, index, name, shape)
+                yield name, _read(archive, folder, index.get(name), name, shape)
     # RuntimeError: passwords, unknown compression, deeply nested JSON.
     except (zipfile.BadZipFile, EOFError, KeyError, ValueError, RuntimeError, OSError) as error:
         raise ModelError(f"its weights cannot be read ({error}); get or export it again") from error
 
 
-def _read_index(archive: zipfile.ZipFile) -> dict[str, Any]:
+def _read_index(archive: zipfile.ZipFile) -> tuple[str, dict[str, Any]]:
+    """Return the folder that the archive's files are in, and the index."""
     entries = [entry for entry in archive.infolist() if entry.filename.endswith(f"/extra/{WEIGHTS_FILE}")]
     if not entries:
         raise ModelError(
@@ -142,14 +143,14 @@ def _read_index(archive: zipfile.ZipFile) -> dict[str, Any]:
     index = json.loads(archive.read(entries[0]))
     if not isinstance(index, dict):
         raise ValueError(f"{WEIGHTS_FILE} is no object")
-    return {"": entries[0].filename.removesuffix(f"extra/{WEIGHTS_FILE}")} | index
+    return entries[0].filename.removesuffix(f"extra/{WEIGHTS_FILE}"), index
 
 
-def _read(archive: zipfile.ZipFile, index: dict[str, Any], name: str, shape: tuple[int, ...]) -> Array:
-    about = index.get(name)
+def _read(archive: zipfile.ZipFile, folder: str, about: Any, name: str, shape: tuple[int, ...]) -> Array:
+    """Return a weight; `about` is its entry of the index."""
     if not isinstance(about, dict) or about.get("shape") != list(shape):
         raise ValueError(f"{name} is missing or does not have the shape {shape}")
-    entry = archive.getinfo(f"{index['']}{about.get('file')}")
+    entry = archive.getinfo(f"{folder}{about.get('file')}")
     # Only what is stored as it is has the size that it says.
     if entry.compress_type != zipfile.ZIP_STORED or entry.file_size != 4 * int(np.prod(shape)):
         raise ValueError(f"{name} does not have the size of {shape} numbers")

@@ -101,7 +101,7 @@ class NormalisationAndDecoding(nn.Module):
             seen, place = last(seen, frames, count), last(place, frames, count)
         rotations = self.rotations(seen, pose).view(-1, count, 24, 3, 3)
         std = self.deviations(deviation).view(-1, count, 24)
-        return rotations, std, place.view(-1, count, place.shape[1]), lowpass
+        return rotations, std, place.view(rotations.shape[0], count, place.shape[1]), lowpass
 
     def smoothed(
         self, pose: Tensor, root: Tensor, lowpass: list[Tensor], frames: int
