@@ -53,14 +53,16 @@ def load(
     """
     installed = find_spec("torch") is not None
     if runtime == "torch" and not installed:
-        raise ModelError("torch is not installed: install it, or use --runtime numpy")
+        raise ModelError("PyTorch is not installed: install it, or use --runtime numpy")
     if runtime == "torch" or (runtime == "auto" and installed):
         module = archive.load(info, trust)
         return LoadedNetwork(module, "torch", quantise_weights(module, info, precision, notify))
     if precision not in ("auto", "f32"):
-        raise ModelError(f"numpy runs in f32 only, not in {precision}: use --precision f32, or install torch")
+        raise ModelError(
+            f"numpy runs in f32 only, not in {precision}: use --precision f32, or install PyTorch"
+        )
     from edgepose.inference import numpy_network
 
     if runtime == "auto":
-        notify("torch is not installed: running with numpy")
+        notify("PyTorch is not installed: running with numpy")
     return LoadedNetwork(numpy_network.load(info), "numpy", "f32")

@@ -173,7 +173,7 @@ def test_a_run_without_torch(made, wearer, tmp_path, command):
         check=False,
     )
     assert result.returncode == 0, result.stderr
-    assert result.stderr.startswith("torch is not installed: running with numpy\nrunning ")
+    assert result.stderr.startswith("PyTorch is not installed: running with numpy\nrunning ")
     assert "in f32 with numpy; Ctrl-C ends" in result.stderr
     with np.load(by_torch) as expected, np.load(by_numpy) as got:
         np.testing.assert_allclose(got["poses"], expected["poses"], rtol=0, atol=1.7e-5)  # 0.001 deg
@@ -184,7 +184,14 @@ def test_a_run_without_torch(made, wearer, tmp_path, command):
         check=False,
     )
     assert result.returncode == 1
-    assert "torch is not installed: install it, or use --runtime numpy\n" in result.stderr
+    assert "PyTorch is not installed: install it, or use --runtime numpy\n" in result.stderr
+    result = subprocess.run(
+        [sys.executable, "-c", WITHOUT_TORCH, "bench"], capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 1
+    assert (
+        result.stderr == "edgepose: this needs PyTorch, which is not installed; see docs/guide/install.md\n"
+    )
 
 
 # --- hostile archives ---------------------------------------------------------------------------------------
