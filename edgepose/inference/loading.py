@@ -59,7 +59,7 @@ def load(
         return LoadedNetwork(module, "torch", quantise_weights(module, info, precision, notify))
     if precision not in ("auto", "f32"):
         raise ModelError(
-            f"numpy runs in f32 only, not in {precision}: use --precision f32, or install PyTorch"
+            f"numpy runs in f32 only, not in {precision}: use --precision f32 or --runtime torch"
         )
     from edgepose.inference import numpy_network
 
