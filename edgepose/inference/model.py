@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +13,8 @@ from edgepose.errors import ModelError
 from edgepose.inference import archive
 from edgepose.inference.engine import Engine, StreamEngine, check_finite
 from edgepose.inference.loading import load
+
+_log = logging.getLogger(__name__)
 
 FRAMES_PER_STEP = 64
 """Frames that the network processes at once in a whole recording."""
@@ -66,7 +69,7 @@ class Model:
         self.rate_hz = float(info.metadata["rate_hz"])
         self.past, self.future = int(info.metadata["past"]), int(info.metadata["future"])
         self.has_place = archive.has_place(info.metadata)
-        self._module, self.runtime, self.precision = load(info, trust, runtime, precision)
+        self._module, self.runtime, self.precision = load(info, trust, runtime, precision, _log.warning)
 
     def engine(self, frames_per_step: int = 1) -> Engine:
         """Return a new engine, which makes poses frame by frame and has its own state.
