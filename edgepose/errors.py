@@ -39,7 +39,9 @@ def as_edgepose_error(error: Exception) -> EdgeposeError:
     if isinstance(error, EdgeposeError):
         return error
     text = (str(error).splitlines() or [""])[0]
-    if isinstance(error, MemoryError):
+    if isinstance(error, ModuleNotFoundError) and error.name == "torch":
+        reported = EdgeposeError("this needs PyTorch, which is not installed; see docs/guide/install.md")
+    elif isinstance(error, MemoryError):
         reported = EdgeposeError("not enough memory; use a shorter file")
     elif isinstance(error, OSError) and error.filename is not None and error.strerror:
         name = str(error.filename)  # the system's answer about a file, such as a name that is too long

@@ -7,12 +7,9 @@ percentiles are wall-clock time, which is what a wearer waits for.
 from __future__ import annotations
 
 import gc
-import json
-import os
 import platform
 import socket
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -29,10 +26,10 @@ from edgepose.calibration import GRAVITY, Calibration, apply_calibration
 from edgepose.calibration.rezero import HeadingRezero
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuFrame, ImuSample
-from edgepose.inference import archive
+from edgepose.inference import archive, loading
 from edgepose.inference.engine import Engine, StreamEngine, WindowEngine
 from edgepose.inference.features import INPUTS
-from edgepose.inference.quantisation import PRECISIONS, quantise_weights
+from edgepose.inference.quantisation import PRECISIONS
 from edgepose.orientation import OrientationEstimator
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.place_stage import PlaceStage
@@ -58,6 +55,9 @@ _FRAMES = {"stream": 100, "window": 20}
 
 _DIP_OUTPUTS = 150
 """Means of 15 rotation matrices and 5 accelerations; there are as many deviations (DIP appendix B)."""
+
+NUMPY = "f32, numpy"
+"""The network in numpy among the precisions of the network in torch."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -211,7 +211,7 @@ class Speed(NamedTuple):
         mode: "stream", "window", or "reference": a `torch.nn.LSTM` of the same size with torch's defaults.
             The reference runs the network only, without pre- and postprocessing: for each frame over a window
             of past, present and future, or one step if the model is unidirectional.
-        precision: of the weights.
+        precision: of the weights; `NUMPY` is f32 without torch.
         us: processor time per frame, microseconds.
         p50_us: median wall-clock time.
         p99_us: 99th percentile of the wall-clock time.
@@ -263,9 +263,16 @@ def _reference(about: dict[str, Any]) -> Callable[[], object]:
 
 
 def load_engine(info: archive.ArchiveInfo, trust: bool, precision: str, mode: str = "stream") -> Engine:
-    """Load a model with its default past and future, and freeze the garbage collector as `run` does."""
-    module = archive.load(info, trust)
-    quantise_weights(module, info, precision)
+    """Load a model with its default past and future, and freeze the garbage collector as `run` does.
+
+    Args:
+        info: the archive.
+        trust: load it although its checksum is unknown.
+        precision: of the weights, or `NUMPY`.
+        mode: "stream" or "window".
+    """
+    runtime, precision = ("numpy", "f32") if precision == NUMPY else ("torch", precision)
+    module = loading.load(info, trust, runtime, precision).module
     kind = StreamEngine if mode == "stream" else WindowEngine
     place = archive.has_place(info.metadata)
     engine = kind(module, info.metadata["past"], info.metadata["future"], place=place)
@@ -283,13 +290,13 @@ def model_speeds(info: archive.ArchiveInfo, trust: bool) -> list[Speed]:
         ways["reference", "f32"] = _reference(about)
     orientation, acceleration = np.tile(np.eye(3), (len(PLACEMENTS), 1, 1)), np.zeros((len(PLACEMENTS), 3))
     for mode in ("stream", "window") if archive.is_windowed(about) else ("stream",):
-        for precision in PRECISIONS if stored == "f32" else (stored,):
+        for precision in (*PRECISIONS, NUMPY) if stored == "f32" else (stored,):
             try:
                 engine = load_engine(info, trust, precision, mode)
             except EdgeposeError:
                 if precision == stored:
                     raise
-                continue  # not supported by this machine or by this kind of network
+                continue  # not supported by this machine, by this kind of network, or by an old archive
             for _ in range(about["past"] + about["future"]):
                 engine.push(None, orientation, acceleration)
             ways[mode, precision] = partial(engine.push, None, orientation, acceleration)
@@ -313,55 +320,7 @@ def model_speeds(info: archive.ArchiveInfo, trust: bool) -> list[Speed]:
     return rows
 
 
-# --- start --------------------------------------------------------------------------------------------------
-
-
-class Start(NamedTuple):
-    """Cost of a fresh process until a model is ready to run.
-
-    Attributes:
-        imports_s: importing edgepose's steps with numpy and torch, seconds.
-        load_s: loading, packing and warming up the model, seconds.
-        memory_mb: resident memory then, megabytes; None if unknown.
-    """
-
-    imports_s: float
-    load_s: float
-    memory_mb: float | None
-
-
-_FRESH = """
-import json, sys, time
-started = time.perf_counter()
-from edgepose.benchmarks import speed
-imported = time.perf_counter()
-engine = speed.load_engine(speed.archive.read_info(speed.Path(sys.argv[1])), True, "auto")
-print(json.dumps([imported - started, time.perf_counter() - imported, speed.memory_mb()]))
-"""
-
-
-def start_up(info: archive.ArchiveInfo, trust: bool) -> Start:
-    """Measure a new process that loads a model.
-
-    Raises:
-        EdgeposeError: the model is not trusted, or the process fails.
-    """
-    if not (info.trusted or trust):
-        archive.load(info)  # raises the error that explains why
-    command = [sys.executable, "-c", _FRESH, str(info.path)]
-    process = subprocess.run(command, capture_output=True, text=True, check=False)
-    if process.returncode:
-        raise EdgeposeError(f"{info.path}: a new process cannot load it: {process.stderr.strip()[-200:]}")
-    return Start(*json.loads(process.stdout))
-
-
-def memory_mb() -> float | None:
-    """Return the resident memory of this process, megabytes; None without /proc."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    except OSError:
-        return None
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+# --- machine -----------------------------------------------------------------------------------------------
 
 
 def machine() -> dict[str, str]:

@@ -118,6 +118,8 @@ def main() -> NoReturn:
     for number in stop_signals():
         if number != signal.SIGINT:
             signal.signal(number, _terminate)
+    # numpy's products are small here: threads cost more than they save, most of all on a busy machine.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # When torch reads int8 weights it logs deprecation warnings, which a user cannot act on.
     os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
     debug = "--debug" in sys.argv[1:]

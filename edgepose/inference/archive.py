@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 from edgepose.errors import ModelError
 from edgepose.inference.quantisation import suppress_quantisation_warning
@@ -135,8 +135,7 @@ def read_info(path: Path) -> ArchiveInfo:
         ModelError: the file is not an edgepose archive, is damaged, or has a newer format.
     """
     try:
-        content = path.read_bytes()
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        with path.open("rb") as file, zipfile.ZipFile(file) as archive:
             entries = [e for e in archive.infolist() if e.filename.endswith(f"/extra/{METADATA_FILE}")]
             if len(entries) != 1 or entries[0].file_size > _METADATA_LIMIT:
                 raise ModelError(
@@ -144,6 +143,7 @@ def read_info(path: Path) -> ArchiveInfo:
                     "make one with edgepose export"
                 )
             metadata = json.loads(archive.read(entries[0]))
+            sha256 = _checksum(file)
     except (zipfile.BadZipFile, EOFError) as error:
         raise ModelError(
             f"{path}: not a model archive (no complete zip file); make one with edgepose export"
@@ -154,11 +154,19 @@ def read_info(path: Path) -> ArchiveInfo:
     except (ValueError, RuntimeError, zlib.error) as error:
         raise ModelError(f"{path}: the archive's metadata cannot be read ({error})") from error
     _check_metadata(path, metadata)
-    sha256 = hashlib.sha256(content).hexdigest()
     trusted = _read_checksums(MODELS / "SHA256SUMS")
     if has_home():
         trusted |= _read_checksums(trust_file())
     return ArchiveInfo(path, sha256, sha256 in trusted, metadata)
+
+
+def _checksum(file: BinaryIO) -> str:
+    """Return the SHA-256 checksum of a file, block by block: archives can be large for a small computer."""
+    checksum = hashlib.sha256()
+    file.seek(0)
+    while block := file.read(1 << 18):
+        checksum.update(block)
+    return checksum.hexdigest()
 
 
 def _check_metadata(path: Path, metadata: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,7 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from edgepose.errors import ModelError
 from edgepose.inference import archive
 from edgepose.inference.engine import Engine, StreamEngine, check_finite
-from edgepose.inference.quantisation import quantise_weights
+from edgepose.inference.loading import load
+
+_log = logging.getLogger(__name__)
 
 FRAMES_PER_STEP = 64
 """Frames that the network processes at once in a whole recording."""
@@ -40,17 +43,23 @@ class Model:
         past: frames in a bidirectional model's window before the present one.
         future: frames after the present one that the model waits for; 0 for a unidirectional model.
         precision: precision of the weights at run time.
+        runtime: what runs the network, "torch" or "numpy".
         has_place: whether the model estimates contacts and the velocity of the pelvis, see
             `edgepose.inference.engine.EngineOutput`.
     """
 
-    def __init__(self, name: str | Path, *, trust: bool = False, precision: str = "auto") -> None:
+    def __init__(
+        self, name: str | Path, *, trust: bool = False, precision: str = "auto", runtime: str = "auto"
+    ) -> None:
         """Load an archive.
 
         Args:
             name: name of a bundled model, or path of an archive.
-            trust: load the archive although its checksum is unknown; loading an archive runs its code.
+            trust: load the archive although its checksum is unknown; loading an archive with torch runs its
+                code.
             precision: precision of the weights, "auto", "f32", "fp16" or "int8".
+            runtime: "torch", "numpy" (f32 only, runs no code of the archive), or "auto": torch where it is
+                installed.
 
         Raises:
             ModelError: there is no such archive, it is damaged or not trusted, or cannot run here.
@@ -60,8 +69,7 @@ class Model:
         self.rate_hz = float(info.metadata["rate_hz"])
         self.past, self.future = int(info.metadata["past"]), int(info.metadata["future"])
         self.has_place = archive.has_place(info.metadata)
-        self._module = archive.load(info, trust)
-        self.precision = quantise_weights(self._module, info, precision)
+        self._module, self.runtime, self.precision = load(info, trust, runtime, precision, _log.warning)
 
     def engine(self, frames_per_step: int = 1) -> Engine:
         """Return a new engine, which makes poses frame by frame and has its own state.
@@ -114,6 +122,8 @@ class Model:
         return Estimate(rotations, std, np.stack(places) if places else None)
 
 
-def load_model(name: str | Path, *, trust: bool = False, precision: str = "auto") -> Model:
+def load_model(
+    name: str | Path, *, trust: bool = False, precision: str = "auto", runtime: str = "auto"
+) -> Model:
     """Load a model archive; see `Model`."""
-    return Model(name, trust=trust, precision=precision)
+    return Model(name, trust=trust, precision=precision, runtime=runtime)

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING
 from edgepose.errors import ConfigError
 
 if TYPE_CHECKING:
-    import torch
-
     from edgepose.config import WearerConfig
     from edgepose.inference.archive import ArchiveInfo
     from edgepose.inference.engine import Engine, MultiWearerEngine
+    from edgepose.inference.loading import LoadedNetwork
 
 FRAMES_PER_STEP = 64
 """Frames of a recording that the network computes in one step."""
@@ -31,6 +30,7 @@ class NetworkConfig:
         past: frames in a window before the present one; None takes the model's own number.
         future: frames after the present one that are waited for; None takes the model's own number.
         precision: number format of the weights, one of `edgepose.inference.quantisation.CHOICES`.
+        runtime: what runs the network, one of `edgepose.inference.loading.RUNTIMES`.
     """
 
     model: str = "birnn"
@@ -39,6 +39,7 @@ class NetworkConfig:
     past: int | None = None
     future: int | None = None
     precision: str = "auto"
+    runtime: str = "auto"
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ class Network:
     def load(
         self, wearers: Sequence[WearerConfig], notify: Callable[[str], None]
     ) -> tuple[Engine | MultiWearerEngine, str]:
-        """Load the network, and return an engine for these wearers and the precision in which it runs.
+        """Load the network, and return an engine for these wearers and how it runs, "fp16" for example.
 
         Args:
             wearers: one wearer, or several who share the network.
@@ -128,11 +129,10 @@ class Network:
         Raises:
             ModelError: the archive is not trusted, or cannot run here.
         """
-        from edgepose.inference import archive
-        from edgepose.inference.quantisation import quantise_weights
+        from edgepose.inference.loading import load
 
-        module = archive.load(self.info, self.config.trust)
-        precision = quantise_weights(module, self.info, self.config.precision, notify)
+        config = self.config
+        loaded = load(self.info, config.trust, config.runtime, config.precision, notify)
         place = not all(wearer.no_place for wearer in wearers)
         if place and not self.has_place:
             notify(
@@ -140,15 +140,16 @@ class Network:
                 "so the path is less accurate"
             )
             place = False
-        return self._engine(module, wearers, precision, place), precision
+        described = loaded.precision + (" with numpy" if loaded.runtime == "numpy" else "")
+        return self._engine(loaded, wearers, place), described
 
     def _engine(
-        self, module: torch.jit.ScriptModule, wearers: Sequence[WearerConfig], precision: str, place: bool
+        self, loaded: LoadedNetwork, wearers: Sequence[WearerConfig], place: bool
     ) -> Engine | MultiWearerEngine:
         from edgepose.inference.engine import MultiWearerEngine, StreamEngine, WindowEngine
 
         # int8 activations share one scale per batch, so batching would change results.
-        batched = precision != "int8"
+        module, batched = loaded.module, loaded.precision != "int8"
         if len(wearers) > 1:
             return MultiWearerEngine(module, self.past, self.future, len(wearers), not batched, place=place)
         if self.windowed:

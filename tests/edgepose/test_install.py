@@ -71,3 +71,12 @@ def test_the_install_page_says_what_is_pinned():
     for machine in ("aarch64", "x86_64"):
         _, pinned = torch_of(machine)
         assert f"{str(pinned.specifier)[2:]} is pinned" in page
+
+
+def test_the_install_page_lists_everything_but_pytorch():
+    page = (ROOT / "docs" / "guide" / "install.md").read_text(encoding="utf-8")
+    (line,) = re.findall(r"^\.venv/bin/pip install (click .*)$", page, re.MULTILINE)
+    needed = [Requirement(text) for text in PROJECT["dependencies"]]
+    listed = [Requirement(text.strip("'")) for text in re.findall(r"'[^']*'|\S+", line)]
+    expected = {(r.name, str(r.marker or "")) for r in needed if r.name != "torch"}
+    assert {(r.name, str(r.marker or "")) for r in listed} == expected

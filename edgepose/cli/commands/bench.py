@@ -30,7 +30,7 @@ def bench(ctx: click.Context, models: tuple[str, ...], trust: bool, as_json: boo
     """Measure the accuracy and speed of parts of the program.
 
     Without a command, measure on one core of this machine the speed of every step from packets to poses, and
-    of the models in all modes and precisions, compared with a torch.nn.LSTM of the same size.
+    of the models in all modes and precisions and in numpy, compared with a torch.nn.LSTM of the same size.
 
     \b
     Examples:
@@ -53,11 +53,12 @@ def _speed(models: tuple[str, ...], trust: bool, as_json: bool) -> None:
     from tempfile import TemporaryDirectory
 
     from edgepose.benchmarks import speed
+    from edgepose.benchmarks.start_up import starts
 
     report: dict[str, Any] = {"machine": speed.machine(), "models": []}
     for info in infos:
         say(f"measuring {info.path.stem}")
-        start = speed.start_up(info, trust)
+        started = starts(info, trust)
         with TemporaryDirectory() as folder:
             engine = speed.load_engine(info, trust, "auto")
             steps = speed.step_costs(engine, Path(folder))
@@ -67,7 +68,7 @@ def _speed(models: tuple[str, ...], trust: bool, as_json: bool) -> None:
         }
         rows = [row._asdict() for row in speed.model_speeds(info, trust)]
         report["models"].append(
-            {"name": info.path.stem, "start": start._asdict(), "steps_us": steps, **throughputs, "ways": rows}
+            {"name": info.path.stem, "start": started, "steps_us": steps, **throughputs, "ways": rows}
         )
     show(json.dumps(report, indent=1) if as_json else _speed_tables(report, speed.BUDGET_US))
 
@@ -98,10 +99,10 @@ def _speed_tables(report: dict[str, Any], budget_us: float) -> str:
             _row([row["model"], name, row["precision"], *times, speed, share, f"{row['times']:.1f}"])
         )
     lines += ["", *_header(["a fresh process", "imports s", "model s", "memory MB"])]
-    for model in models:
-        start = model["start"]
+    for name, runtime, start in ((m["name"], *item) for m in models for item in m["start"].items()):
         memory = "-" if start["memory_mb"] is None else f"{start['memory_mb']:.0f}"
-        lines.append(_row([model["name"], f"{start['imports_s']:.2f}", f"{start['load_s']:.2f}", memory]))
+        imports, load = (f"{start[key]:.2f}" for key in ("imports_s", "load_s"))
+        lines.append(_row([f"{name}, {runtime}", imports, load, memory]))
     return "\n".join(lines)
 
 

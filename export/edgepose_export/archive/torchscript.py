@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import warnings
+import zipfile
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -13,8 +15,9 @@ import torch
 from torch import Tensor, nn
 
 from edgepose import __version__
-from edgepose.errors import EdgeposeError
+from edgepose.errors import EdgeposeError, ModelError
 from edgepose.inference.archive import FORMAT, METADATA_FILE
+from edgepose.inference.weights import WEIGHTS_FILE, recipe_of
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import CONTACTS
 from edgepose.skeleton import JOINTS
@@ -74,12 +77,36 @@ def save(
         with TemporaryDirectory() as folder, warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="`torch.jit", category=DeprecationWarning)
             named = Path(folder) / path.name  # torch stores this name in the file
-            torch.jit.save(module, str(named), _extra_files={METADATA_FILE: json.dumps(metadata, indent=2)})
+            extra = {METADATA_FILE: json.dumps(metadata, indent=2)}
+            torch.jit.save(module, str(named), _extra_files=extra)
+            extra |= _weights_file(module, metadata, named)
+            torch.jit.save(module, str(named), _extra_files=extra)
             content = named.read_bytes()
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
         raise EdgeposeError(f"{path}: cannot be written: {reason}") from error
     write_whole(path, content, "the archive", overwrite=overwrite)
+
+
+def _weights_file(module: torch.jit.ScriptModule, metadata: dict[str, object], saved: Path) -> dict[str, str]:
+    """Return the extra file that says where a saved archive keeps the weights of its network.
+
+    It is for `edgepose.inference.weights`; networks that do not run there have none. torch numbers the files
+    of an archive by itself, but in the same way each time, so they are found by their content.
+    """
+    try:
+        shapes = recipe_of(metadata).shapes()
+    except ModelError:
+        return {}
+    with zipfile.ZipFile(saved) as archive:
+        names = [name for name in archive.namelist() if re.fullmatch(r"[^/]+/data/\d+", name)]
+        files = {archive.read(name): name.partition("/")[2] for name in names}
+    weights = {name: tensor.contiguous().numpy() for name, tensor in module.state_dict().items()}
+    index = {
+        name: {"file": files[weights[name].astype("<f4").tobytes()], "shape": list(shape)}
+        for name, shape in shapes.items()
+    }
+    return {WEIGHTS_FILE: json.dumps(index, indent=2)}
 
 
 def revision() -> str | None:
