@@ -109,6 +109,8 @@ def find_archive(name: str) -> Path:
         _note_alias(name)
         return bundled[ALIASES[name]]
     hint = choices(name, bundled, "give the path of an archive, or one of")
+    if Path(name).exists():
+        raise ModelError(f"{name}: it is not a file on a disk; {hint}")
     raise ModelError(f"{name}: no such model; {hint}")
 
 

@@ -192,12 +192,9 @@ def solve(
     interrupted = False
     with ExitStack() as stack:
         # Opened before the work, so that a wrong name is reported at once.
-        sinks = open_outputs(
-            *(stack, outputs, solver.rate, lambda: interrupted),
-            body=wearer_body,
-            translation=True,
-            contacts=place is not None,
-        )
+        target = (stack, outputs, solver.rate, lambda: interrupted)
+        contacts = place is not None
+        sinks = open_outputs(*target, body=wearer_body, translation=True, contacts=contacts)
         solutions, interrupted = _collect(solve_all(measurements, settings, solver.jobs, _progress()))
         if not solutions:
             raise KeyboardInterrupt
