@@ -16,7 +16,7 @@ from edgepose.placements import PLACEMENTS, SITES
 from edgepose.rotations import geodesic_angle, rotation_about_axis
 from edgepose.skeleton import forward_kinematics
 from edgepose_export.archive.model_card import card
-from edgepose_export.evaluation import baselines
+from edgepose_export.evaluation import baselines, real_paths
 from edgepose_export.evaluation import real_wearers as real
 
 MODELS = ("birnn", "rnn")
@@ -144,7 +144,8 @@ def test_command_prints_all_tables(tables):
     for title, table in tables.items():
         rows = {row: columns for row, columns in table.items() if not row.startswith("birnn")}
         assert f"\n{real.format_table(title, rows)}\n" in said.stdout
-    assert said.stdout.rstrip().endswith(real.LEGEND)
+    assert f"\n{real.LEGEND}\n" in said.stdout
+    assert said.stdout.rstrip().endswith(real_paths.LEGEND)
 
 
 def test_archives_of_ones_own_need_trust(tmp_path):

@@ -361,7 +361,7 @@ def test_every_format_takes_the_samples_of_a_clip(monkeypatch):
     recording = tool["read_input"](CLIP)
     for name, spoken in PROTOCOLS.items():
         data = recording.sensors["pelvis"]
-        sensor = tool["Sensor"](5, data, data.time_s[0], spoken.encoder())
+        sensor = tool["Sensor"](5, data, data.time_s[0], False, spoken.encoder())
         sensor.prepare(spoken, 0 if spoken.single_device else spoken.ids[5])
         sensor.measure(0)
         assert sensor.wire, name

@@ -79,7 +79,8 @@ FAULTS = {
     ),
     "quaternions x, y, z, w": Fault(
         of_all(as_xyzw),
-        r"left_forearm: orientation and gravity disagree by 17\d deg at rest: "
+        # check says it once for all sensors, with the range.
+        r"(left_forearm|all six sensors): orientation and gravity disagree by (\d+ to )?17\d deg at rest: "
         r"looks like x, y, z, w: the quaternion must be w, x, y, z",
     ),
     "data in g": Fault(
