@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.analysis.figures import INK, PREDICTION
+from edgepose.place import Way as WalkedWay
 from edgepose.pose import CONTACTS, PoseSequence
 from edgepose.skeleton import JOINTS, Body, forward_kinematics
 
@@ -30,7 +31,7 @@ class Way(NamedTuple):
     Attributes:
         path: (T, 2) smoothed position of the pelvis, see `seen_from_above`, metres.
         speed: (T,) metres per second.
-        length_m: length of the path.
+        length_m: length of the way walked, without sway, as a run reports it.
         apart_m: distance from its start to its end.
     """
 
@@ -51,8 +52,10 @@ def way_of(translation: Array, rate: float) -> Way:
     if len(path) < 2:
         return Way(path, np.zeros(len(path)), 0.0, 0.0)
     speed = np.linalg.norm(np.gradient(path, axis=0), axis=1) * rate
-    length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
-    return Way(path, speed, float(length), float(np.linalg.norm(path[-1] - path[0])))
+    walked = WalkedWay()
+    for position in translation:
+        walked.add(position)
+    return Way(path, speed, walked.length_m, float(np.linalg.norm(path[-1] - path[0])))
 
 
 def seen_from_above(positions: Array) -> Array:

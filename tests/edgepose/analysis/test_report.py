@@ -221,6 +221,8 @@ def test_the_way_there_and_back():
     assert way.speed.max() < 1.3
     still = way_of(np.tile([3.0, 0.95, -2.0], (50, 1)), 60.0)
     assert (still.length_m, still.apart_m, still.speed.max()) == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
+    swaying = np.stack([0.05 * np.sin(times), np.full(600, 0.95), 0.05 * np.cos(3.0 * times)], axis=1)
+    assert way_of(swaying, 60.0).length_m < 0.15
     assert way_of(places[:1], 60.0).length_m == 0.0
     assert way_of(places[:2], 60.0).length_m == pytest.approx(0.02, rel=0.1)
 
