@@ -462,7 +462,7 @@ def test_a_whole_session_on_a_terminal(wearer: Wearer, tmp_path: Path) -> None:
     process = processes.Popen(
         [sys.executable, "-m", "edgepose", "calibrate", "--port", wearer.port, "--heading-reset", "live",
          "--hold", "0.4", "--countdown", "0", "--out", str(out)],
-        stdin=inside, stdout=inside, stderr=inside,
+        stdin=inside, stdout=inside, stderr=inside, env={**os.environ, "TERM": "xterm"},
     )  # fmt: skip
     os.close(inside)
     screen = b""
