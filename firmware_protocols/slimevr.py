@@ -249,6 +249,12 @@ def _joined(
 KEEP_ALIVE_S = 0.5
 """Time between two keep-alive messages to a tracker, seconds; it gives up after 3 s without any."""
 
+UNHEARD_S = 1.0
+"""Time without a datagram after which keep-alives pause, seconds: a tracker replies to each of them.
+
+An address in a handshake may be forged, so what is sent there stays in proportion to what came.
+"""
+
 GONE_S = 10.0
 """Time without a datagram after which a tracker is forgotten, seconds."""
 
@@ -309,7 +315,8 @@ class SlimevrHost:
                 del self._trackers[tracker], self._macs[tracker]
             elif now_s >= due_s:
                 self._trackers[tracker][1] = now_s + KEEP_ALIVE_S
-                messages.append((tracker, _ALIVE))
+                if now_s - heard_s <= UNHEARD_S:
+                    messages.append((tracker, _ALIVE))
         self._next_s = min((due_s for _, due_s in self._trackers.values()), default=now_s + KEEP_ALIVE_S)
         return messages
 

@@ -673,6 +673,8 @@ def main(
         raise click.UsageError(f"{protocol} is not a CAN protocol")
     if (udp or tcp) and wire_format.transport == "can":
         raise click.UsageError(f"{protocol} is a CAN protocol")
+    if udp and tcp:
+        raise click.UsageError("give --udp or --tcp, not both")
     if wire_format.transport == "udp" and not udp:
         raise click.UsageError(f"{protocol} needs --udp HOST:PORT")
     if corrupt and wire_format.transport == "can":

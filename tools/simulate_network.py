@@ -7,7 +7,8 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
-from edgepose.utils.sockets import address_text
+from edgepose.errors import DeviceError
+from edgepose.utils.sockets import address_text, resolve
 from firmware_protocols import slimevr
 
 FIRST_SENDER = 11
@@ -24,13 +25,25 @@ class DatagramLine:
     """
 
     def __init__(self, host: str, port: int, number: int | None = None) -> None:
-        """Open the socket of a sender, with an address of its own if it has a number."""
+        """Open the socket of a sender, with an address of its own if it has a number.
+
+        Raises:
+            DeviceError: nothing can be sent to the host, or not from such an address.
+        """
         self.name = address_text(host, port)
         self.sender = "" if number is None else f"127.0.0.{FIRST_SENDER + number}"
-        self._target = (host, port)
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            family, self._target = resolve(host, port, socket.SOCK_DGRAM)
+            self._socket = socket.socket(family, socket.SOCK_DGRAM)
+            self._socket.bind((self.sender, 0))
+            with socket.socket(family, socket.SOCK_DGRAM) as trial:
+                trial.bind((self.sender, 0))
+                trial.connect(self._target)  # sends nothing
+        except (OSError, UnicodeError) as error:
+            raise DeviceError(
+                f"--udp {self.name}: cannot send from {self.sender or 'this machine'}: {error}"
+            ) from None
         self._socket.setblocking(False)
-        self._socket.bind((self.sender, 0))
         self.master = self._socket.fileno()
 
     def send(self, wire: bytes) -> None:
@@ -98,8 +111,16 @@ class TcpServer:
     """
 
     def __init__(self, host: str) -> None:
-        """Listen on a free port of an address."""
-        self._server = socket.create_server((host, 0))
+        """Listen on a free port of an address.
+
+        Raises:
+            DeviceError: it is not an address of this machine.
+        """
+        try:
+            family, address = resolve(host, 0, socket.SOCK_STREAM)
+            self._server = socket.create_server(address, family=family)
+        except (OSError, UnicodeError) as error:
+            raise DeviceError(f"--tcp {host}: cannot listen there: {error}") from None
         self._server.setblocking(False)
         self.name = address_text(host, self._server.getsockname()[1])
         self.master = self._server.fileno()
@@ -118,7 +139,7 @@ class TcpServer:
             self._client = None
 
     def receive(self) -> bytes:
-        """Accept a client, in the place of an earlier one."""
+        """Accept a client, instead of an earlier one."""
         with suppress(OSError):
             client, _ = self._server.accept()
             client.setblocking(False)

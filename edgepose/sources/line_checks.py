@@ -22,7 +22,7 @@ REFUSED_S = 1.0
 
 
 def check_start(line: LineReader, now_s: float, start_s: float) -> None:
-    """Check that usable packets come from a line.
+    """Check that usable packets come from a line, and mark it once they do.
 
     Args:
         line: the line to check.
@@ -38,7 +38,10 @@ def check_start(line: LineReader, now_s: float, start_s: float) -> None:
             raise DeviceError(f"{spec.name}: no data for {SILENCE_S:g} s; check {spec.check[0]}")
         return
     passed_s = now_s - decoder.first_s
-    if decoder.counters.packets or passed_s <= REFUSED_S:
+    if decoder.counters.packets:
+        line.start_checked = True
+        return
+    if passed_s <= REFUSED_S:
         return
     if decoder.refused is not None and decoder.unknown is None:
         raise DeviceError(f"{spec.name}: {decoder.refused}")

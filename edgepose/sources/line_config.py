@@ -19,7 +19,6 @@ BAUD = 115200
 BITRATE = 500_000
 """Default speed of a CAN bus, bit/s."""
 
-
 QUEUE = 512
 """Number of arrivals from a socket that may wait: most of a second of the packets of six sensors."""
 

@@ -49,6 +49,7 @@ class LineDecoder:
         placements: Callable[[Protocol], PlacementById],
         clock: Callable[[int], Clock],
         placement_owner: dict[int, str],
+        quiet: bool = False,
     ) -> None:
         """Create the decoder.
 
@@ -58,6 +59,7 @@ class LineDecoder:
             placements: returns the line's map of ids, once the protocol is known.
             clock: makes the line's clock, given the value at which device times wrap, microseconds.
             placement_owner: name of the line that sends each placement's samples; shared by all lines.
+            quiet: count packets of ids without a placement, without a warning.
         """
         self.name = name
         self.protocol: Protocol | None = None
@@ -69,6 +71,7 @@ class LineDecoder:
         self._make_placements = placements
         self._make_clock = clock
         self._placement_owner = placement_owner
+        self._quiet = quiet
         self._decoder: Decoder | None = None
         self._clock: Clock | None = None
         self._placements: PlacementById = {}
@@ -194,9 +197,13 @@ class LineDecoder:
             placement = self._placements.get(None)
         if placement is None:
             if sensor not in self._unknown and len(self._unknown) < MOST_UNKNOWN:
-                _log.warning(
-                    "%s: ignoring packets of sensor id %d; expected ids are %s", self.name, sensor, self.ids
-                )
+                if not self._quiet:
+                    _log.warning(
+                        "%s: ignoring packets of sensor id %d; expected ids are %s",
+                        self.name,
+                        sensor,
+                        self.ids,
+                    )
                 self._unknown[sensor] = 0
             if sensor in self._unknown:
                 self._unknown[sensor] += 1

@@ -32,7 +32,6 @@ FULL_READS = 32
 _SETTLE_S = 0.1
 """Shortest time spent discarding: data that the system has buffered comes in several pieces."""
 
-
 _FULL_S = 0.001
 """Time between two looks at a queue that is too long, seconds."""
 
@@ -117,7 +116,7 @@ class LineReader:
         decoder: turns the line's data into samples.
         clock_resets: resets of each device's clock at the last check, by placement.
         duplicate_ids: the user has been warned about two devices with one id.
-        warned: the user has been warned that nothing usable comes.
+        start_checked: usable packets have come, or the user has been warned that none do.
         refused_reported: the user has been warned about input that cannot be used.
     """
 
@@ -154,7 +153,7 @@ class LineReader:
             )
         self.clock_resets: dict[int, int] = {}
         self.duplicate_ids = False
-        self.warned = False
+        self.start_checked = False
         self.refused_reported = False
         self._queue = queue
         self._now = now

@@ -190,14 +190,14 @@ class LiveSource:
             since_s = poll_s
 
     def _check_start(self, line: LineReader, now_s: float, start_s: float) -> None:
-        if line.warned:
+        if line.start_checked:
             return
         try:
             check_start(line, now_s, start_s)
         except EdgeposeError as error:
             if not self._lenient:
                 raise
-            line.warned = True
+            line.start_checked = True
             _log.warning("%s", error)
 
 

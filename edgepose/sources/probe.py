@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from edgepose.errors import EdgeposeError
+from edgepose.errors import ConfigError, EdgeposeError
 from edgepose.sources.line_config import BAUD, can_line, serial_line, tcp_line, udp_line
 from edgepose.sources.line_decoder import LISTEN_S
 from edgepose.sources.line_reader import LineDisconnectedError, LineSpec, discard_backlog
@@ -28,7 +28,8 @@ class ProbeResult(NamedTuple):
         protocol: name of the wire format; None if none could be decoded.
         amount: bytes, frames or datagrams received.
         rates_hz: samples per second by sensor id.
-        refused: input that could be understood but not used, see `Decoder.refused`.
+        refused: input that could be understood but not used, see `Decoder.refused`; for a sender of datagrams
+            also formats that fit equally well.
     """
 
     protocol: str | None
@@ -73,8 +74,10 @@ def probe_connection(name: str) -> ProbeResult:
 def probe_socket(name: str) -> dict[str, ProbeResult]:
     """Listen for datagrams at HOST:PORT, and return the findings about each sender.
 
+    Anybody can send: a sender whose formats fit equally well costs only its own finding.
+
     Raises:
-        EdgeposeError: it cannot be listened at, or formats fit equally well.
+        EdgeposeError: it cannot be listened at.
     """
     spec = udp_line(name, "auto", lambda found, sender: {}, None)
     detectors: dict[str, Detector] = {}
@@ -84,10 +87,17 @@ def probe_socket(name: str) -> dict[str, ProbeResult]:
             if datagram.sender not in detectors:
                 if len(detectors) == MOST_SENDERS:
                     continue
-                detectors[datagram.sender] = Detector(f"{name} from {datagram.sender}", spec.protocols)
+                detectors[datagram.sender] = Detector(datagram.sender, spec.protocols)
             amounts[datagram.sender] += 1
             detectors[datagram.sender].feed([datagram], arrival_s)
-    return {sender: _result(detector, amounts[sender]) for sender, detector in sorted(detectors.items())}
+    results: dict[str, ProbeResult] = {}
+    for sender, detector in sorted(detectors.items()):
+        try:
+            results[sender] = _result(detector, amounts[sender])
+        except ConfigError as error:
+            refused = str(error).removeprefix(f"{sender}: ")
+            results[sender] = ProbeResult(None, amounts[sender], {}, refused)
+    return results
 
 
 def probe_line(spec: LineSpec) -> ProbeResult:

@@ -63,6 +63,7 @@ class SenderDecoders:
         self._decoders: dict[str, LineDecoder] = {}
         self._turned_away: dict[str, str] = {}  # reason by sender
         self._unnamed = False  # there are more of these than are named
+        self._strangers = 0  # forgotten senders of ids without a placement
         self._bad = 0
         self._ignored = 0
         self._forgotten = SourceCounters()
@@ -150,8 +151,11 @@ class SenderDecoders:
                 return None
             self._forget(useless[0])
         name = f"{self.name} from {sender}"
+        quiet = self._strangers > MOST_NAMED
         try:
-            decoder = LineDecoder(name, self._protocols, placements, self._clock, self._placement_owner)
+            decoder = LineDecoder(
+                name, self._protocols, placements, self._clock, self._placement_owner, quiet
+            )
         except EdgeposeError as error:
             self._turn_away(sender, str(error))
             return None
@@ -163,7 +167,11 @@ class SenderDecoders:
         if len(self._turned_away) < MOST_NAMED:
             self._turned_away[sender] = reason
             _log.warning("%s: ignoring datagrams from %s: %s", self.name, sender, reason)
-        elif not self._unnamed:
+        else:
+            self._stop_naming()
+
+    def _stop_naming(self) -> None:
+        if not self._unnamed:
             self._unnamed = True
             _log.warning("%s: ignoring datagrams from more senders, without naming them", self.name)
 
@@ -171,6 +179,10 @@ class SenderDecoders:
         """Drop a sender's decoder, keep its counts, and free its placements."""
         decoder = self._decoders.pop(sender, None)
         if decoder is not None:
+            if decoder.unknown_ids:
+                self._strangers += 1
+                if self._strangers > MOST_NAMED:
+                    self._stop_naming()
             self._forgotten = sum_counters([self._forgotten, decoder.counters])
             self._bad += decoder.amount if decoder.protocol is None else 0
             for placement in decoder.devices:

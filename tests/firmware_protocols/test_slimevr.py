@@ -146,6 +146,15 @@ def test_a_host_answers_as_the_server_does():
     assert host.receive(data, "a", 20.0) == (False, b"")
 
 
+def test_a_host_sends_little_to_a_forged_address():
+    host = SlimevrHost()
+    host.receive(bytes.fromhex(HANDSHAKE), "victim", 0.0)
+    assert sum(len(host.due(k / 10)) for k in range(90)) == 2
+    # A tracker that is heard again is kept sending.
+    assert host.receive(bytes.fromhex(ROTATION), "victim", 9.0) == (True, b"")
+    assert [tracker for tracker, _ in host.due(9.5)] == ["victim"]
+
+
 def test_a_host_answers_few_strangers_and_no_short_calls():
     host = SlimevrHost()
     call = bytes.fromhex(HANDSHAKE)

@@ -224,6 +224,21 @@ def test_a_file_that_is_not_there(tmp_path):
     assert errors.startswith(f"Error: {tmp_path / 'nowhere.npz'}: cannot read it")
 
 
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        (["--udp", "[::1]:9000", "--protocol", "ximu3"], "--udp [::1]:9000: cannot send from 127.0.0.11: "),
+        (["--tcp", "192.0.2.5"], "--tcp 192.0.2.5: cannot listen there: "),
+        (["--tcp", "127.0.0.1", "--udp", "127.0.0.1:9000"], "give --udp or --tcp, not both"),
+    ],
+)
+def test_addresses_that_do_not_work(recording, flags, says):
+    with start(recording, *flags) as process:
+        _, errors = process.communicate(timeout=30)
+    assert process.returncode in (1, 2)
+    assert errors.splitlines()[-1].startswith(f"Error: {says}")
+
+
 def test_sensors_that_sample_at_other_times(recording, tmp_path):
     source = read_recording(recording)
     head = source.sensors["head"]

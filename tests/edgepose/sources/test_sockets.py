@@ -14,6 +14,7 @@ from edgepose.placements import PLACEMENTS
 from edgepose.sources import open_source
 from edgepose.sources.clock_sync import HostClocks
 from edgepose.sources.line_config import QUEUE, line_specs
+from edgepose.sources.probe import probe_socket
 from edgepose.sources.protocol_detection import Datagram, candidate_protocols
 from edgepose.sources.sender_decoders import MOST_NAMED, MOST_SENDERS, SenderDecoders
 from edgepose.sources.sensor_map import read_map
@@ -234,6 +235,15 @@ def test_a_flood_of_senders_stays_bounded(caplog):
     assert strangers.unknown.endswith(", s15 and others: it is not in the sensor map")
 
 
+def test_a_flood_of_senders_with_unknown_ids_warns_a_bounded_number_of_times(caplog):
+    got = decoders([PROTOCOLS["native"]], lambda sender: lambda found: {0: 0})
+    for k in range(12 * MOST_SENDERS):
+        got.feed([Datagram(f"s{k}", native(1, k))], k / 10)
+    assert got.counters.unknown + got.counters.bad == 12 * MOST_SENDERS
+    assert len(caplog.records) <= MOST_SENDERS + MOST_NAMED + 1
+    assert caplog.records[-1].getMessage().endswith("from more senders, without naming them")
+
+
 def test_a_sender_of_noise_is_listened_to_afresh():
     got = decoders(AUTO, lambda sender: lambda found: {0: 0})
     for k in range(80):
@@ -290,6 +300,36 @@ def test_more_than_can_be_read_stays_with_the_system(address):
                 flood.sendto(data, (host, int(port)))
         assert source._queue.qsize() <= QUEUE + 2
         batches.close()
+
+
+class OneAndAmbiguous(Sender):
+    """A sender of one format, and one of two formats that fit equally well."""
+
+    def __init__(self, address):
+        super().__init__()
+        host, _, port = address.rpartition(":")
+        self.one, self.ambiguous = (DatagramLine(host, int(port), number) for number in range(2))
+
+    def send(self, k):
+        self.one.send(native(0, k))
+        for name in ("native", "vectornav-ascii"):
+            reading = sample(PROTOCOLS[name], 0, k)._replace(temperature=None)
+            self.ambiguous.send(PROTOCOLS[name].encode(reading, k))
+
+    def __exit__(self, *_):
+        super().__exit__()
+        self.one.close()
+        self.ambiguous.close()
+
+
+def test_an_ambiguous_sender_costs_only_its_own_finding(address):
+    with OneAndAmbiguous(address) as sensors:
+        found = probe_socket(address)
+    assert found[sensors.one.sender].protocol == "native"
+    ambiguous = found[sensors.ambiguous.sender]
+    assert ambiguous.protocol is None
+    assert ambiguous.refused.startswith("it could be ")
+    assert ambiguous.refused.endswith("; choose one with --protocol")
 
 
 # --- TCP ----------------------------------------------------------------------------------------------------
