@@ -15,7 +15,7 @@ SILENCE_S = 5.0
 """Longest time without any data at the start, seconds."""
 
 NOISE_S = 3.0
-"""Longest time with data but no usable packet at the start, seconds."""
+"""Longest time with data but no usable packet at the start, seconds; SILENCE_S for sockets."""
 
 REFUSED_S = 1.0
 """The same with packets that could be understood, but not used."""
@@ -41,16 +41,16 @@ def check_start(line: LineReader, now_s: float, start_s: float) -> None:
     if decoder.counters.packets:
         line.start_checked = True
         return
-    if passed_s <= REFUSED_S:
-        return
-    if decoder.refused is not None and decoder.unknown is None:
+    # Anybody can send to a socket: a stranger's datagrams leave the sensors no less time than silence.
+    refused_s, noise_s = (REFUSED_S, NOISE_S) if spec.senders is None else (SILENCE_S, SILENCE_S)
+    if passed_s > refused_s and decoder.refused is not None and decoder.unknown is None:
         raise DeviceError(f"{spec.name}: {decoder.refused}")
-    if passed_s > NOISE_S:
+    if passed_s > noise_s:
         if decoder.unknown is not None:
             raise DeviceError(f"{spec.name}: {decoder.unknown}")
         kind = "" if decoder.protocol is None else f"{decoder.protocol.name} "
         raise DeviceError(
-            f"{spec.name}: {decoder.amount} {spec.unit} in {NOISE_S:g} s but no valid {kind}packet; "
+            f"{spec.name}: {decoder.amount} {spec.unit} in {noise_s:g} s but no valid {kind}packet; "
             f"check {spec.check[1]}"
         )
 

@@ -18,6 +18,9 @@ from firmware_protocols.base import Host
 LONGEST = 2048
 """Length limit of a datagram, bytes; longer ones, and empty ones, come out empty."""
 
+_LARGEST = 1 << 16
+"""Size of the buffer for a datagram, bytes: none is larger. On Windows one that does not fit is an error."""
+
 _MOST, _MOST_POLLED = 32, 512
 """Most datagrams read at a time, when waiting for them and when polling."""
 
@@ -66,7 +69,7 @@ class UdpSocket:
         more = True
         for _ in range(most):
             try:
-                data, address = self._socket.recvfrom(LONGEST + 1)
+                data, address = self._socket.recvfrom(_LARGEST)
             except BlockingIOError:
                 more = False
                 break

@@ -194,6 +194,29 @@ def test_a_sender_that_is_not_in_the_map_is_named_once(by_sender, caplog):
     assert [s.sensor for s in got.feed([Datagram(SENDERS[3], native(0, 9))], 1.0)] == [3]
 
 
+class StrangerFirst(Sensors):
+    """A stranger that sends for a while before six sensors do."""
+
+    def send(self, k):
+        if k < 40:
+            self.stranger.send(native(0, k))
+        else:
+            super().send(k)
+
+
+def test_a_stranger_does_not_end_the_wait_for_the_sensors(address, by_sender, monkeypatch):
+    monkeypatch.setattr("edgepose.sources.line_checks.NOISE_S", 0.1)
+    monkeypatch.setattr("edgepose.sources.line_checks.REFUSED_S", 0.1)
+    host, _, port = address.rpartition(":")
+    lines = [DatagramLine(host, int(port), i) for i in range(7)]
+    with open_source(listen=address, protocol="native", sensors=by_sender) as source:
+        rig = StrangerFirst("native", lines[:6])
+        rig.stranger = lines[6]
+        with rig:
+            assert {each.sensor for each in samples_of(source, 3)} == set(range(6))
+    lines[6].close()
+
+
 def test_two_senders_with_one_id_cost_only_the_second(caplog):
     got = decoders([PROTOCOLS["native"]], lambda sender: lambda found: {0: 0, 1: 1})
     pieces = [Datagram(sender, native(0, k)) for k in range(3) for sender in ("a", "b")]
