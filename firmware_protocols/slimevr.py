@@ -123,7 +123,7 @@ class SlimevrDecoder(Receiver):
         return []
 
     def _is_new(self, number: int) -> bool:
-        """Return whether a datagram is not late, and count the lost ones.
+        """Return whether a datagram is not late, and count those lost before it.
 
         A number that does not follow its predecessor may be forged: it makes no later datagram late.
         """

@@ -117,8 +117,8 @@ class SensorMap(NamedTuple):
         result = {device.id: i for i, device in enumerate(self.devices.values())}
         if len(result) < len(self.devices):
             raise ConfigError(
-                f"{self.path}: it distinguishes sensors by port, but a capture holds only one port; "
-                "record samples instead (edgepose record walk.csv)"
+                f"{self.path}: it distinguishes sensors by port or address, but a capture holds only one "
+                "line; record samples instead (edgepose record walk.csv)"
             )
         return result
 
@@ -177,7 +177,9 @@ def read_map(path: Path) -> SensorMap:
     devices = {name: _device(f"{path}: {name}", content[name]) for name in PLACEMENTS}
     for (other, before), (name, device) in combinations(devices.items(), 2):
         if _same(device, before):
-            raise ConfigError(f"{path}: {name} and {other} are the same device; give each its own port or id")
+            raise ConfigError(
+                f"{path}: {name} and {other} are the same device; give each its own port, sender or id"
+            )
     return SensorMap(str(path), devices, {n: _port(f"{path}: ports.{n}", t) for n, t in tables.items()})
 
 
