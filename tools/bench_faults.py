@@ -66,8 +66,8 @@ def turned(recording: Recording, name: str, angle_deg: float, seed: int) -> Reco
     return Recording(recording.sensors | {name: moved}, {})
 
 
-def said_by_run(recording: Recording, calibration: cal.Calibration) -> list[str]:
-    """Return what a run says about the calibration."""
+def warnings_of_run(recording: Recording, calibration: cal.Calibration) -> list[str]:
+    """Return the warnings of a run about the calibration."""
     samples = list(iter_samples(recording))
     misfits, clock = MisfitDetector(calibration), FrameSynchronizer(60.0)
     clock.push(samples, samples[-1].time_s)
@@ -78,7 +78,7 @@ def said_by_run(recording: Recording, calibration: cal.Calibration) -> list[str]
     return lines + misfits.at_end()
 
 
-def named_by_check(recording: Recording, calibration: cal.Calibration) -> set[str]:
+def misplaced_by_check(recording: Recording, calibration: cal.Calibration) -> set[str]:
     """Return the sensors that `check` finds misplaced."""
     monitor, samples = SensorHealthMonitor(calibration), list(iter_samples(recording))
     for first in range(0, len(samples), 600):
@@ -114,11 +114,12 @@ def count(clips: Sequence[Path], with_faults: bool) -> Counter[tuple[str, str]]:
             kind = "a common north" if north else "no north"
             tries = faults(recording, seed) if with_faults else ()
             for fault, names, faulty in [("none", set(), recording), *tries]:
-                said, named = said_by_run(faulty, calibration), named_by_check(faulty, calibration)
-                text = " ".join(said)
-                by_run = all(name in text for name in names) if names else bool(said)
+                warnings = warnings_of_run(faulty, calibration)
+                named = misplaced_by_check(faulty, calibration)
+                text = " ".join(warnings)
+                by_run = all(name in text for name in names) if names else bool(warnings)
                 counts[f"{fault}, {kind}", "tries"] += 1
-                counts[f"{fault}, {kind}", "run"] += by_run and bool(said)
+                counts[f"{fault}, {kind}", "run"] += by_run and bool(warnings)
                 counts[f"{fault}, {kind}", "check"] += names <= named if names else bool(named)
     return counts
 

@@ -48,7 +48,7 @@ def _over(angle_deg: Array, limit_deg: float) -> str:
 def next_command(source: SourceConfig, out: str) -> str:
     """Return the command that uses the calibration."""
     words = ["edgepose", "run"]
-    for flag in ("file", "port", "baud", "can", "bitrate", "sensors"):
+    for flag in ("file", "port", "baud", "can", "bitrate", "listen", "connect", "sensors"):
         value = getattr(source, flag)
         words += [] if value is None else [f"--{flag}", str(value)]
     words += [] if source.protocol == "auto" else ["--protocol", source.protocol]

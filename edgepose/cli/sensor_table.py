@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import click
@@ -49,41 +49,39 @@ class _Column(NamedTuple):
     Attributes:
         header: name of the column.
         unit: unit of its numbers.
-        text: returns the text of a sensor's cell.
+        field: field of `SensorHealth` with the numbers.
+        spec: format of a number.
         rank: order in which columns are left out on a narrow screen, highest first.
     """
 
     header: str
     unit: str
-    text: Callable[[SensorHealth], str]
+    field: str
+    spec: str
     rank: int
 
-
-def _number(field: str, decimals: int, sign: str = "") -> Callable[[SensorHealth], str]:
-    def text(sensor: SensorHealth) -> str:
-        value = getattr(sensor, field)
-        return "-" if math.isnan(value) else f"{value:{sign}.{decimals}f}"
-
-    return text
+    def text(self, sensor: SensorHealth) -> str:
+        """Return the cell of a sensor."""
+        value = getattr(sensor, self.field)
+        return "-" if math.isnan(value) else format(value, self.spec)
 
 
 _COLUMNS = (
-    _Column("rate", "Hz", _number("rate_hz", 1), 0),
-    _Column("jitter", "ms", _number("jitter_ms", 1), 9),
-    _Column("lost", "%", _number("lost_percent", 1), 1),
-    _Column("late", "ms", _number("late_ms", 0), 7),
-    _Column("age", "s", _number("age_s", 1), 6),
-    _Column("clock", "ppm", _number("clock_ppm", 0, "+"), 5),
-    _Column("norm", "m/s²", _number("norm_m_s2", 2), 2),
-    _Column("gravity", "m/s²", _number("gravity_error_m_s2", 2), 10),
-    _Column("tilt", "deg", _number("tilt_deg", 1), 1),
-    _Column("noise", "m/s²", _number("acc_noise_m_s2", 2), 8),
-    _Column("noise", "deg/s", _number("gyr_noise_deg_s", 1), 4),
-    _Column("bias", "deg/s", _number("bias_deg_s", 1), 3),
-    _Column("field", "uT", _number("field_ut", 1), 11),
-    _Column("heading", "deg", _number("heading_deg", 0, "+"), 3),
+    _Column("rate", "Hz", "rate_hz", ".1f", 0),
+    _Column("jitter", "ms", "jitter_ms", ".1f", 9),
+    _Column("lost", "%", "lost_percent", ".1f", 1),
+    _Column("late", "ms", "late_ms", ".0f", 7),
+    _Column("age", "s", "age_s", ".1f", 6),
+    _Column("clock", "ppm", "clock_ppm", "+.0f", 5),
+    _Column("norm", "m/s²", "norm_m_s2", ".2f", 2),
+    _Column("gravity", "m/s²", "gravity_error_m_s2", ".2f", 10),
+    _Column("tilt", "deg", "tilt_deg", ".1f", 1),
+    _Column("noise", "m/s²", "acc_noise_m_s2", ".2f", 8),
+    _Column("noise", "deg/s", "gyr_noise_deg_s", ".1f", 4),
+    _Column("bias", "deg/s", "bias_deg_s", ".1f", 3),
+    _Column("field", "uT", "field_ut", ".1f", 11),
+    _Column("heading", "deg", "heading_deg", "+.0f", 3),
 )
-
 
 _NOTHING = "no packet came from any sensor: switch them on, and check the lines' names, --baud and --protocol"
 

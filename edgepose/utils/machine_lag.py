@@ -35,7 +35,7 @@ class MachineLag:
     @property
     def late_ms(self) -> float:
         """The delay that 95 % of the last waits did not exceed, milliseconds."""
-        late_s = sorted(list(self._late_s))
+        late_s = sorted(self._late_s)
         return 1e3 * late_s[int(0.95 * (len(late_s) - 1))]
 
     def _run(self) -> None:

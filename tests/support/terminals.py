@@ -8,6 +8,7 @@ import os
 import pty
 import subprocess
 import termios
+from collections.abc import Iterator
 
 from tests.support import processes
 
@@ -32,16 +33,23 @@ def rest_of(master: int) -> bytes:
     return text
 
 
+@contextlib.contextmanager
+def ended(process: subprocess.Popen, master: int) -> Iterator[None]:
+    """At the end, the process is gone and its terminal closed, whatever happened."""
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
+        os.close(master)
+
+
 def on_a_terminal(command: list[object], **options: object) -> tuple[int, bytes]:
     """Runs a command whose output and messages go to a terminal: exit code, and all that came there."""
     master, slave = pty.openpty()
     options = {"stdin": subprocess.DEVNULL, "stdout": slave, "stderr": slave} | options
     process = processes.Popen(list(map(str, command)), **options)
     os.close(slave)
-    try:
+    with ended(process, master):
         text = rest_of(master)
         return process.wait(60), text
-    finally:
-        process.kill()
-        process.wait()
-        os.close(master)

@@ -43,6 +43,8 @@ from edgepose.sources.sensor_map import SensorMap, read_map
 PAGE_PORT = 8090
 """Port of the page without an address."""
 
+_LINES = "--port, --can, --listen or --connect"
+
 
 def _body_frame(ctx: click.Context, param: click.Parameter, value: str | None) -> str | None:
     try:
@@ -177,9 +179,9 @@ def calibrate(
 ) -> None:
     """Find out how the six sensors sit on their wearer.
 
-    The wearer holds a pose for a few seconds, live (--port, --can) or in a recording (--file). The
-    calibration contains the direction that the wearer faces and the orientation of each sensor on its
-    segment; `edgepose run` needs it. Repeat it whenever a sensor was taken off or slipped.
+    The wearer holds a pose for a few seconds, live (--port, --can, --listen, --connect) or in a recording
+    (--file). The calibration contains the direction that the wearer faces and the orientation of each sensor
+    on its segment; `edgepose run` needs it. Repeat it whenever a sensor was taken off or slipped.
 
     \b
     Examples:
@@ -226,19 +228,21 @@ def _repeated(job: _Job, guide: Guide, out: str, overwrite: bool) -> bool:
         guide.close_page()
         for warning in warnings:
             terminal.say(f"warning: {warning}")
-        if out == "-":
-            click.echo(calibration.to_json(result), nl=False)
-        else:
+        if out != "-":
             calibration.save(result, out, overwrite)
             overwrite = True  # by a repetition
         guide(table(result, measured))
-        guide(f"Wrote {'stdout' if out == '-' else out}.")
+        if out != "-":
+            guide(f"Wrote {out}.")
         judgement = judge(result, measured, warnings)
         guide(judgement.text)
         if out != "-" and not measured.damaged:
             guide("Next:")
             terminal.show(f"  {next_command(job.source, out)}")  # in one line, to be copied
         if not guide.wants_repeat(end_stage(judgement.word, judgement.text, job.plan.pose)):
+            if out == "-":  # once only, whatever the wearer repeats
+                click.echo(calibration.to_json(result), nl=False)
+                guide("Wrote stdout.")
             return measured.damaged
 
 
@@ -295,10 +299,10 @@ def _check_use(source: SourceConfig, plan: CalibrationPlan, page: tuple[str, int
         flag = "--motion" if plan.start is None else "--from"
         raise click.UsageError(f"{flag} needs a recording that is read at once: --file without --realtime")
     if page is not None and not source.live:
-        raise click.UsageError("--page guides a wearer in front of live sensors: give --port or --can")
+        raise click.UsageError(f"--page guides a wearer in front of live sensors: give {_LINES}")
     if plan.heading_reset == "live" and not source.live:
         raise click.UsageError(
-            "--heading-reset live needs --port; give a recording of the sensors lying side by side instead"
+            f"--heading-reset live needs {_LINES}; give a recording of the sensors lying side by side instead"
         )
     if plan.motion is not None and plan.heading_reset != "motion":
         raise click.UsageError("--motion needs --heading-reset motion")

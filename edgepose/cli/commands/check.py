@@ -8,8 +8,8 @@ import logging
 import math
 import shutil
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -18,7 +18,7 @@ from edgepose.cli.options.calibrated_run import CalibratedRun, calibration_optio
 from edgepose.cli.options.source import source_options
 from edgepose.cli.sensor_table import State, page_lines, table_lines
 from edgepose.cli.terminal.live_page import Page, is_terminal
-from edgepose.cli.terminal.messages import printable, say, show
+from edgepose.cli.terminal.messages import say, show, warnings_to
 from edgepose.cli.terminal.stop_signal import StopSignal
 from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
@@ -76,10 +76,11 @@ def check(
     from edgepose.diagnostics.sensor_health import SensorHealthMonitor
     from edgepose.sources import open_source
 
+    warnings: list[str] = []
     health = SensorHealthMonitor(None if calibrated is None else calibrated.calibration)
     with ExitStack() as stack:
         page = stack.enter_context(Page()) if is_terminal() and source.live and not as_json else None
-        warnings = stack.enter_context(_warnings(hidden=page is not None))
+        stack.enter_context(warnings_to(warnings.append, hidden=page is not None))
         opened = stack.enter_context(open_source(**source.arguments(), lenient=True))
         stop = stack.enter_context(StopSignal())
         lag = stack.enter_context(MachineLag()) if source.file is None else None
@@ -190,26 +191,6 @@ def _listen(
     except EdgeposeError as error:
         return state(), error
     return state(), None
-
-
-@contextmanager
-def _warnings(hidden: bool) -> Iterator[list[str]]:
-    """Collect the program's warnings while the context is entered.
-
-    Args:
-        hidden: do not write them to standard error as well.
-    """
-    result: list[str] = []
-    handler = logging.Handler()
-    handler.emit = lambda record: result.append(printable(record.getMessage()))  # type: ignore[method-assign]
-    logger = logging.getLogger("edgepose")
-    logger.addHandler(handler)
-    logger.propagate = not hidden
-    try:
-        yield result
-    finally:
-        logger.removeHandler(handler)
-        logger.propagate = True
 
 
 def _json(name: str, state: State, warnings: list[str]) -> str:

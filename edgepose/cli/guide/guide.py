@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import logging
 import select
 import shutil
 import sys
 import time
+from contextlib import ExitStack
 from types import TracebackType
 
 from edgepose.cli.guide.phone_page import PhonePage
@@ -40,8 +40,7 @@ class Guide:
         self._unsaid: list[str] = []  # on the page, but not on the normal screen
         self._shown: tuple[Stage, int] | None = None
         self._drawn_s = 0.0
-        self._handler = logging.Handler()
-        self._handler.emit = lambda record: self(record.getMessage())  # type: ignore[method-assign]
+        self._open = ExitStack()  # the page, while there is one
 
     def __enter__(self) -> Guide:
         """Return the guide."""
@@ -93,10 +92,8 @@ class Guide:
 
     def _draw(self, stage: Stage, passed_s: float, is_new: bool) -> None:
         if self._page is None:
-            self._page = Page().__enter__()
-            logger = logging.getLogger("edgepose")
-            logger.addHandler(self._handler)
-            logger.propagate = False  # messages would be written over the page
+            self._page = self._open.enter_context(Page())
+            self._open.enter_context(terminal.warnings_to(self, hidden=True))
         now_s = time.monotonic()
         if is_new or now_s - self._drawn_s >= _REDRAW_S:
             self._drawn_s = now_s
@@ -110,10 +107,7 @@ class Guide:
         """Leave the page on the terminal, and show the messages that were on it."""
         if self._page is None:
             return
-        logger = logging.getLogger("edgepose")
-        logger.removeHandler(self._handler)
-        logger.propagate = True
-        self._page.__exit__(None, None, None)
+        self._open.close()
         self._page = None
         unsaid, self._unsaid = self._unsaid, []
         for text in unsaid:

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from socketserver import TCPServer
 from types import TracebackType
 from typing import Any
 from urllib.parse import urlsplit
@@ -64,8 +65,10 @@ class PhonePage:
                 "give an address of this machine and a free port"
             ) from error
         self.port: int = self._server.server_port
-        self.is_local = ipaddress.ip_address(address[0]).is_loopback
-        self.url = f"http://{address_text(host, port)}/"
+        bound = ipaddress.ip_address(address[0])
+        self.is_local = bound.is_loopback
+        shown = address_in_network() if bound.is_unspecified else None  # no browser opens 0.0.0.0 elsewhere
+        self.url = f"http://{address_text(shown or host, port)}/"
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True)
 
     def __enter__(self) -> PhonePage:
@@ -122,7 +125,7 @@ class _Server(ThreadingHTTPServer):
 
     def server_bind(self) -> None:
         # HTTPServer would look up the machine's name, which can take seconds.
-        socket.socket.bind(self.socket, self.server_address)
+        TCPServer.server_bind(self)
         self.server_name, self.server_port = self.host, self.server_address[1]
 
     def process_request(self, request: Any, client_address: Any) -> None:
@@ -156,9 +159,8 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(HTTPStatus.NOT_FOUND)
 
     def do_POST(self) -> None:
-        origin = self.headers.get("Origin")
-        foreign = origin is not None and urlsplit(origin).netloc != self.headers.get("Host")
-        if foreign or not self._is_own_name():
+        origins = None, f"http://{self.headers.get('Host')}"
+        if self.headers.get("Origin") not in origins or not self._is_own_name():
             self._answer(HTTPStatus.FORBIDDEN)  # another page, open in the same browser
         elif self.server.page.press(self.path.removeprefix("/")):
             self._answer(HTTPStatus.NO_CONTENT)
@@ -167,11 +169,10 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _is_own_name(self) -> bool:
         """Return whether the request names this server by address: other names may have been bent to it."""
-        name = urlsplit(f"//{self.headers.get('Host', '')}").hostname
-        if name in ("localhost", self.server.host):
-            return True
         try:
-            ipaddress.ip_address(name or "")
+            name = urlsplit(f"//{self.headers.get('Host', '')}").hostname or ""
+            if name not in ("localhost", self.server.host.lower()):
+                ipaddress.ip_address(name)
         except ValueError:
             return False
         return True

@@ -13,7 +13,7 @@ import stat
 import sys
 import textwrap
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import IO, Any
 
@@ -142,8 +142,31 @@ def has_terminal() -> bool:
 
 
 class _Handler(logging.Handler):
+    def __init__(self, receive: Callable[[str], None]) -> None:
+        super().__init__()
+        self._receive = receive
+
     def emit(self, record: logging.LogRecord) -> None:
-        say(record.getMessage())
+        self._receive(record.getMessage())
+
+
+@contextmanager
+def warnings_to(receive: Callable[[str], None], hidden: bool) -> Iterator[None]:
+    """Pass the program's warnings to a function while the context is entered.
+
+    Args:
+        receive: called with each warning, printable.
+        hidden: do not write them to standard error as well.
+    """
+    handler = _Handler(lambda text: receive(printable(text)))
+    logger = logging.getLogger("edgepose")
+    logger.addHandler(handler)
+    logger.propagate = not hidden
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.propagate = True
 
 
 def prepare() -> None:
@@ -160,7 +183,7 @@ def prepare() -> None:
     if reconfigure is not None:
         reconfigure(errors="backslashreplace")  # file names may be undecodable
     sys.stderr = _Messages(sys.stderr)
-    logging.basicConfig(handlers=[_Handler()])
+    logging.basicConfig(handlers=[_Handler(say)])
 
 
 def _reserve_standard_descriptors() -> None:

@@ -19,7 +19,9 @@ from click.testing import CliRunner, Result
 
 from edgepose import calibration as cal
 from edgepose import rotations as rot
+from edgepose.cli.calibration_verdict import next_command
 from edgepose.cli.commands.calibrate import calibrate
+from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.base import recording_from_samples
 from edgepose.formats.recordings.csv import write_csv
@@ -492,6 +494,14 @@ def test_a_whole_session_on_a_terminal(wearer: Wearer, tmp_path: Path) -> None:
     calibration = cal.load_calibration(out)
     np.testing.assert_allclose(np.degrees(calibration.heading_offset), np.degrees(ERRORS), atol=0.1)
     assert_recovers(calibration, ERRORS, 0.1)
+
+
+def test_the_next_command_names_lines_of_all_kinds() -> None:
+    source = SourceConfig(port="/dev/ttyUSB0", can="can:can0", listen="0.0.0.0:7000", connect="10.0.0.2:7000")
+    assert next_command(source, "my calib.json") == (
+        "edgepose run --port /dev/ttyUSB0 --can can:can0 --listen 0.0.0.0:7000 --connect 10.0.0.2:7000 "
+        "--calibration 'my calib.json' --view"
+    )
 
 
 def test_the_recording_is_not_written_over(tmp_path: Path) -> None:

@@ -15,13 +15,14 @@ import pytest
 
 from edgepose.cli.guide.big_words import big_word
 from edgepose.cli.guide.guide import end_stage, start_stage
-from edgepose.cli.guide.phone_page import PhonePage
+from edgepose.cli.guide.phone_page import PhonePage, address_in_network
 from edgepose.cli.guide.stage import COUNTDOWN, HOLD, MOVE, Stage
 from edgepose.cli.guide.terminal_page import page_lines
 from edgepose.cli.prompts import _INSTRUCTIONS, _MOVES
 from edgepose.errors import DeviceError
 from tests.support import processes
 from tests.support.browser import Browser, needs_browser, until
+from tests.support.datagrams import free_address
 from tests.support.processes import ROOT, simulated
 
 CLIP = ROOT / "tools" / "data" / "09_12.bvh"
@@ -86,6 +87,8 @@ def test_the_page_takes_its_own_buttons_and_nothing_else():
         assert asked(page, "POST", "/repeat")[0] == 404  # not shown now
         assert asked(page, "POST", "/start", Origin="http://evil.example")[0] == 403
         assert asked(page, "GET", "/state", Host="evil.example")[0] == 403  # a name bent to this address
+        assert asked(page, "GET", "/state", Host="[")[0] == 403
+        assert asked(page, "POST", "/start", Origin="http://[")[0] == 403
         assert asked(page, "PUT", "/start")[0] == 501
         assert page.pressed() is None
         assert asked(page, "POST", "/start", Origin=f"http://127.0.0.1:{page.port}")[0] == 204
@@ -94,6 +97,17 @@ def test_the_page_takes_its_own_buttons_and_nothing_else():
         assert page.pressed() is None
         page.show(end_stage("GOOD", "done", "straight"), 0.0, [])
         assert json.loads(asked(page, "GET", "/state")[1])["buttons"] == ["repeat", "finish"]
+
+
+def test_the_page_is_found_by_the_name_that_was_given():
+    host, port = free_address().split(":")
+    with PhonePage("0X7F.1", int(port)) as page:  # browsers write names in small letters
+        assert page.is_local
+        assert asked(page, "GET", "/state", Host=f"0x7f.1:{port}")[0] == 200
+    with PhonePage("0.0.0.0", int(port)) as page:  # the same port at once, as when a calibration is repeated
+        assert not page.is_local
+        assert page.url == f"http://{address_in_network() or '0.0.0.0'}:{port}/"
+        assert asked(page, "GET", "/state", Host=f"{host}:{port}")[0] == 200
 
 
 def test_many_silent_connections_do_not_stop_the_page():
@@ -119,8 +133,7 @@ def test_a_calibration_on_a_phone(tmp_path):
         simulated(CLIP, "--mounting", 7, "--stand") as (_, port),
         contextlib.closing(Browser(tmp_path / "chromium", "390,844")) as browser,
     ):
-        with socket.create_server(("127.0.0.1", 0)) as free:
-            address = f"127.0.0.1:{free.getsockname()[1]}"
+        address = free_address()
         words = ("--port", port, "--protocol", "native", "--body-frame", "heading:0", "--out", out)
         words += ("--page", address, "--hold", 1, "--countdown", 1)
         process = processes.Popen(

@@ -39,7 +39,7 @@ from tests.support import limits, processes
 from tests.support.datagrams import Listener, free_address
 from tests.support.ports import Port, Sender
 from tests.support.processes import end, simulated, start
-from tests.support.terminals import own_terminal, rest_of
+from tests.support.terminals import ended, own_terminal, rest_of
 
 BONES = [18, 19, 4, 5, 15, 0]  # those with the sensors, in the order of PLACEMENTS
 
@@ -280,16 +280,12 @@ def test_ctrl_c_at_a_terminal_in_the_middle_of_a_frame(wearer, tmp_path):
     )
     os.close(other)
     text = b""
-    try:
+    with ended(process, terminal):
         while b" poses, " not in text:
             text += os.read(terminal, 4096)
         process.send_signal(signal.SIGINT)
         text += rest_of(terminal)
         assert process.wait(60) == 0
-    finally:
-        process.kill()
-        process.wait()
-        os.close(terminal)
     assert re.search(rb"\r\d+ poses, \d+ a second, 0 with a held sensor", text)
     frames, *_ = whole(file)
     assert 0 < len(frames) < 720
@@ -553,7 +549,7 @@ def test_the_place_is_reset_by_key_text_and_osc(wearer, tmp_path):
         )  # fmt: skip
         os.close(inside)
         screen = b""
-        try:
+        with ended(process, outside):
             for times, ask in enumerate(requests):
                 parts = [screen]
                 while len(parts) <= times or b" poses, " not in parts[-1]:
@@ -562,10 +558,6 @@ def test_the_place_is_reset_by_key_text_and_osc(wearer, tmp_path):
                 ask()
             screen += rest_of(outside)
             assert process.wait(60) == 0
-        finally:
-            process.kill()
-            process.wait()
-            os.close(outside)
     assert b"Ctrl-C ends the run, r re-zeroes headings, o resets the place" in b" ".join(screen.split())
     assert b"datagrams without" not in screen
     path = read_poses(file).translation[:, [0, 2]]
