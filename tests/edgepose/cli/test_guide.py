@@ -161,6 +161,19 @@ def test_a_calibration_on_a_phone(tmp_path):
     assert json.loads(out.read_text())["pose"] == "straight"
 
 
+@needs_browser
+def test_the_buttons_come_back_with_the_network(tmp_path):
+    host, port = free_address().split(":")
+    with contextlib.closing(Browser(tmp_path / "chromium", "390,844")) as browser:
+        for attempt in range(2):
+            with PhonePage(host, int(port)) as page:
+                page.show(start_stage("Press start", "straight"), 0.0, [])
+                if attempt == 0:
+                    browser.call("Page.navigate", url=page.url)
+                until(lambda: browser.run("document.querySelectorAll('button').length") == 1, "the button")
+            until(lambda: "edgepose has ended" in browser.text(), "the end")
+
+
 def _listens(address: str) -> bool:
     host, port = address.split(":")
     try:
