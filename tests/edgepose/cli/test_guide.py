@@ -67,11 +67,11 @@ def served() -> Iterator[PhonePage]:
         yield page
 
 
-def asked(page: PhonePage, method: str, path: str, **headers: str) -> tuple[int, bytes]:
-    connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=10)
+def asked(port: int, method: str, path: str, **headers: str) -> tuple[int, bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
     with contextlib.closing(connection):
         connection.putrequest(method, path, skip_host=True)
-        for name, value in ({"Host": f"127.0.0.1:{page.port}"} | headers).items():
+        for name, value in ({"Host": f"127.0.0.1:{port}"} | headers).items():
             connection.putheader(name, value)
         connection.endheaders()
         answer = connection.getresponse()
@@ -81,33 +81,33 @@ def asked(page: PhonePage, method: str, path: str, **headers: str) -> tuple[int,
 def test_the_page_takes_its_own_buttons_and_nothing_else():
     with served() as page:
         page.show(start_stage("Press start", "straight"), 0.0, ["<b>note"])
-        state = json.loads(asked(page, "GET", "/state")[1])
+        state = json.loads(asked(page.port, "GET", "/state")[1])
         assert (state["word"], state["buttons"], state["notes"]) == ("START", ["start"], ["<b>note"])
-        assert asked(page, "GET", "/../pyproject.toml")[0] == 404
-        assert asked(page, "POST", "/repeat")[0] == 404  # not shown now
-        assert asked(page, "POST", "/start", Origin="http://evil.example")[0] == 403
-        assert asked(page, "GET", "/state", Host="evil.example")[0] == 403  # a name bent to this address
-        assert asked(page, "GET", "/state", Host="[")[0] == 403
-        assert asked(page, "POST", "/start", Origin="http://[")[0] == 403
-        assert asked(page, "PUT", "/start")[0] == 501
+        assert asked(page.port, "GET", "/../pyproject.toml")[0] == 404
+        assert asked(page.port, "POST", "/repeat")[0] == 404  # not shown now
+        assert asked(page.port, "POST", "/start", Origin="http://evil.example")[0] == 403
+        assert asked(page.port, "GET", "/state", Host="evil.example")[0] == 403  # a name bent to this address
+        assert asked(page.port, "GET", "/state", Host="[")[0] == 403
+        assert asked(page.port, "POST", "/start", Origin="http://[")[0] == 403
+        assert asked(page.port, "PUT", "/start")[0] == 501
         assert page.pressed() is None
-        assert asked(page, "POST", "/start", Origin=f"http://127.0.0.1:{page.port}")[0] == 204
-        assert asked(page, "POST", "/start")[0] == 204
+        assert asked(page.port, "POST", "/start", Origin=f"http://127.0.0.1:{page.port}")[0] == 204
+        assert asked(page.port, "POST", "/start")[0] == 204
         assert page.pressed() == "start"
         assert page.pressed() is None
         page.show(end_stage("GOOD", "done", "straight"), 0.0, [])
-        assert json.loads(asked(page, "GET", "/state")[1])["buttons"] == ["repeat", "finish"]
+        assert json.loads(asked(page.port, "GET", "/state")[1])["buttons"] == ["repeat", "finish"]
 
 
 def test_the_page_is_found_by_the_name_that_was_given():
     host, port = free_address().split(":")
     with PhonePage("0X7F.1", int(port)) as page:  # browsers write names in small letters
         assert page.is_local
-        assert asked(page, "GET", "/state", Host=f"0x7f.1:{port}")[0] == 200
+        assert asked(page.port, "GET", "/state", Host=f"0x7f.1:{port}")[0] == 200
     with PhonePage("0.0.0.0", int(port)) as page:  # the same port at once, as when a calibration is repeated
         assert not page.is_local
         assert page.url == f"http://{address_in_network() or '0.0.0.0'}:{port}/"
-        assert asked(page, "GET", "/state", Host=f"{host}:{port}")[0] == 200
+        assert asked(page.port, "GET", "/state", Host=f"{host}:{port}")[0] == 200
 
 
 def test_many_silent_connections_do_not_stop_the_page():
@@ -115,12 +115,12 @@ def test_many_silent_connections_do_not_stop_the_page():
         page.show(start_stage("Press start", "straight"), 0.0, [])
         for _ in range(40):
             stack.enter_context(socket.create_connection(("127.0.0.1", page.port)))
-        until(lambda: _answers(page), "the page")
+        until(lambda: _answers(page.port), "the page")
 
 
-def _answers(page: PhonePage) -> bool:
+def _answers(port: int, method: str = "GET", path: str = "/state") -> bool:
     try:
-        return asked(page, "GET", "/state")[0] == 200
+        return asked(port, method, path)[0] < 300
     except (OSError, http.client.HTTPException):
         return False
 
@@ -159,6 +159,27 @@ def test_a_calibration_on_a_phone(tmp_path):
     assert f"Page for the wearer: http://{address}/" in text
     assert text.count(f"Wrote {out}.") == 2
     assert json.loads(out.read_text())["pose"] == "straight"
+
+
+def test_standard_output_gets_the_last_of_several_calibrations():
+    address = free_address()
+    page_port = int(address.partition(":")[2])
+    words = ("--protocol", "native", "--body-frame", "heading:0", "--out", "-", "--page", address)
+    with simulated(CLIP, "--mounting", 7, "--stand") as (_, port):
+        process = processes.start(
+            *("calibrate", "--port", port, *words, "--hold", 0.5, "--countdown", 0),
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+        )  # fmt: skip
+        try:
+            for button in ("start", "repeat", "start", "finish"):
+                until(lambda path=f"/{button}": _answers(page_port, "POST", path), button)
+            out, errors = process.communicate(timeout=60)
+        finally:
+            process.kill()
+            process.wait()
+    assert process.returncode == 0, errors
+    assert errors.count("The calibration is good.") == 2
+    assert json.loads(out)["pose"] == "straight"
 
 
 @needs_browser
