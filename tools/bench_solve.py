@@ -159,7 +159,7 @@ class Sample(NamedTuple):
 
 
 def takes(data: Path, part: str, every: int, body: Body, frames: int | None = None) -> Iterator[Sample]:
-    """Yield every `every`-th take of a part, or so many frames of its middle, on the wearer's body."""
+    """Yield every `every`-th take of a part, or the middle `frames` frames of it, on the wearer's body."""
     from edgepose_export.training.dataset import take_paths
 
     for number, path in enumerate(take_paths(data, part)[::every]):

@@ -21,7 +21,7 @@ from edgepose_export.evaluation import plots
 from edgepose_export.evaluation.evaluate import takes_of
 from edgepose_export.evaluation.paths import BOTH, KINDS, measured, summarise
 from edgepose_export.evaluation.paths import Path as Way
-from edgepose_export.evaluation.real_paths import Models, real_paths, sitter_row, walker_row
+from edgepose_export.evaluation.real_paths import Models, cells, real_paths, sitter_row, walker_row
 from edgepose_export.evaluation.real_wearers import FOLDER
 from edgepose_export.training.dataset import parts_of
 from edgepose_export.training.sources import GROUPS, HELD_OUT
@@ -54,10 +54,6 @@ def _cell(metric: Metric | None) -> str:
     return f"{metric.mean:.1f}" if metric and metric.frames else "-"
 
 
-def _number(column: str, value: float) -> str:
-    return f"{value:.2f}" if column.endswith(" m") else f"{value:.1f}"
-
-
 def page_table(rows: Sequence[Sequence[str]]) -> str:
     """Return rows, the first of them the head, as a table of a page."""
     lines = ["| " + " | ".join(row) + " |" for row in rows]
@@ -75,10 +71,8 @@ def real_table(models: Models) -> dict[str, str]:
     plots.real_path_plot(IMAGES / "real-paths.png", paths)
     tables = {}
     for key, row_of, index in (("walker", walker_row, 0), ("sitter", sitter_row, 1)):
-        rows = {name: row_of(pair[index]) for name, pair in paths.items()}
-        head = ["model", *next(iter(rows.values()))]
-        cells = [[f"`{name}`", *(_number(*item) for item in row.items())] for name, row in rows.items()]
-        tables[key] = page_table([head, *cells])
+        head, *rows = cells({f"`{name}`": row_of(pair[index]) for name, pair in paths.items()})
+        tables[key] = page_table([["model", *head[1:]], *rows])
     return tables
 
 

@@ -138,6 +138,16 @@ def summary(predicted: ArrayLike, true: ArrayLike, offsets: ArrayLike, rate: flo
     return {key: measure(values) for key, values in per_frame(predicted, true, offsets, rate).items()}
 
 
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a table, its first column aligned to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for name, *cells in rows:
+        padded = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
+        lines.append("  ".join([name.ljust(widths[0]), *padded]).rstrip())
+    return lines
+
+
 def format_table(summaries: Mapping[str, Mapping[str, Metric]]) -> str:
     """Format a table with one line per method, one column per metric and "mean ± deviation" in each cell.
 
@@ -154,11 +164,7 @@ def format_table(summaries: Mapping[str, Mapping[str, Metric]]) -> str:
     for name, row in summaries.items():
         cells = [f"{row[key].mean:.2f} ± {row[key].std:.2f}" if key in row else "-" for key in keys]
         table.append([name, *cells, *([] if same else [str(frames[name])])])
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    lines = []
-    for method, *cells in table:
-        padded = [cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True)]
-        lines.append("  ".join([method.ljust(widths[0]), *padded]).rstrip())
+    lines = aligned(table)
     over = f" over {frames.popitem()[1]} frames" if same else ""
     lines.append(f"mean ± deviation{over}; 15 joints: all predicted, 10 joints: those without a sensor")
     return "\n".join(lines)

@@ -250,7 +250,10 @@ def _way(poses: PoseSequence, bouts: Sequence[WalkingBout], body: Body) -> list[
         ("highest speed", f"{way.speed.max():.2f} m/s"),
         ("height of the pelvis", f"{low:.2f} to {high:.2f} m"),
     ]
-    note = "Lengths and speeds are those of the path averaged over half a second."
+    note = (
+        "Speeds are those of the path averaged over half a second. As in a run, steps of less than 25 cm do "
+        "not count for the length."
+    )
     return [
         "<h2>Way</h2>",
         _table(("way of the pelvis", ""), rows),

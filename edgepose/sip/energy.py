@@ -80,7 +80,7 @@ class Evaluation(NamedTuple):
         states: sensors of the posed body, from which derivatives are computed.
         orientation_residual: (T, N, 3) rad (SIP eq. 11).
         acceleration_residual: (T, N, 3) m/s^2 (SIP eq. 16), see `project`.
-        prior_residual: (T, P - 3) L (x - mean) (SIP eq. 30); with a network (T, 3 J), see `network_residual`.
+        prior_residual: (T, P - 3) L (x - mean) (SIP eq. 30); with a network see `_network_residual`.
         limit_residual: (T, P - 3) excess of each parameter over its limits, rad (SIP eq. 19).
         costs: of all residuals.
     """

@@ -84,8 +84,8 @@ def grounded(
     known = np.isfinite(acceleration[1:-1])
     stiffness = np.where(known, rate**4 / ACCELERATION_ERROR**2, 0.0)
     force = stiffness * np.where(known, acceleration[1:-1] - change, 0.0) / rate**2
-    for place, factor in enumerate((1.0, -2.0, 1.0)):
-        rows = slice(place, frames - 2 + place)
+    for shift, factor in enumerate((1.0, -2.0, 1.0)):
+        rows = slice(shift, frames - 2 + shift)
         band[0, rows] += factor**2 * stiffness
         right[rows] += factor * force
     band[1, :-2] -= 2.0 * stiffness

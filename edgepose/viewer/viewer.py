@@ -90,7 +90,8 @@ class SkeletonView:
                 ("bones", "joints"), (cylinder, ball), build(body.offsets), strict=True
             )
         ]
-        self._marks = add("contacts", ball, np.full((len(CONTACTS), 3), _HIDDEN), [_rgb(CONTACT)] * 7)
+        hidden = np.full((len(CONTACTS), 3), _HIDDEN)
+        self._marks = add("contacts", ball, hidden, [_rgb(CONTACT)] * len(CONTACTS))
         self._marked = False
 
     def show(self, rotations: Array, position: Array | None, contacts: NDArray[Any] | None = None) -> Array:
@@ -276,7 +277,7 @@ class _TimeLine:
 
 
 class _Track:
-    """A figure, its poses, and their whole path."""
+    """A figure, its poses, and their path."""
 
     def __init__(self, figure: SkeletonView, path: FloorPath, poses: PoseSequence, body: Body) -> None:
         self.poses = poses

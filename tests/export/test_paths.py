@@ -165,6 +165,7 @@ def test_the_command_shows_rows_kinds_and_a_picture(folder, tmp_path):
     [
         (["--place", "--table", "3"], "--place has tables and a picture of its own"),
         (["--place", "--online", "stream"], "--place has tables and a picture of its own"),
+        (["--place", "--past", "20"], "--place has tables and a picture of its own"),
         (["--paths", "paths.png"], "--paths belongs to --place or --real"),
     ],
 )

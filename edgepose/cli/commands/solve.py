@@ -21,6 +21,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.sinks.registry import SINKS
 
 if TYPE_CHECKING:
+    from edgepose.calibration import Calibration
     from edgepose.imu import Recording
     from edgepose.sinks.base import Sink
     from edgepose.sip.measurements import Measurements, SensorMount
@@ -183,8 +184,9 @@ def solve(
     from edgepose.sip.solve import solve as solve_all
     from edgepose.sip.translation import pelvis_path
 
-    wearer_body = body.build(load_calibration(calibration_path).height_m)
-    data, mounts = _read(recording, calibration_path, solver)
+    calibration = load_calibration(calibration_path)
+    wearer_body = body.build(calibration.height_m)
+    data, mounts = _read(recording, calibration, solver)
     measurements = measure(data, mounts, solver.rate)
     network = _network(solver, body.hinges, data, mounts, measurements)
     settings = _settings(solver, body.hinges, wearer_body, measurements, network)
@@ -237,17 +239,15 @@ def _check_outputs(outputs: OutputConfig, plot: Path | None, inputs: Mapping[str
 
 
 def _read(
-    path: Path, calibration_path: Path, solver: SolverFlags
+    path: Path, calibration: Calibration, solver: SolverFlags
 ) -> tuple[Recording, dict[str, SensorMount]]:
     """Read a recording and the mounting of its sensors.
 
     Raises:
-        EdgeposeError: the recording or the calibration cannot be read, or the method needs other sensors.
+        EdgeposeError: the recording cannot be read, or the method needs other sensors.
     """
-    from edgepose.calibration import load_calibration
     from edgepose.sip.inputs import mounted, read
 
-    calibration = load_calibration(calibration_path)
     data = read(path, calibration)
     if solver.method == "sip" and all(sensor.acc is None for sensor in data.sensors.values()):
         raise EdgeposeError(f"{path}: no sensor has accelerations, which sip needs; use --method sop")
@@ -271,11 +271,12 @@ def _network(
     from edgepose.sip.measurements import measure
     from edgepose.sip.network_prior import missing_for_network, network_prior
 
-    name, plain = solver.prior, "sop" if solver.method == "sop" else "--body hinges"
-    if solver.statistics or (name is None and (hinges or solver.method == "sop")):
+    name, statistics_only = solver.prior, hinges or solver.method == "sop"
+    if solver.statistics or (name is None and statistics_only):
         return None
-    if hinges or solver.method == "sop":
-        raise EdgeposeError(f"{plain} takes no network as its prior: leave out --prior {name}")
+    if statistics_only:
+        flag = "--method sop" if solver.method == "sop" else "--body hinges"
+        raise EdgeposeError(f"{flag} takes no network as its prior: leave out --prior {name}")
     missing = missing_for_network(measurements)
     if missing and name is not None:
         raise EdgeposeError(

@@ -196,10 +196,10 @@ def _check_combination(
         raise click.UsageError("--table decides how models run: omit --online, --past and --future")
     if heat_map and (table or tables):
         raise click.UsageError("--heat-map replaces the tables: omit --table, --histogram and --baselines")
-    if place and (table or tables or heat_map or modes or flags["reliability"]):
+    if place and (table or tables or heat_map or modes or past is not None or flags["reliability"]):
         raise click.UsageError(
             "--place has tables and a picture of its own: omit --table, --histogram, --heat-map, "
-            "--reliability, --baselines and --online"
+            "--reliability, --baselines, --online and --past"
         )
     if flags["paths"] and not place:
         raise click.UsageError("--paths belongs to --place or --real")

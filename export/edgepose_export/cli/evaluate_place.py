@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from edgepose_export.evaluation.paths import Path
 
 SHOWN = 6
-"""Paths in the picture: the longest of each part."""
+"""Paths in the picture: the widest of each part."""
 
 
 def evaluate_place(
@@ -55,7 +55,7 @@ def evaluate_place(
             if kinds:
                 show(f"\n{format_table(f'{part}, {model.name}: after 2 s, cm, by kind of motion', kinds)}")
             if model is able[0]:
-                drawn[part] = sorted(paths, key=_length, reverse=True)[:SHOWN]
+                drawn[part] = sorted(paths, key=_width, reverse=True)[:SHOWN]
     show(f"\n{LEGEND}")
     if picture:
         path_plot(picture, drawn, BOTH, overwrite)
@@ -93,7 +93,7 @@ def evaluate_real_place(
         say(f"wrote {picture}")
 
 
-def _length(path: Path) -> float:
+def _width(path: Path) -> float:
     """Return how far a path spreads, metres."""
     spread = path.true.max(axis=0) - path.true.min(axis=0)
     return float(spread[0] + spread[2])

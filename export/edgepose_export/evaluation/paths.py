@@ -13,13 +13,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from edgepose.analysis.metrics import Metric, measure
+from edgepose.analysis.metrics import Metric, aligned, measure
 from edgepose.place import PlaceTracker
 from edgepose.pose import CONTACTS
+from edgepose.rotations import yaw_of_matrix
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics
 from edgepose_export.training.dataset import RATE, Take
 
 Array = NDArray[np.float64]
+Singles = NDArray[np.float32]
 
 SECONDS = (2.0, 5.0, 10.0)
 """Times after which the error is measured."""
@@ -31,7 +33,7 @@ EVERY = 10
 """Frames from the start of a measured time or way to the next."""
 
 KIND_S = 2.0
-"""Length of the parts whose kind of motion is told, seconds."""
+"""Length of the parts that each have one kind of motion, seconds."""
 
 KINDS = ("in place", "forwards", "backwards", "sideways", "turning", "running", "jumping")
 """Kinds of motion: slower than 0.2 m/s; three by the direction of the pelvis; through more than 90 degrees;
@@ -40,7 +42,8 @@ faster than 2 m/s; in the air for more than 15 % of the time."""
 FRAMES = 256
 """Frames that run together."""
 
-ANKLES, KNEES = [7, 8], [4, 5]
+ANKLES = [JOINTS.index("left_ankle"), JOINTS.index("right_ankle")]
+KNEES = [JOINTS.index("left_knee"), JOINTS.index("right_knee")]
 
 Row = dict[str, Array]
 """Errors by column, see `LEGEND`."""
@@ -64,11 +67,8 @@ class Path(NamedTuple):
     kinds: Row
 
 
-Place = NDArray[np.float32]
-
-
-def _with(contacts: bool, velocity: bool) -> Callable[[Place], Place | None]:
-    def changed(place: Place) -> Place | None:
+def _with(contacts: bool, velocity: bool) -> Callable[[Singles], Singles | None]:
+    def changed(place: Singles) -> Singles | None:
         if not (contacts or velocity):
             return None
         return place * np.repeat([contacts, velocity], [len(CONTACTS), 3]).astype(np.float32)
@@ -76,7 +76,7 @@ def _with(contacts: bool, velocity: bool) -> Callable[[Place], Place | None]:
     return changed
 
 
-ROWS: Mapping[str, Callable[[Place], Place | None]] = {
+ROWS: Mapping[str, Callable[[Singles], Singles | None]] = {
     "no heads": _with(contacts=False, velocity=False),
     "velocity": _with(contacts=False, velocity=True),
     "contacts": _with(contacts=True, velocity=False),
@@ -99,7 +99,7 @@ no heads: the lower foot stands still; velocity: the network's velocity alone;
     contacts: its contacts alone; both: as in a run; truth: the true motion"""
 
 
-def streamed(module: torch.jit.ScriptModule, take: Take, future: int) -> tuple[Place, Place]:
+def streamed(module: torch.jit.ScriptModule, take: Take, future: int) -> tuple[Singles, Singles]:
     """Return local poses (T, 24, 3, 3) and places (T, 10) for every frame of a take, streamed as in a run."""
     orientation, acceleration = torch.from_numpy(take.orientation), torch.from_numpy(take.acceleration)
     poses, places = [], []
@@ -113,7 +113,7 @@ def streamed(module: torch.jit.ScriptModule, take: Take, future: int) -> tuple[P
     return torch.cat([*poses, pose], 1)[0].numpy(), torch.cat([*places, place], 1)[0].numpy()
 
 
-def tracked(time_s: Array, poses: Place, places: Iterable[Place | None]) -> Array:
+def tracked(time_s: Array, poses: Singles, places: Iterable[Singles | None]) -> Array:
     """Return the positions (T, 3) of the pelvis in poses (T, 24, 3, 3), on the default body."""
     tracker = PlaceTracker(default_body())
     frames = zip(time_s.tolist(), poses, places, strict=True)
@@ -121,7 +121,7 @@ def tracked(time_s: Array, poses: Place, places: Iterable[Place | None]) -> Arra
 
 
 def estimates(
-    poses: Place, place: Place, time_s: Array | None = None, only: str | None = None
+    poses: Singles, place: Singles, time_s: Array | None = None, only: str | None = None
 ) -> dict[str, Array]:
     """Return the positions (T, 3) of the pelvis by row of the tables, of all rows or of one."""
     times = np.arange(len(poses)) / RATE if time_s is None else time_s
@@ -147,7 +147,7 @@ def measured(
         yield Path(take.name, true, ways, rows, _errors_by_kind(ways[BOTH], true, take))
 
 
-def soles(poses: Place) -> Array:
+def soles(poses: Singles) -> Array:
     """Return the points (T, 2, 3) of the default body's soles below the ankles, relative to the pelvis."""
     offsets = default_body().offsets
     rotations, joints = forward_kinematics(poses.astype(float), offsets)
@@ -228,8 +228,7 @@ def kind_of(take: Take, span: slice) -> str:
     way = np.linalg.norm(np.diff(take.translation[span][:, [0, 2]], axis=0), axis=1).sum()
     across, _, ahead = take.place[span, len(CONTACTS) :].mean(axis=0)
     airborne = 1.0 - take.place[span, :4].max(axis=1).mean()
-    pelvis = take.pose[span, 0]
-    heading = np.unwrap(np.arctan2(pelvis[:, 0, 2] - pelvis[:, 2, 0], pelvis[:, 0, 0] + pelvis[:, 2, 2]))
+    heading = np.unwrap(yaw_of_matrix(take.pose[span, 0]))
     if way > 2.0 * KIND_S:
         return "running"
     if airborne > 0.15:
@@ -265,9 +264,4 @@ def format_table(title: str, table: Mapping[str, Mapping[str, Metric]]) -> str:
         for name, row in table.items()
     ]
     counts = ["count", *(str(next(iter(table.values()))[key].frames) for key in keys)]
-    widths = [max(map(len, column)) for column in zip(head, *rows, counts, strict=True)]
-    lines = [title]
-    for name, *cells in (head, *rows, counts):
-        padded = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
-        lines.append("  ".join([name.ljust(widths[0]), *padded]).rstrip())
-    return "\n".join(lines)
+    return "\n".join([title, *aligned([head, *rows, counts])])

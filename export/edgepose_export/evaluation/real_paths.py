@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from edgepose.analysis.metrics import aligned
 from edgepose_export.evaluation.paths import BOTH, estimates, soles, streamed
 from edgepose_export.evaluation.real_wearers import SITTER, WALKER, Wearer, read_sitter, read_walker
 from edgepose_export.training.dataset import RATE
@@ -104,16 +105,18 @@ def sitter_row(path: RealPath) -> dict[str, float]:
     }
 
 
+def cells(rows: Mapping[str, Mapping[str, float]]) -> list[list[str]]:
+    """Return the cells of a table: a head, and a row for each model."""
+    return [
+        ["", *next(iter(rows.values()))],
+        *([name, *(_number(*item) for item in row.items())] for name, row in rows.items()),
+    ]
+
+
 def format_table(title: str, rows: Mapping[str, Mapping[str, float]]) -> str:
     """Format a table with one line per model."""
-    head = ["", *next(iter(rows.values()))]
-    cells = [
-        [name, *(f"{value:.2f}" if key.endswith(" m") else f"{value:.1f}" for key, value in row.items())]
-        for name, row in rows.items()
-    ]
-    widths = [max(map(len, column)) for column in zip(head, *cells, strict=True)]
-    lines = [title]
-    for name, *row in (head, *cells):
-        padded = (cell.rjust(width) for cell, width in zip(row, widths[1:], strict=True))
-        lines.append("  ".join([name.ljust(widths[0]), *padded]).rstrip())
-    return "\n".join(lines)
+    return "\n".join([title, *aligned(cells(rows))])
+
+
+def _number(column: str, value: float) -> str:
+    return f"{value:.2f}" if column.endswith(" m") else f"{value:.1f}"

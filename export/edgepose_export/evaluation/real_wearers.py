@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose import rotations as rot
-from edgepose.analysis.metrics import Metric, jitter, measure
+from edgepose.analysis.metrics import Metric, aligned, jitter, measure
 from edgepose.calibration import Calibration, calibrate, check_hold, hold_from_recording, trim
 from edgepose.calibration.rezero import HeadingRezero
 from edgepose.errors import EdgeposeError
@@ -303,13 +303,7 @@ def _strides(axis: Array) -> Array:
 
 def format_table(title: str, table: Table) -> str:
     """Format a table with "mean ± deviation" in each cell and the numbers of values in the last row."""
-    rows = cells(title, table)
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = [title]
-    for name, *row in rows:
-        padded = (cell.rjust(width) for cell, width in zip(row, widths[1:], strict=True))
-        lines.append("  ".join([name.ljust(widths[0]), *padded]).rstrip())
-    return "\n".join(lines)
+    return "\n".join([title, *aligned(cells(title, table))])
 
 
 def cells(title: str, table: Mapping[str, Mapping[str, Sequence[float]]]) -> list[list[str]]:
