@@ -161,7 +161,7 @@ def solve_chunk(
 ) -> Solution:
     """Solve all frames of a problem: SIP from the network's poses, or SOP and then SIP from its result."""
     done = 0
-    if problem.network is None:
+    if problem.network is None or method == "sop":
         minimum = orientation_poser(problem, on_step)
         start, done = minimum.parameters, minimum.evaluations
     else:

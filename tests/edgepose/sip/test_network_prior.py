@@ -53,10 +53,10 @@ def expected(local, deviation, place=None):
     return NetworkPrior(JOINTS, local, orientation, np.sqrt(3.0) / deviation * np.ones((FRAMES, 10)), place)
 
 
-def solved(measurements, network):
+def solved(measurements, network, method="sip"):
     points = sensor_points(BODY, PLACEMENTS)
     rig = network_rig(load_prior(), BONES)
-    return concatenate(list(solve(measurements, Settings("sip", rig, points, WITH_NETWORK, 30, network))))
+    return concatenate(list(solve(measurements, Settings(method, rig, points, WITH_NETWORK, 30, network))))
 
 
 def test_accelerations_mend_what_the_network_is_unsure_of():
@@ -76,9 +76,10 @@ def test_accelerations_mend_what_the_network_is_unsure_of():
     assert np.degrees(rot.geodesic_angle(*hips)).mean() < 0.6
 
 
-def test_right_poses_stay_and_extremities_rest():
+@pytest.mark.parametrize("method", ["sop", "sip"])
+def test_right_poses_stay_and_extremities_rest(method):
     local, path, _ = walker()
-    solution = solved(measured(local, path), expected(local, 0.2))
+    solution = solved(measured(local, path), expected(local, 0.2), method)
     assert metrics.sip_error(solution.rotations, local).max() < 0.1
     at_rest = np.tile(np.eye(3), (FRAMES, 2, 1, 1))
     np.testing.assert_allclose(solution.rotations[:, [10, 22]], at_rest, atol=1e-6)
