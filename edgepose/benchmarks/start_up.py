@@ -30,13 +30,12 @@ import json, os, sys, time
 path, runtime = sys.argv[1:]
 started = time.perf_counter()
 import edgepose.pipeline.run_wearers
-from edgepose.inference import archive, engine, loading
+from edgepose.inference.model import Model
 if runtime == "torch":
     import torch
 imported = time.perf_counter()
-info = archive.read_info(archive.Path(path))
-module = loading.load(info, True, runtime, "auto").module
-engine.StreamEngine(module, info.metadata["past"], info.metadata["future"])
+model = Model(path, trust=True, runtime=runtime)
+engine = model.engine()
 times = imported - started, time.perf_counter() - imported
 statm = "/proc/self/statm"
 pages = int(open(statm).read().split()[1]) if os.path.exists(statm) else None

@@ -13,7 +13,6 @@ import json
 import logging
 import os
 import zipfile
-import zlib
 from collections.abc import Mapping
 from functools import cache
 from importlib import resources
@@ -24,6 +23,7 @@ from edgepose.errors import ModelError
 from edgepose.inference.quantisation import suppress_quantisation_warning
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import CONTACTS
+from edgepose.utils.safe_npz import BROKEN
 from edgepose.utils.similar_names import choices
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ FORMAT = 1
 MODELS = Path(str(resources.files("edgepose.inference") / "models"))
 
 ALIASES = {"birnn-cmu": "birnn", "rnn-cmu": "rnn"}
-"""Former names of bundled archives, for names that none has any more."""
+"""Names that bundled archives had before, and their present ones."""
 
 _log = logging.getLogger(__name__)
 
@@ -90,8 +90,8 @@ def trust_file() -> Path:
 
 
 def bundled_archives() -> list[Path]:
-    """Return the archives that come with the package, those trained on all data first."""
-    return sorted(MODELS.glob("*.pt"), key=lambda path: ("-" in path.stem, path.stem))
+    """Return the archives that come with the package, by name."""
+    return sorted(MODELS.glob("*.pt"))
 
 
 def find_archive(name: str) -> Path:
@@ -152,8 +152,7 @@ def read_info(path: Path) -> ArchiveInfo:
         ) from error
     except OSError as error:
         raise ModelError(f"{path}: {error.strerror or error}") from error
-    # RuntimeError covers zipfile's for passwords and unknown compression, and json's RecursionError.
-    except (ValueError, RuntimeError, zlib.error) as error:
+    except BROKEN as error:  # also RecursionError, of deeply nested JSON
         raise ModelError(f"{path}: the archive's metadata cannot be read ({error})") from error
     _check_metadata(path, metadata)
     trusted = _read_checksums(MODELS / "SHA256SUMS")

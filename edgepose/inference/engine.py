@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 Input = NDArray[np.floating[Any]]
 
+FRAMES_PER_STEP = 64
+"""Frames of a recording to run at once, see `StreamEngine`."""
+
 WARM_UP = 5
 """Frames run through a module before the first real one: TorchScript compiles in its first calls."""
 

@@ -11,17 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from edgepose.errors import ModelError
 from edgepose.inference import archive
-from edgepose.inference.engine import Engine, StreamEngine, check_finite
+from edgepose.inference.engine import FRAMES_PER_STEP, Engine, StreamEngine, check_finite
 from edgepose.inference.loading import load
 
 _log = logging.getLogger(__name__)
 
-FRAMES_PER_STEP = 64
-"""Frames that the network processes at once in a whole recording."""
-
 
 class Estimate(NamedTuple):
-    """What a network says about the T frames of a whole recording.
+    """A network's results for the T frames of a whole recording.
 
     Attributes:
         rotations: (T, 24, 3, 3) local rotations, joint 0 relative to the body frame.

@@ -74,7 +74,7 @@ class _Cell:
 
 
 class NumpyNetwork(Runtime):
-    """What both networks share. The methods are those of `runtime.Runtime`."""
+    """Base of both networks. The methods are those of `runtime.Runtime`."""
 
     def __init__(self, recipe: Recipe, weights: Mapping[str, Array]) -> None:
         """Use weights as `load` prepares them."""

@@ -15,7 +15,7 @@ sensors, all in the root's frame. 8 is the root's orientation R_TB.
 """
 
 SEEN_ROOT = 8
-"""The one of them that is the root's orientation."""
+"""Index of the root's orientation among them."""
 
 
 def rotation_rows(joints: Sequence[int], passed: bool) -> tuple[list[int], list[int]]:

@@ -16,9 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import ModelError
+from edgepose.inference.archive import has_place
 from edgepose.inference.rotation_rows import SEEN
 from edgepose.pose import CONTACTS
 from edgepose.skeleton import JOINTS
+from edgepose.utils.safe_npz import BROKEN
 
 WEIGHTS_FILE = "weights.json"
 """Name of the index: a JSON object of weights, each {"file": name, "shape": [...]}, little-endian float32."""
@@ -31,7 +33,7 @@ _MOST_SMOOTHING = 0.99
 
 
 class Recipe(NamedTuple):
-    """What the metadata of an archive say about its recurrent network.
+    """An archive's recurrent network, as its metadata describe it.
 
     Attributes:
         kind: "rnn" or "birnn".
@@ -106,7 +108,7 @@ def recipe_of(metadata: Mapping[str, Any]) -> Recipe:
         tuple(JOINTS.index(name) for name in names),
         metadata["measured_bones"] == "passed",
         float(smoothing),
-        len(CONTACTS) + 3 if "place" in metadata else 0,
+        len(CONTACTS) + 3 if has_place(metadata) else 0,
     )
 
 
@@ -126,8 +128,7 @@ def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> Iterator[
             folder, index = _read_index(archive)
             for name, shape in shapes.items():
                 yield name, _read(archive, folder, index.get(name), name, shape)
-    # RuntimeError: passwords, unknown compression, deeply nested JSON.
-    except (zipfile.BadZipFile, EOFError, KeyError, ValueError, RuntimeError, OSError) as error:
+    except (OSError, *BROKEN) as error:
         raise ModelError(f"its weights cannot be read ({error}); get or export it again") from error
 
 

@@ -14,9 +14,6 @@ if TYPE_CHECKING:
     from edgepose.inference.engine import Engine, MultiWearerEngine
     from edgepose.inference.loading import LoadedNetwork
 
-FRAMES_PER_STEP = 64
-"""Frames of a recording that the network computes in one step."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkConfig:
@@ -136,7 +133,7 @@ class Network:
         place = not all(wearer.no_place for wearer in wearers)
         if place and not self.has_place:
             notify(
-                f"{self.config.model} does not estimate contacts: the lowest foot counts as standing still, "
+                f"{config.model} does not estimate contacts: the lowest foot counts as standing still, "
                 "so the path is less accurate"
             )
             place = False
@@ -146,7 +143,12 @@ class Network:
     def _engine(
         self, loaded: LoadedNetwork, wearers: Sequence[WearerConfig], place: bool
     ) -> Engine | MultiWearerEngine:
-        from edgepose.inference.engine import MultiWearerEngine, StreamEngine, WindowEngine
+        from edgepose.inference.engine import (
+            FRAMES_PER_STEP,
+            MultiWearerEngine,
+            StreamEngine,
+            WindowEngine,
+        )
 
         # int8 activations share one scale per batch, so batching would change results.
         module, batched = loaded.module, loaded.precision != "int8"

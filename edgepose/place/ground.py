@@ -4,8 +4,8 @@ Assumptions:
 - The ground is level, apart from steps: a foot that comes to rest clearly above or below what the feet stood
   on stands on something else. Slopes, and steps lower than `_STEP`, cannot be told from errors of poses.
 - What a foot stands on does not move. A foot that has stood for long is where it was.
-- No part of the body is below the ground. A foot may be, if one of them stands: it goes down a step. Who
-  jumps comes down on a known ground, or higher.
+- No part of the body is below the ground. A foot may be, if one of them stands: it goes down a step. A
+  wearer who jumps lands on a known ground, or higher.
 """
 
 from __future__ import annotations
@@ -66,9 +66,14 @@ class Ground:
         for foot in self._feet:
             foot.lift()
 
-    def height_of(self, points: Sequence[Point]) -> float:
-        """Return the height of the pelvis above the ground that the body rests on with its lowest point."""
-        return max(self._skin[i] - points[i][1] for i in NEVER_BELOW)
+    def height_of(self, points: Sequence[Point], parts: Sequence[int] = NEVER_BELOW) -> float:
+        """Return the height of the pelvis, metres, above a ground that the lowest of some points rests on.
+
+        Args:
+            points: the points of `BodyPoints`.
+            parts: indices of those that can rest on the ground.
+        """
+        return max(self._skin[i] - points[i][1] for i in parts)
 
     def correct(
         self,
@@ -117,17 +122,17 @@ class Ground:
         self._keep_above(dt, position, points)
 
     def _keep_above(self, dt: float, position: list[float], points: Sequence[Point]) -> None:
-        """Lift a body out of the ground."""
+        """Lift a body out of the ground, in place."""
         ground = min(foot.ground for foot in self._feet)
         standing = any(foot.planted_s > 0.0 for foot in self._feet)
-        parts: Sequence[int] = NEVER_BELOW[2:] if standing else NEVER_BELOW
         if not standing:
             ground = min(ground, 0.0)
-        depth = ground + max(self._skin[i] - points[i][1] for i in parts) - position[1]
+        parts = NEVER_BELOW[2:] if standing else NEVER_BELOW
+        depth = ground + self.height_of(points, parts) - position[1]
         position[1] += _limited(max(depth, 0.0), dt)
 
     def _ground_at(self, height: float) -> float:
-        """Return the height of what a foot stands on that came to rest at a height."""
+        """Return the height of the ground under a foot that came to rest at `height`, metres."""
         known = min((self._feet[0].ground, self._feet[1].ground, 0.0), key=lambda g: abs(g - height))
         return known if abs(height - known) < _STEP + self._uncertainty else height
 

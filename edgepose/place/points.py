@@ -38,7 +38,7 @@ everywhere in edgepose, the toes' joints of a standing wearer are at height 0, s
 
 
 class BodyPoints:
-    """Computes where `POINTS` are, from rotations.
+    """Computes the positions of `POINTS` from rotations.
 
     Attributes:
         skin: 15 heights of the points above a surface that they touch, metres.

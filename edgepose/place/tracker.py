@@ -70,7 +70,8 @@ class PlaceTracker:
     def update(self, time_s: float, rotations: Input, place: Input | None) -> Place:
         """Return the place in the next frame.
 
-        Numbers that are not finite leave the place as it is.
+        A frame with a time or rotations that are not finite leaves the place as it is; a `place` that is not
+        finite counts as None.
 
         Args:
             time_s: time of the frame, seconds, later than that of the frame before.

@@ -4,7 +4,7 @@ Assumptions:
 - Points in contact do not move. Where the network is sure of a contact, this is more accurate than its
   velocity, which is too slow for fast wearers.
 - The difference between both, as it was at the last contacts, remains while nothing touches the ground.
-- Nobody moves faster than `FASTEST`.
+- No one moves faster than `FASTEST`.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from edgepose.imu import GRAVITY
 from edgepose.place.points import Point
 
 FASTEST = 12.0
@@ -26,10 +27,9 @@ _PREDICTION = 0.1
 _PREDICTION_S = 0.1
 """Time constant with which the prediction follows the network's velocity, seconds."""
 _CORRECTION_S = 0.4
-"""Time constant with which the network's error is learnt from contacts, seconds."""
+"""Time constant with which the network's error is estimated from contacts, seconds."""
 _GLITCH = 5.0
 """A point that would change the velocity by more, m/s, belongs to a pose that has jumped."""
-_GRAVITY = 9.81
 
 
 def shares(probabilities: Sequence[float]) -> list[float]:
@@ -64,14 +64,14 @@ class PelvisVelocity:
         share: Sequence[float],
         network: Sequence[float] | None,
     ) -> list[float]:
-        """Return the velocity between two frames.
+        """Return the velocity between two frames, [x, y, z].
 
         Args:
             dt: time between the frames, seconds.
-            before: the points of `BodyPoints` in the frame before.
+            before: the points of `BodyPoints` in the frame before, metres from the pelvis.
             points: the same in this frame.
             share: shares of the first seven, see `shares`.
-            network: the network's velocity along the axes of T; None without it.
+            network: the network's velocity along the axes of T, m/s; None without it.
         """
         predicted = self._predicted(dt, max(share), network)
         px, py, pz = predicted
@@ -99,5 +99,5 @@ class PelvisVelocity:
             to_x, to_y, to_z = network
             to_x, to_z = to_x + self._correction[0], to_z + self._correction[1]
         part = min(1.0, dt / _PREDICTION_S)
-        y -= (1.0 - contact) * _GRAVITY * dt
+        y -= (1.0 - contact) * GRAVITY * dt
         return [x + part * (to_x - x), y + part * (to_y - y), z + part * (to_z - z)]

@@ -1,4 +1,7 @@
-"""Safe opening of untrusted .npz files: the exceptions that damaged ones raise, limits on their size."""
+"""Safe opening of untrusted .npz files: the exceptions that damaged ones raise, limits on their size.
+
+The exceptions are those of other zip files, too.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,11 @@ from numpy.typing import NDArray
 
 from edgepose.errors import FileFormatError
 
+try:
+    from lzma import LZMAError
+except ImportError:  # a Python built without it, whose zipfile raises RuntimeError
+    LZMAError = RuntimeError  # type: ignore[misc,assignment]
+
 MAX_BYTES = 2 << 30
 """Most memory that a file may take, enough for hours of poses or samples."""
 
@@ -27,6 +35,7 @@ _LONGEST_NAME = 60  # characters of a name in a message
 BROKEN = (
     zipfile.BadZipFile,
     zlib.error,
+    LZMAError,
     EOFError,
     ValueError,
     TypeError,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from edgepose.cli.options.gathered import add_flags
 from edgepose.skeleton import DEFAULT_HEIGHT, MAX_HEIGHT, MIN_HEIGHT, with_leg_length
 
 if TYPE_CHECKING:
@@ -115,6 +116,4 @@ def body_options(command: Callable[..., Any]) -> Callable[..., Any]:
             )
         return command(body=body, **values)
 
-    for flag in reversed(flags):
-        with_body = flag(with_body)
-    return with_body
+    return add_flags(with_body, flags)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from edgepose.cli.options.gathered import add_flags
 from edgepose.imu import FILTERS
 
 if TYPE_CHECKING:
@@ -62,7 +63,4 @@ def calibration_options(command: Callable[..., Any]) -> Callable[..., Any]:
         differences = check_settings(loaded, filter, no_mag, height_m)
         return command(calibrated=CalibratedRun(loaded, differences), **values)
 
-    wrapped: Callable[..., Any] = with_calibration
-    for flag in reversed(_FLAGS):
-        wrapped = flag(wrapped)
-    return wrapped
+    return add_flags(with_calibration, _FLAGS)

@@ -24,6 +24,13 @@ def usage_errors() -> Iterator[None]:
         raise click.UsageError(str(error)) from None
 
 
+def add_flags(command: Command, flags: Sequence[Callable[[Command], Command]]) -> Command:
+    """Add click options to a command, in the order of the help text."""
+    for flag in reversed(flags):
+        command = flag(command)
+    return command
+
+
 def gathered(
     command: Command, flags: Sequence[Callable[[Command], Command]], name: str, config: type
 ) -> Command:
@@ -45,7 +52,4 @@ def gathered(
             gathered_values = config(**{name: values.pop(name) for name in names})
         return command(**{name: gathered_values}, **values)
 
-    wrapped: Command = with_config
-    for flag in reversed(flags):
-        wrapped = flag(wrapped)
-    return wrapped
+    return add_flags(with_config, flags)

@@ -6,11 +6,11 @@ import stat
 import zipfile
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
-from zlib import error as zlib_error
 
 from edgepose.errors import FileFormatError
 from edgepose.formats.recordings.base import ReadOptions, RecordingFormat
 from edgepose.imu import Recording
+from edgepose.utils.safe_npz import BROKEN
 
 MAX_BYTES = 2_000_000_000
 """Most bytes that are unpacked."""
@@ -31,7 +31,7 @@ def read_zip(path: Path, options: ReadOptions) -> Recording:
         try:
             with zipfile.ZipFile(path) as packed:
                 _unpack(path, packed, folder)
-        except (zipfile.BadZipFile, zlib_error, EOFError, NotImplementedError, RuntimeError) as error:
+        except BROKEN as error:
             raise FileFormatError(f"{path}: not a whole .zip file that can be read ({error})") from None
         session = _session(folder)
         if session is None:

@@ -23,7 +23,7 @@ from edgepose_export.networks.shape import PoseDecoder, PoseNetwork
 
 
 class RecurrentArchive(nn.Module):
-    """What both archives share: the methods that return poses alone.
+    """Base of both archives: the methods that return poses alone.
 
     In all methods `orientation` is (B, [T,] 6, 3, 3), calibrated bone orientations R_TB, and `acceleration`
     (B, [T,] 6, 3), m/s^2 in T without gravity, for B wearers. Poses are (B, [T,] 24, 3, 3) local rotations

@@ -315,6 +315,23 @@ def test_compressed_weights_are_not_unpacked(made, tmp_path):
         numpy_network.load(archive.read_info(path))
 
 
+@pytest.mark.parametrize("packing", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+@pytest.mark.parametrize("file", ["edgepose.json", "weights.json"])
+def test_damage_in_a_compressed_description(made, tmp_path, packing, file):
+    path = tmp_path / "small.pt"
+    with zipfile.ZipFile(made) as old, zipfile.ZipFile(path, "w") as new:
+        for entry in old.infolist():
+            packed = packing if entry.filename.endswith(file) else zipfile.ZIP_STORED
+            new.writestr(entry.filename, old.read(entry), compress_type=packed)
+        (entry,) = (entry for entry in new.infolist() if entry.filename.endswith(file))
+    content = bytearray(path.read_bytes())
+    start = entry.header_offset + 30 + len(entry.filename) + 20
+    content[start : start + 40] = bytes(255 - byte for byte in content[start : start + 40])
+    path.write_bytes(content)
+    with pytest.raises(ModelError, match=str(path)):
+        numpy_network.load(archive.read_info(path))
+
+
 def test_a_networks_nan_is_reported(made, tmp_path):
     """Weights that are finite can still overflow."""
     file = weight_file(made, "ends.dense.weight")

@@ -87,6 +87,21 @@ def test_what_is_not_a_session(tmp_path, monkeypatch):
     assert find_format(path) is packed_session.FORMAT
 
 
+@pytest.mark.parametrize("packing", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_damage_in_each_way_of_packing(tmp_path, packing):
+    path = tmp_path / "walk.zip"
+    with zipfile.ZipFile(pack(tmp_path / "plain.zip")) as old, zipfile.ZipFile(path, "w") as new:
+        for entry in old.infolist():
+            new.writestr(entry.filename, old.read(entry), compress_type=packing)
+        longest = max(new.infolist(), key=lambda entry: entry.file_size)
+    content = bytearray(path.read_bytes())
+    start = longest.header_offset + 30 + len(longest.filename) + 20
+    content[start : start + 40] = bytes(255 - byte for byte in content[start : start + 40])
+    path.write_bytes(content)
+    with pytest.raises(EdgeposeError, match="read"):
+        read_recording(path)
+
+
 def write_recording(path: Path, recording: Recording) -> Path:
     write_session(path / "walk", recording)
     packed = shutil.make_archive(str(path), "zip", path)
