@@ -7,7 +7,6 @@ WearerConfig(source=SourceConfig(port="/dev/ttyUSB0"), calibration=Path("calib.j
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,8 +100,7 @@ class OutputConfig:
     OutputConfig(csv="poses.csv", udp="127.0.0.1:9000", view=True, height=1.68)
 
     Attributes:
-        targets: name and target of each output. The target of the output NAME is also the attribute NAME,
-            which is None if it is not written.
+        targets: name and target of each output.
         rotations: representation of rotations in the CSV.
         std: add the network's standard deviations to the CSV.
         height: the wearer's height, metres; None for that of the calibration, or an average one.
@@ -126,21 +124,22 @@ class OutputConfig:
         height: float | None = None,
         leg_length: float | None = None,
         overwrite: bool = False,
-        sinks: Mapping[str, str] | None = None,
+        sinks: Mapping[str, str | list[str]] | None = None,
         **outputs: Any,
     ) -> None:
         """Parse the targets.
 
         Args:
             targets: outputs as pairs of name and target.
-            rotations: representation of rotations in the CSV.
+            rotations: representation of rotations in CSV files that do not name their own.
             std: add the network's standard deviations to the CSV.
             height: the wearer's height, metres.
             leg_length: length of the wearer's thigh and shank, metres.
             overwrite: replace existing files.
-            sinks: targets of outputs from other packages (entry points `edgepose.sinks`), by output name.
-            **outputs: targets of this package's outputs, as text or parsed; True for `view`. None and False
-                mean no such output.
+            sinks: targets of outputs from other packages (entry points `edgepose.sinks`), by output name; a
+                list of them for several.
+            **outputs: targets of this package's outputs, as text or parsed; True for `view`. A list stands
+                for several outputs of a kind; None and False mean none.
 
         Raises:
             ConfigError: an output is unknown, given twice or in the wrong place, or a value is invalid.
@@ -150,16 +149,16 @@ class OutputConfig:
         sinks = sinks or {}
         if own := sinks.keys() & SINKS.keys():
             raise ConfigError(f"{min(own)} is not an output of another package: give --{min(own)}")
-        pairs = [
-            *targets,
-            *((name, outputs[name]) for name in SINKS if name in outputs),
-            *sinks.items(),
-        ]
+        given = [*((name, outputs[name]) for name in SINKS if name in outputs), *sinks.items()]
+        several = [(name, value if isinstance(value, list) else [value]) for name, value in given]
+        pairs = [*targets, *((name, value) for name, values in several for value in values)]
         pairs = [
             (name, _target(name, value)) for name, value in pairs if value is not None and value is not False
         ]
-        if repeated := [name for name, count in Counter(name for name, _ in pairs).items() if count > 1]:
-            raise ConfigError(f"the output {repeated[0]} is given twice")
+        for i, (name, target) in enumerate(pairs):
+            if (name, target) in pairs[:i]:
+                what = "" if target is True else " with the same target"
+                raise ConfigError(f"the output {name} is given twice{what}")
         if rotations not in ROTATION_FORMATS:
             raise ConfigError(
                 f"rotations: {rotations!r} is not one of {', '.join(map(repr, ROTATION_FORMATS))}"
@@ -167,13 +166,6 @@ class OutputConfig:
         values = (tuple(pairs), rotations, std, height, leg_length, overwrite)
         for each, value in zip(dataclasses.fields(self), values, strict=True):
             object.__setattr__(self, each.name, value)
-
-    def __getattr__(self, name: str) -> Any:
-        """Return the file or target of an output of this package, None if it is not written."""
-        if name not in SINKS:
-            raise AttributeError(f"OutputConfig has no attribute {name!r}")
-        target = dict(self.targets).get(name)
-        return target if target is None or not SINKS[name].suffix else SINKS[name].file(target)
 
     @property
     def any(self) -> bool:
@@ -191,14 +183,14 @@ class OutputConfig:
         return default_body(height, leg_length_m=self.leg_length)
 
     @property
-    def files(self) -> dict[str, str | Path]:
-        """The files that are written, by flag."""
-        files: dict[str, str | Path] = {}
+    def files(self) -> list[tuple[str, str | Path]]:
+        """Flag and name of each file that is written."""
+        files: list[tuple[str, str | Path]] = []
         for name, target in self._files():
             part = SINKS[name].part
-            files[f"--{name}"] = target
+            files.append((f"--{name}", target))
             if part is not None and not is_stream(target):
-                files[f"--{name} (while it grows)"] = part(target)
+                files.append((f"--{name} (while it grows)", part(target)))
         return files
 
     def check(self) -> None:
@@ -310,8 +302,10 @@ class WearerConfig:
 # --- TOML ---------------------------------------------------------------------------------------------------
 
 _TEXT, _SWITCH, _WHOLE, _NUMBER = "text in quotes", "true or false", "a whole number", "a number"
+_TEXTS = "text in quotes or a list of such texts"
 
 _TYPES: dict[str, tuple[type, ...]] = {_TEXT: (str,), _SWITCH: (bool,), _WHOLE: (int,), _NUMBER: (int, float)}
+_TYPES[_TEXTS] = (str,)
 
 _FILES = ("file", "sensors", "calibration", *(name for name, output in SINKS.items() if output.suffix))
 """Keys whose values are files, relative to the TOML file; that of `protocol` may be one too."""
@@ -331,7 +325,7 @@ _KEYS = {
     "filter": _TEXT,
     "no-mag": _SWITCH,
     "calibration": _TEXT,
-    **{name: _SWITCH if output.metavar is None else _TEXT for name, output in SINKS.items()},
+    **{name: _SWITCH if output.metavar is None else _TEXTS for name, output in SINKS.items()},
     "rotations": _TEXT,
     "std": _SWITCH,
     "height": _NUMBER,
@@ -348,9 +342,11 @@ def _value(key: str, value: object, folder: Path) -> Any:
     Raises:
         ConfigError: there is no such key, or the value has the wrong type or is invalid.
     """
-    if key == "sinks" and isinstance(value, dict) and all(isinstance(item, str) for item in value.values()):
+    if key == "sinks" and isinstance(value, dict) and all(map(_is_text_or_texts, value.values())):
         return value
     what = _KEYS.get(key)
+    if what is _TEXTS and isinstance(value, list) and _is_text_or_texts(value):
+        return [_value(key, item, folder) for item in value]
     if what is None:
         raise ConfigError(f"unknown key {key!r}; {choices(key, ['name', *_KEYS, 'sinks'], 'keys are')}")
     if type(value) not in _TYPES[what]:  # not isinstance, to which a bool is an int
@@ -360,6 +356,10 @@ def _value(key: str, value: object, folder: Path) -> Any:
     if "\0" in value:
         raise ConfigError(f"{key} must be text without NUL characters, not {value!r}")
     return _text(key, value, folder)
+
+
+def _is_text_or_texts(value: object) -> bool:
+    return all(isinstance(item, str) for item in (value if isinstance(value, list) else [value]))
 
 
 def _text(key: str, value: str, folder: Path) -> Any:

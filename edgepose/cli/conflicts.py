@@ -48,21 +48,21 @@ def check_all_files(wearers: Sequence[WearerConfig], model: Path) -> None:
         wearers: one or several.
         model: the archive that is loaded.
     """
-    if sum("-" in wearer.outputs.files.values() for wearer in wearers) > 1:
+    if sum(any(file == "-" for _, file in wearer.outputs.files) for wearer in wearers) > 1:
         raise click.UsageError("several wearers write to standard output; give all but one a file")
-    outputs: dict[str, str | Path | None] = {}
+    outputs: list[tuple[str, str | Path]] = []
     inputs: dict[str, Path | None] = {"--model": model}
     for wearer in wearers:
         prefix = f"{wearer.name}: " if wearer.name else ""
-        outputs |= {prefix + flag: file for flag, file in wearer.outputs.files.items()}
+        outputs += [(prefix + flag, file) for flag, file in wearer.outputs.files]
         inputs |= {prefix + flag: file for flag, file in _inputs(wearer).items()}
     check_files(outputs, inputs)
     for wearer in wearers:
         with prefix_errors(wearer.name):
             wearer.outputs.check()
     if len(wearers) > 1:
-        for flag, file in outputs.items():
-            if file is not None and has_reader(file):
+        for flag, file in outputs:
+            if has_reader(file):
                 raise click.UsageError(
                     f"{flag} {file} is not a file on a disk: a slow reader of it would delay every wearer; "
                     "give each a file, --udp or --tcp"

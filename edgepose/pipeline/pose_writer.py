@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from math import inf
 
 from edgepose.pose import PoseFrame
-from edgepose.sinks.base import Sink
+from edgepose.sinks.group import SinkGroup
 
 OLD_S = 1.0
 """Age from which a pose is of no use to a live output, seconds, beyond the network's look-ahead."""
@@ -16,7 +16,7 @@ QUIET_S = 30.0
 
 
 class PoseWriter:
-    """Writes each pose to the sinks, in their order.
+    """Writes each pose to the sinks.
 
     After a machine has been busy with something else, a backlog of poses comes all at once. Live outputs skip
     it, so that their receivers see the present again as soon as possible.
@@ -25,9 +25,7 @@ class PoseWriter:
         skipped: poses that live outputs have skipped.
     """
 
-    def __init__(
-        self, sinks: Sequence[Sink], look_ahead_s: float | None, notify: Callable[[str], None]
-    ) -> None:
+    def __init__(self, sinks: SinkGroup, look_ahead_s: float | None, notify: Callable[[str], None]) -> None:
         """Store the sinks.
 
         Args:
@@ -38,9 +36,7 @@ class PoseWriter:
         """
         self.skipped = 0
         self._sinks = sinks
-        self._files = [sink for sink in sinks if not sink.live]
-        skips = look_ahead_s is not None and len(self._files) < len(sinks)
-        self._oldest_s = OLD_S + look_ahead_s if skips and look_ahead_s is not None else inf
+        self._oldest_s = inf if look_ahead_s is None or not sinks.has_live else OLD_S + look_ahead_s
         self._notify = notify
         self._reported_s = -inf  # time of the pose at the last report
 
@@ -48,7 +44,7 @@ class PoseWriter:
         """Write a pose that was measured `age_s` ago, seconds.
 
         Raises:
-            EdgeposeError: see `Sink.write`.
+            EdgeposeError: see `SinkGroup.write`.
         """
         is_old = age_s > self._oldest_s
         if is_old:
@@ -56,5 +52,4 @@ class PoseWriter:
             if pose.time_s - self._reported_s >= QUIET_S:
                 self._reported_s = pose.time_s
                 self._notify(f"poses are {age_s:.1f} s late; live outputs skip those older than {OLD_S:g} s")
-        for sink in self._files if is_old else self._sinks:
-            sink.write(pose)
+        self._sinks.write(pose, live=not is_old)

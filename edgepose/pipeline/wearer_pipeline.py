@@ -14,7 +14,7 @@ from edgepose.calibration import apply_calibration
 from edgepose.calibration.misfit import MisfitDetector
 from edgepose.calibration.rezero import HeadingRezero
 from edgepose.diagnostics.rig_monitor import RigMonitor
-from edgepose.errors import EdgeposeError, as_edgepose_error
+from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuFrame, ImuSample
 from edgepose.inference.engine import EngineInput, EngineOutput, check_finite
 from edgepose.pipeline.dropout import extrapolate_dropouts
@@ -25,6 +25,7 @@ from edgepose.pipeline.pose_writer import PoseWriter
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseFrame
 from edgepose.sinks.base import Sink
+from edgepose.sinks.group import SinkGroup
 from edgepose.sources import Batch
 
 LATENCIES = 216_000
@@ -115,16 +116,18 @@ class WearerPipeline:
             on_pose: called after each pose has been written.
             misfits: checks whether the calibration fits the wearer.
             rig: checks the sensors as they measure.
-            warn: called with one message per finding of `misfits` and `rig`, and about skipped poses.
+            warn: called with one message per finding of `misfits` and `rig`, and about outputs that fail or
+                skip poses.
             look_ahead_s: time by which poses come later than their frames, seconds, if samples come at their
                 own pace; see `PoseWriter`.
             place: follows the wearer through the room; None leaves the poses without translation.
         """
         self.summary, self.clock = RunSummary(), clock
         self.arrived = self._started = time.perf_counter()
-        self._headings, self._sinks, self._orient, self._notify = headings, sinks, orient, notify
+        self._headings, self._orient, self._notify = headings, orient, notify
         self._on_pose, self._misfits, self._rig, self._warn = on_pose, misfits, rig, warn
-        self._writer, self._place = PoseWriter(sinks, look_ahead_s, warn), place
+        self._sinks = SinkGroup(sinks, warn)
+        self._writer, self._place = PoseWriter(self._sinks, look_ahead_s, warn), place
         self._dropouts = DropoutMonitor()
         self._source_s = 0.0  # time on the source's clock at 0 of the clock of `arrived`
         self._bones: NDArray[np.float64] | None = None  # those of the previous frame
@@ -180,12 +183,10 @@ class WearerPipeline:
         self.summary.seconds = time.perf_counter() - self._started
 
     def close(self) -> None:
-        """Close the sinks; their errors go to the summary like any other."""
-        for sink in self._sinks:
-            try:
-                sink.close()
-            except Exception as error:
-                self.summary.error = self.summary.error or as_edgepose_error(error)
+        """Close the sinks; the summary gets their errors, unless the run has ended in another one."""
+        self._sinks.close()
+        if self.summary.error is None or self.summary.error in self._sinks.errors:
+            self.summary.error = self._sinks.error
 
     def _engine_inputs(self, frames: list[ImuFrame]) -> Iterator[EngineInput]:
         for frame in frames:

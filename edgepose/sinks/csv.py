@@ -11,6 +11,7 @@ from edgepose.pose import PoseFrame, format_status
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.sinks.pose_file import PoseFileSink
 from edgepose.utils.growing_files import GrowingFile
+from edgepose.utils.output_targets import FileTarget
 
 
 class CsvSink(PoseFileSink):
@@ -81,10 +82,11 @@ class CsvSink(PoseFileSink):
             self._output.write(rows)
 
 
-def open_sink(target: str, context: SinkContext) -> Sink:
+def open_sink(target: FileTarget, context: SinkContext) -> Sink:
     """Open a `CsvSink`."""
+    rotations = target.option or context.rotations
     return CsvSink(
-        *(target, context.rotations, context.std, context.translation, context.contacts),
+        *(target.path, rotations, context.std, context.translation, context.contacts),
         overwrite=context.overwrite,
         stopped=context.stopped,
     )

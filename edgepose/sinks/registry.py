@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from edgepose.errors import ConfigError
 from edgepose.formats.bvh_names import BVH_NAMES
+from edgepose.formats.poses.csv_columns import ROTATION_FORMATS
 from edgepose.formats.poses.npz_amass import JOINT_COUNTS
 from edgepose.utils.output_targets import FileTarget, parse_file, part_path
 from edgepose.utils.sockets import (
@@ -72,7 +73,13 @@ class Output:
 _JOINTS = tuple(map(str, JOINT_COUNTS))
 
 SINKS = {
-    "csv": Output("edgepose.sinks.csv:open_sink", "Write poses as CSV; - is standard output.", suffix=".csv"),
+    "csv": Output(
+        "edgepose.sinks.csv:open_sink",
+        "Write poses as CSV; - is standard output. FORMAT is as in --rotations, which holds without it.",
+        "FILE[,rotations=FORMAT]",
+        partial(parse_file, key="rotations", choices=tuple(ROTATION_FORMATS), default=""),
+        suffix=".csv",
+    ),
     "npz": Output(
         "edgepose.sinks.npz:open_sink",
         "Write poses as NPZ with the keys of AMASS at the end. Numbers of joints: "

@@ -117,8 +117,14 @@ class FileTarget(NamedTuple):
     option: str
 
 
-def parse_file(text: str, key: str, choices: Sequence[str]) -> FileTarget:
-    """Parse "FILE[,key=value]"; the first choice is the default.
+def parse_file(text: str, key: str, choices: Sequence[str], default: str | None = None) -> FileTarget:
+    """Parse "FILE[,key=value]".
+
+    Args:
+        text: the text.
+        key: name of the option.
+        choices: its values.
+        default: value of the option if it is not given; None for the first choice.
 
     Raises:
         ConfigError: an unknown key or value.
@@ -126,7 +132,7 @@ def parse_file(text: str, key: str, choices: Sequence[str]) -> FileTarget:
     path, comma, option = text.rpartition(",")
     name, equals, value = option.partition("=")
     if not (comma and equals and name.isidentifier()):  # a comma in the name of a file
-        return FileTarget(text, choices[0])
+        return FileTarget(text, choices[0] if default is None else default)
     if name != key or value not in choices or not path:
         raise ConfigError(f"unknown option {option!r} of {path}: possible are {key}={'|'.join(choices)}")
     return FileTarget(path, value)

@@ -164,20 +164,32 @@ def test_outputs_by_name():
         csv=Path("a.csv"), udp="[::1]:9000,format=binary", view=True, osc=None, sinks={"mine": "x"}
     )
     assert outputs.targets == (
-        ("csv", "a.csv"),
+        ("csv", ("a.csv", "")),
         ("udp", ("::1", 9000, "binary", "")),
         ("view", True),
         ("mine", "x"),
     )
-    assert (outputs.csv, outputs.udp.port, outputs.osc, outputs.any) == ("a.csv", 9000, None, True)
-    assert outputs.files == {"--csv": "a.csv"}
+    assert outputs.any
+    assert outputs.files == [("--csv", "a.csv")]
     assert dataclasses.replace(outputs, overwrite=True).targets == outputs.targets
     assert (
         outputs == edgepose.OutputConfig(outputs.targets) != edgepose.OutputConfig(outputs.targets, std=True)
     )
     assert not edgepose.OutputConfig(view=False, csv=None).any
-    with pytest.raises(AttributeError, match="mine"):
-        outputs.mine  # noqa: B018
+
+
+def test_several_outputs_of_a_kind():
+    outputs = edgepose.OutputConfig(
+        csv=["a.csv", "b.csv,rotations=quat"],
+        udp=["127.0.0.1:1", ("127.0.0.1", 2, "json")],
+        sinks={"m": ["x", "y"]},
+    )
+    assert outputs.targets == (
+        *(("csv", ("a.csv", "")), ("csv", ("b.csv", "quat"))),
+        *(("udp", ("127.0.0.1", port, "json", "")) for port in (1, 2)),
+        *(("m", "x"), ("m", "y")),
+    )
+    assert outputs.files == [("--csv", "a.csv"), ("--csv", "b.csv")]
 
 
 def test_every_output_has_a_flag_in_the_order_of_the_table():
@@ -198,7 +210,8 @@ def test_every_output_has_a_flag_in_the_order_of_the_table():
         (lambda: edgepose.OutputConfig(rotations="rodrigues"), "is not one of"),
         (lambda: edgepose.OutputConfig(cvs="a.csv"), "unknown output 'cvs'; outputs are csv, npz, "),
         (lambda: edgepose.OutputConfig(udp="127.0.0.1"), "udp: no port in '127.0.0.1'"),
-        (lambda: edgepose.OutputConfig([("csv", "a"), ("csv", "b")]), "csv is given twice"),
+        (lambda: edgepose.OutputConfig(csv=["a", "a"]), "csv is given twice with the same target"),
+        (lambda: edgepose.OutputConfig(view=[True, True]), "view is given twice"),
         (lambda: edgepose.OutputConfig(sinks={"csv": "a"}), "csv is not an output of another package"),
         (lambda: edgepose.OutputConfig(view="no"), "view: 'no' is neither True nor False"),
     ],

@@ -193,7 +193,7 @@ def calibrate(
     """
     _check_use(source, plan, page)
     inputs = {"--file": source.file, "--sensors": source.sensors, "--heading-reset": plan.side_by_side}
-    check_files({"--out": out}, inputs)
+    check_files([("--out", out)], inputs)
     _check_writable(out, overwrite)
     sensor_map = None if source.sensors is None else read_map(source.sensors)
     mountings = (

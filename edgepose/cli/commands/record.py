@@ -62,7 +62,7 @@ def record(source: SourceConfig, out: str, seconds: float | None, overwrite: boo
     if kind == "bus" and (source.can is None or others):
         raise click.UsageError(f"{out} stores the frames of a CAN bus: give --can, or name it .csv or .npz")
     with ExitStack() as stack:
-        outputs = {"OUT": out, "OUT (while it grows)": recorder.growing(out)}
+        outputs = [("OUT", out), ("OUT (while it grows)", recorder.growing(out))]
         check_files(outputs, {"--file": source.file, "--sensors": source.sensors})
         recorder.check_free(out, overwrite)
         opened = stack.enter_context(open_source(**source.arguments()))

@@ -36,10 +36,13 @@ def run(wearers: list[WearerConfig], settings: NetworkConfig) -> None:
     calibration pose once more to re-zero the headings. Press o to put the wearer back at the origin of the
     room, on the ground.
 
+    Flags of outputs may be given several times, such as --udp for two receivers. An output that fails ends
+    alone, unless it is the only one.
+
     \b
     Examples:
       edgepose run --port /dev/ttyUSB0 --calibration calib.json --csv poses.csv
-      edgepose run --port COM3 --calibration calib.json --udp 10.0.0.5:9000
+      edgepose run --port COM3 --calibration calib.json --udp 10.0.0.5:9000 --udp 10.0.0.6:9000
       edgepose run --can socketcan:can0 --calibration calib.json --npz walk.npz
       edgepose run --sensors rig.toml --calibration calib.json --model rnn --view
       edgepose run --port COM3 --filter kalman --calibration calib.json --view

@@ -23,7 +23,7 @@ from edgepose.sinks.registry import SINKS
 if TYPE_CHECKING:
     from edgepose.calibration import Calibration
     from edgepose.imu import Recording
-    from edgepose.sinks.base import Sink
+    from edgepose.sinks.group import SinkGroup
     from edgepose.sip.measurements import Measurements, SensorMount
     from edgepose.sip.network_prior import NetworkPrior
     from edgepose.sip.solve import Method, OnProgress, Settings, Solution
@@ -178,6 +178,7 @@ def solve(
     _check_outputs(outputs, plot, {"IN": recording, "--calibration": calibration_path})
 
     from edgepose.calibration import load_calibration
+    from edgepose.sinks.group import SinkGroup
     from edgepose.sinks.open import open_outputs
     from edgepose.sip import residuals
     from edgepose.sip.measurements import measure
@@ -203,14 +204,16 @@ def solve(
         solution = residuals.concatenate(solutions)
         place = None if place is None else place[: len(solution.rotations)]
         path = pelvis_path(solution, settings.body.offsets, solver.rate, place)
-        _write(sinks, solution, measurements, path)
-        for sink in sinks:
-            sink.close()
+        group = SinkGroup(sinks, say)
+        _write(group, solution, measurements, path)
+        group.close()
     _report(solution, measurements)
     if plot is not None:
         residuals.plot(plot, solution, measurements, outputs.overwrite)
     if interrupted:
         raise KeyboardInterrupt
+    if group.error is not None:
+        raise group.error
     if data.damage:
         raise EdgeposeError(data.damage)
 
@@ -230,7 +233,7 @@ def _check_outputs(outputs: OutputConfig, plot: Path | None, inputs: Mapping[str
     if not outputs.any:
         flags = [f"--{name} FILE" for name, output in SINKS.items() if output.suffix]
         raise click.UsageError(f"give at least one output: {', '.join(flags[:-1])} or {flags[-1]}")
-    check_files({**outputs.files, "--plot": plot}, inputs)
+    check_files([*outputs.files, ("--plot", plot)], inputs)
     outputs.check()
     if plot is not None:
         from edgepose.analysis.figures import check_picture
@@ -345,7 +348,7 @@ def _collect(solutions: Iterable[Solution]) -> tuple[list[Solution], bool]:
     return done, False
 
 
-def _write(sinks: list[Sink], solution: Solution, measurements: Measurements, path: PelvisPath) -> None:
+def _write(sinks: SinkGroup, solution: Solution, measurements: Measurements, path: PelvisPath) -> None:
     import numpy as np
 
     from edgepose.pose import PoseFrame
@@ -356,8 +359,7 @@ def _write(sinks: list[Sink], solution: Solution, measurements: Measurements, pa
         pose = PoseFrame(i, float(measurements.time_s[i]), matrices, std, position, held)
         if path.contacts is not None:
             pose = pose._replace(contacts=path.contacts[i])
-        for sink in sinks:
-            sink.write(pose)
+        sinks.write(pose)
 
 
 def _progress() -> OnProgress:

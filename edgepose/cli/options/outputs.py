@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,23 +19,24 @@ from edgepose.utils.output_targets import identity, is_null
 from edgepose.utils.sockets import parse_host_and_port
 
 
-def check_files(outputs: Mapping[str, str | Path | None], inputs: Mapping[str, Path | None]) -> None:
+def check_files(outputs: Iterable[tuple[str, str | Path | None]], inputs: Mapping[str, Path | None]) -> None:
     """Raise click.UsageError if an output is also an input, or if two flags name the same output.
 
     Args:
-        outputs: files to write, by flag.
+        outputs: flag and name of each file to write; None is skipped.
         inputs: files to read, by flag.
     """
     written: dict[object, str] = {}
-    for flag, output in outputs.items():
+    for flag, output in outputs:
         if output is None:
             continue
         for name, path in inputs.items():
             if path is not None and _is_same_file(Path(output), path):
                 raise click.UsageError(f"{flag} would overwrite {path}, which is {name}; name another file")
-        other = written.setdefault(identity(output), flag)
-        if other != flag and not is_null(output):
+        other = written.get(identity(output))
+        if other is not None and not is_null(output):
             raise click.UsageError(f"{other} and {flag} name the same file, {output}; name two files")
+        written[identity(output)] = flag
 
 
 def _is_same_file(output: Path, path: Path) -> bool:
@@ -53,13 +54,13 @@ def address(ctx: click.Context, param: click.Parameter, value: str | None) -> tu
         raise click.BadParameter(str(error)) from None
 
 
-def _other_sinks(ctx: click.Context, param: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
-    targets: dict[str, str] = {}
+def _other_sinks(ctx: click.Context, param: click.Parameter, values: tuple[str, ...]) -> dict[str, list[str]]:
+    targets: dict[str, list[str]] = {}
     for value in values:
         name, equals, target = value.partition("=")
-        if not equals or not name or name in targets:
-            raise click.BadParameter(f"{value!r} is not NAME=TARGET, or repeats a name")
-        targets[name] = target
+        if not equals or not name:
+            raise click.BadParameter(f"{value!r} is not NAME=TARGET")
+        targets.setdefault(name, []).append(target)
     return targets
 
 
@@ -129,12 +130,14 @@ def _flags(
 
 
 def _flag(name: str, output: Output) -> Callable[[Command], Command]:
-    def target(ctx: click.Context, param: click.Parameter, value: str | None) -> Any:
+    def targets(ctx: click.Context, param: click.Parameter, values: tuple[str, ...]) -> list[Any]:
         try:
-            return None if value is None else output.target(value)
+            return [output.target(value) for value in values]
         except EdgeposeError as error:
             raise click.BadParameter(str(error)) from None
 
     if output.metavar is None:
         return click.option(f"--{name}", is_flag=True, help=output.help)
-    return click.option(f"--{name}", metavar=output.metavar, callback=target, help=output.help)
+    return click.option(
+        f"--{name}", metavar=output.metavar, callback=targets, multiple=True, help=output.help
+    )

@@ -8,8 +8,7 @@ import pytest
 @pytest.mark.parametrize(
     ("words", "flag"),
     [
-        (("run", "--udp", "127.0.0.1:1", "--csv", "a.csv", "--udp", "127.0.0.1:2"), "--udp"),
-        (("run", "--csv", "a.csv", "--csv", "b.csv"), "--csv"),
+        (("run", "--model", "rnn", "--csv", "a.csv", "--model", "birnn"), "--model"),
         (("calibrate", "--port", "a", "--port", "b"), "--port"),
         (("convert", "a.csv", "--to", "npz", "--to=csv"), "--to"),
         (("train", "--config", "a", "--config", "a"), "--config"),

@@ -118,6 +118,9 @@ def test_an_interrupted_run_leaves_whole_files(wearer, tmp_path, numbers):
         (["--bvh", "a.bvh", "--height", "175"], 1, "height 175 m is not between"),
         (["--bvh", "a.bvh", "--leg-length", "85"], 1, "leg length 85 m does not fit a height of 1.75 m"),
         (["--bvh", "RECORDING"], 2, "--bvh would overwrite"),
+        (["--csv", "a.csv", "--csv", "./a.csv"], 2, "--csv and --csv name the same file, ./a.csv"),
+        (["--csv", "-", "--csv", "/dev/stdout"], 2, "--csv and --csv name the same file, /dev/stdout"),
+        (["--udp", "127.0.0.1:9", "--udp", "127.0.0.1:9"], 2, "udp is given twice with the same target"),
     ],
 )
 def test_wrong_use(command, wearer, tmp_path, words, code, says):
@@ -130,6 +133,44 @@ def test_wrong_use(command, wearer, tmp_path, words, code, says):
     assert says in result.stderr
     assert "Traceback" not in result.stderr
     assert Path(wearer.short).exists()
+
+
+def test_each_output_may_be_given_several_times(command, wearer, tmp_path):
+    with Listener() as one, Listener() as other:
+        result = command(
+            *("run", "--file", wearer.short, "--calibration", wearer.calibration, "--model", "rnn"),
+            *("--csv", tmp_path / "a.csv", "--csv", f"{tmp_path / 'b.csv'},rotations=quat"),
+            *("--bvh", tmp_path / "a.bvh", "--bvh", f"{tmp_path / 'b.bvh'},names=unity"),
+            *("--npz", tmp_path / "a.npz", "--npz", f"{tmp_path / 'b.npz'},joints=52"),
+            *("--udp", one.address, "--udp", f"{other.address},format=binary", "--realtime"),
+            *("--tcp", free_address(), "--tcp", free_address()),
+        )
+    assert result.returncode == 0, result.stderr
+    poses = [read_poses(tmp_path / name) for name in ("a.csv", "b.csv", "a.npz", "b.npz")]
+    for each in poses[1:]:
+        np.testing.assert_allclose(each.rotations, poses[0].rotations, atol=2e-6)
+    assert len(poses[0].frames) == 180
+    assert (tmp_path / "b.csv").read_text().startswith("frame,time_s,status,pelvis_w,")
+    assert [read_bvh(tmp_path / name).names[0] for name in ("a.bvh", "b.bvh")] == ["pelvis", "Hips"]
+    assert [len(one.datagrams), len(other.datagrams)] == [180, 180]
+    assert one.datagrams[0].startswith(b"{")
+    assert other.datagrams[0].startswith(b"EPOS")
+
+
+def test_an_output_whose_reader_ends_costs_only_itself(wearer, tmp_path):
+    words = ["run", "--file", wearer.recording, "--calibration", wearer.calibration, "--model", "rnn"]
+    process = processes.start(
+        *words, "--csv", "-", "--csv", tmp_path / "a.csv", "--bvh", tmp_path / "a.bvh", stdout=subprocess.PIPE
+    )
+    process.stdout.readline()
+    process.stdout.close()
+    code, errors = process.wait(120), process.stderr.read()
+    process.stderr.close()
+    lost = "the program that read the poses from standard output has ended"
+    assert code == 1
+    assert f"{lost}; this output has ended, the others go on\n" in errors
+    assert errors.endswith(f"edgepose: 1 of 3 outputs failed: {lost}\n")
+    assert len(read_poses(tmp_path / "a.csv").frames) == len(read_bvh(tmp_path / "a.bvh").rotations) == 720
 
 
 def test_nobody_listens_for_osc(command, wearer):

@@ -56,13 +56,16 @@ def walk(wearer, module):
         past=4,
         future=3,
         on_pose=lambda summary: None,
+        warn=lambda text: None,
         **options,
     ):
         engine = StreamEngine(module, past, future)
         headings = HeadingRezero(load_calibration(wearer.calibration))
-        walk = WearerPipeline(FrameSynchronizer(), headings, list(sinks), on_pose=on_pose)
+        walk = WearerPipeline(FrameSynchronizer(), headings, list(sinks), on_pose=on_pose, warn=warn)
         with open_source(file=wearer.short) as source:
-            return run(walk, change(source), engine, **options)
+            summary = run(walk, change(source), engine, **options)
+        walk.close()
+        return summary
 
     return go
 
@@ -178,14 +181,22 @@ def test_what_came_before_a_sample_without_orientation_comes_out(walk):
     assert indices(shelf) == list(range(60))
 
 
-def test_nothing_is_written_after_an_output_failed(walk):
-    before, full, after = Shelf(), Shelf(room=50), Shelf()
-    summary = walk(sinks=[before, full, after])
-    assert str(summary.error) == "the shelf is full"
-    assert indices(before) == list(range(51))
-    assert indices(full) == indices(after) == list(range(50))
-    assert full.asked == 51
-    assert summary.poses == 50
+def test_an_output_that_fails_ends_alone_and_the_last_one_ends_the_run(walk):
+    small, full, smaller, lines = Shelf(room=60), Shelf(room=50), Shelf(room=0), []
+    summary = walk(sinks=[small, full, smaller], warn=lines.append)
+    assert indices(small) == list(range(60))
+    assert indices(full) == list(range(50))
+    assert (small.asked, full.asked, smaller.asked) == (61, 51, 1)
+    assert lines == ["the shelf is full; this output has ended, the others go on"] * 2
+    assert str(summary.error) == "3 of 3 outputs failed: the shelf is full"
+    assert summary.poses == 60
+
+
+def test_a_run_of_which_an_output_failed_reports_it_at_its_end(walk):
+    good, full = Shelf(), Shelf(room=50)
+    summary = walk(sinks=[full, good])
+    assert indices(good) == list(range(180))
+    assert (summary.poses, str(summary.error)) == (180, "1 of 2 outputs failed: the shelf is full")
 
 
 def test_a_sensor_that_stops_is_held_and_counted(walk):

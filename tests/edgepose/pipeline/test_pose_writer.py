@@ -6,6 +6,7 @@ import pytest
 from edgepose.pipeline.pose_writer import OLD_S, QUIET_S, PoseWriter
 from edgepose.pose import PoseFrame
 from edgepose.sinks.base import Sink
+from edgepose.sinks.group import SinkGroup
 
 
 class Shelf(Sink):
@@ -22,7 +23,7 @@ class Shelf(Sink):
 def write(ages, look_ahead_s, sinks):
     """Poses of these ages, a second apart; returns the messages and the number of skipped poses."""
     lines = []
-    writer = PoseWriter(sinks, look_ahead_s, lines.append)
+    writer = PoseWriter(SinkGroup(sinks), look_ahead_s, lines.append)
     for i, age_s in enumerate(ages):
         writer.write(PoseFrame(i, float(i), np.eye(3)[None].repeat(24, 0), np.zeros(24)), age_s)
     return lines, writer.skipped

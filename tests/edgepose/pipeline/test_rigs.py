@@ -71,7 +71,7 @@ def test_files_are_named_against_the_folder_of_the_rig_file(rig, tmp_path):
     assert flags.source.sensors == Path("/map.toml")
     assert flags.source.protocol == str(tmp_path / "mine.toml")
     assert flags.calibration == tmp_path / "../calib.json"
-    assert (flags.outputs.csv, flags.outputs.npz) == ("-", str(tmp_path / "out/a.npz"))
+    assert flags.outputs.targets == (("csv", ("-", "")), ("npz", (str(tmp_path / "out/a.npz"), "24")))
     assert (flags.outputs.height, flags.outputs.std, flags.no_mag) == (2.0, True, True)
     assert (flags.outputs.leg_length, flags.outputs.body.leg_length_m, flags.no_place) == (1.0, 1.0, True)
     # What is not there is as on the command line.
@@ -85,14 +85,18 @@ def test_addresses_and_lines_are_read_as_flags(rig):
         [
             rig(
                 file=None, port="/dev/ttyUSB0", baud=921600, protocol="native", name="Anna B.", csv=None,
-                udp="10.0.0.5:9000,format=binary", osc="127.0.0.1:39539", control="127.0.0.1:9100",
+                udp=["10.0.0.5:9000,format=binary", "10.0.0.6:9000"], osc="127.0.0.1:39539",
+                control="127.0.0.1:9100",
             )
         ]
     )  # fmt: skip
     assert flags.name == "Anna B."
     assert (flags.source.port, flags.source.baud, flags.source.protocol) == ("/dev/ttyUSB0", 921600, "native")
-    assert flags.outputs.udp == ("10.0.0.5", 9000, "binary", "")
-    assert flags.outputs.osc == ("127.0.0.1", 39539, "")
+    assert flags.outputs.targets == (
+        ("udp", ("10.0.0.5", 9000, "binary", "")),
+        ("udp", ("10.0.0.6", 9000, "json", "")),
+        ("osc", ("127.0.0.1", 39539, "")),
+    )
     assert flags.control == ("127.0.0.1", 9100)
 
 
@@ -111,7 +115,9 @@ def test_addresses_and_lines_are_read_as_flags(rig):
         ({"height": "tall"}, "height must be a number, not 'tall'"),
         ({"leg-length": "long"}, "leg-length must be a number, not 'long'"),
         ({"no-place": 1}, "no-place must be true or false, not 1"),
-        ({"csv": ["a.csv"]}, "csv must be text in quotes, not ['a.csv']"),
+        ({"csv": ["a.csv", 3]}, "csv must be text in quotes or a list of such texts, not ['a.csv', 3]"),
+        ({"csv": ["a.csv", "b\0.csv"]}, "csv must be text without NUL characters"),
+        ({"port": ["a", "b"]}, "port must be text in quotes, not ['a', 'b']"),
         ({"protocol": "nonsense"}, "protocol: unknown protocol 'nonsense'"),
         ({"filter": "best"}, "filter: 'best' is not one of"),
         ({"udp": "127.0.0.1"}, "udp: no port in '127.0.0.1'"),
@@ -251,6 +257,17 @@ def test_what_does_not_go_together(command, wearer, rig, tmp_path, ben, flags, s
     assert (tmp_path / "short.npz").read_bytes() == wearer.short.read_bytes()
 
 
+def test_outputs_of_all_wearers_are_opened_or_none(command, rig, tmp_path):
+    (tmp_path / "old.csv").write_text("a take")
+    anna = rig(csv=["anna.csv", "old.csv"], overwrite=True)
+    for target in ({"osc": "nosuch.invalid:39539"}, {"csv": ["ben.csv", "nowhere/ben.csv"]}):
+        result = command("run", *words(anna, rig("ben", **target)), "--model", "rnn")
+        assert result.returncode == 1
+        assert re.search(r"ben: cannot (find host 'nosuch|write poses to .*nowhere/ben.csv)", result.stderr)
+        assert {path.name for path in tmp_path.glob("*.csv")} == {"old.csv"}
+    assert (tmp_path / "old.csv").read_text() == "a take"
+
+
 def test_only_one_wearer_has_standard_output(command, rig):
     result = command("run", *words(rig(csv="-"), rig("ben", csv="-")))
     assert result.returncode == 2
@@ -262,7 +279,7 @@ def test_the_example_of_a_rig_file_is_one(tmp_path):
     (tmp_path / "example.toml").write_text(example)
     (flags,) = read_rigs([tmp_path / "example.toml"])
     assert (flags.name, flags.source.port, flags.control) == ("anna", "/dev/ttyUSB0", ("127.0.0.1", 9101))
-    assert flags.outputs.csv == str(tmp_path / "anna.csv")
+    assert ("csv", (str(tmp_path / "anna.csv"), "")) in flags.outputs.targets
 
 
 # --- recordings ---------------------------------------------------------------------------------------------
