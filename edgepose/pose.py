@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.placements import PLACEMENTS, SITES
-from edgepose.skeleton import JOINTS
+from edgepose.skeleton import JOINTS, grounded_pelvis_position
 
 Array = NDArray[np.float64]
 
@@ -88,6 +88,18 @@ def longest_holds(held: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return the longest run of poses (6,) in which each sensor is held, from `held` (T, 6)."""
     edges = np.diff(np.pad(held.astype(int), ((1, 1), (0, 0))), axis=0).T
     return np.array([np.max(np.flatnonzero(e < 0) - np.flatnonzero(e > 0), initial=0) for e in edges])
+
+
+def pelvis_position(pose: PoseFrame, offsets: Array) -> Array:
+    """Return the position (3,) of the pelvis in T, metres; above the origin if it is unknown.
+
+    Args:
+        pose: the pose.
+        offsets: (24, 3) joint position minus its parent's in the zero pose, metres.
+    """
+    if pose.translation is not None:
+        return pose.translation
+    return grounded_pelvis_position(pose.rotations, offsets)
 
 
 class PoseSequence(NamedTuple):

@@ -74,6 +74,12 @@ def quat_continuous(q: ArrayLike) -> Array:
     return np.concatenate([q[:1], q[1:] * flips])
 
 
+def quat_near(q: ArrayLike, others: ArrayLike) -> Array:
+    """Flip signs of quaternions (..., 4) so that they are close to others; rotations stay the same."""
+    q, others = np.asarray(q, float), np.asarray(others, float)
+    return np.where((q * others).sum(axis=-1, keepdims=True) < 0.0, -q, q)
+
+
 def slerp(q0: ArrayLike, q1: ArrayLike, t: ArrayLike) -> Array:
     """Interpolate on the sphere from q0 (..., 4) at t = 0 to q1 at t = 1, along the shorter arc.
 

@@ -28,6 +28,7 @@ from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
 from edgepose.placements import PLACEMENTS
 from edgepose.sinks.open import open_outputs
 from edgepose.sources import open_source
+from edgepose.sources.live import unix_now
 from edgepose.sources.sensor_map import read_map
 
 if TYPE_CHECKING:
@@ -103,6 +104,7 @@ class OpenWearer:
                 contacts=not self._config.no_place and network.has_place,
                 wearer=self._config.name,
                 about=about,
+                clock=unix_now if self._config.source.file is None else None,
             )
 
     def pipeline(

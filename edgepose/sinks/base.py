@@ -79,6 +79,8 @@ class SinkContext(NamedTuple):
         about: origin of the poses, see `PoseSequence`.
         stopped: whether the run is to end; a reader that has stopped reading is then not waited for.
         wearer: the wearer's name, for messages; empty for a single wearer.
+        clock: returns the present time on the clock of the poses, seconds, if they are measured now; None
+            for recordings.
     """
 
     body: Body
@@ -92,6 +94,7 @@ class SinkContext(NamedTuple):
     about: Mapping[str, str] = MappingProxyType({})
     stopped: Callable[[], bool] = lambda: False
     wearer: str = ""
+    clock: Callable[[], float] | None = None
 
 
 SinkFactory = Callable[[Any, SinkContext], Sink]

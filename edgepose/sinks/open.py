@@ -25,6 +25,7 @@ def open_outputs(
     contacts: bool = False,
     wearer: str = "",
     about: Mapping[str, str] = MappingProxyType({}),
+    clock: Callable[[], float] | None = None,
 ) -> list[Sink]:
     """Open the sinks of one wearer. No file appears or is replaced before all of them are open.
 
@@ -38,6 +39,7 @@ def open_outputs(
         contacts: every pose has contacts.
         wearer: the wearer's name, for messages.
         about: origin of the poses, see `PoseSequence`.
+        clock: see `SinkContext`.
 
     Returns:
         The sinks in the order in which each pose should be written to them.
@@ -58,6 +60,7 @@ def open_outputs(
         about=about,
         stopped=stopped,
         wearer=wearer,
+        clock=clock,
     )
     targets = sorted(outputs.targets, key=_rank)
     sinks = [stack.enter_context(sink_factory(name)(target, context)) for name, target in targets]

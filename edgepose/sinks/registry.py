@@ -30,6 +30,21 @@ ENTRY_POINTS = "edgepose.sinks"
 """Group of entry points under which other packages register their factories."""
 
 
+LONGEST_NAME = 100
+"""Most characters of the name of a stream."""
+
+
+def parse_stream_name(text: str) -> str:
+    """Return the name of a stream.
+
+    Raises:
+        ConfigError: it is empty, too long, or has characters that cannot be printed.
+    """
+    if not text.strip() or not text.isprintable() or len(text) > LONGEST_NAME:
+        raise ConfigError(f"{text!r} is no name of a stream: write up to {LONGEST_NAME} printable characters")
+    return text
+
+
 @dataclass(frozen=True)
 class Output:
     """An output of poses, which has the flag --NAME and the TOML key NAME.
@@ -100,7 +115,7 @@ SINKS = {
         "edgepose.sinks.udp:open_sink",
         "Send each pose as a datagram.",
         "HOST:PORT[,format=json|binary|binary-v1][,broadcast|multicast]",
-        parse_destination,
+        partial(parse_destination, key="format", choices=("json", "binary", "binary-v1")),
         Destination,
     ),
     "osc": Output(
@@ -110,6 +125,28 @@ SINKS = {
         "HOST:PORT[,broadcast|multicast]",
         parse_datagram_address,
         Address,
+    ),
+    "vrchat": Output(
+        "edgepose.sinks.vrchat:open_sink",
+        "Send trackers to VRChat over OSC; it listens on port 9000. 8: hip, feet, knees, chest, elbows; "
+        "6: without elbows; 3: hip and feet.",
+        "HOST:PORT[,trackers=8|6|3][,broadcast|multicast]",
+        partial(parse_destination, key="trackers", choices=("8", "6", "3")),
+        Destination,
+    ),
+    "mocopi": Output(
+        "edgepose.sinks.mocopi:open_sink",
+        "Send each pose as Sony's mocopi does, to its receivers for Unity, Unreal, MotionBuilder and "
+        "Blender, which listen on port 12351.",
+        "HOST:PORT[,broadcast|multicast]",
+        parse_datagram_address,
+        Address,
+    ),
+    "lsl": Output(
+        "edgepose.sinks.lsl:open_sink",
+        "Offer the poses as a stream of this name to the Lab Streaming Layer, to all of the network.",
+        "NAME",
+        parse_stream_name,
     ),
     "tcp": Output(
         "edgepose.sinks.tcp:open_sink",

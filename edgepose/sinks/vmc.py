@@ -10,11 +10,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from edgepose.pose import PoseFrame
-from edgepose.rotations import matrix_to_quat
+from edgepose.pose import PoseFrame, pelvis_position
+from edgepose.rotations import matrix_to_quat, quat_near
 from edgepose.sinks.base import Sink, SinkContext
+from edgepose.sinks.osc import TO_UNITY, osc_bundle, osc_string
 from edgepose.sinks.udp import DatagramSink
-from edgepose.skeleton import JOINTS, Body, default_body, grounded_pelvis_position
+from edgepose.skeleton import JOINTS, Body, default_body
 from edgepose.utils.sockets import Address
 
 BONES = {
@@ -50,27 +51,10 @@ _INDEX = [JOINTS.index(joint) for joint in BONES.values()]
 _CHEST, _UPPER_CHEST = JOINTS.index("spine2"), JOINTS.index("spine3")
 _ON_UPPER_CHEST = [JOINTS.index(name) for name in ("neck", "left_collar", "right_collar")]
 
-TO_UNITY = np.array([-1.0, 1.0, 1.0])
-"""Mirrors points from T (X left, Y up, Z forward) to Unity, X right; rotations about Y and Z reverse."""
-
-
-def _string(text: str) -> bytes:
-    data = text.encode() + b"\0"
-    return data + bytes(-len(data) % 4)
-
-
-def _bundle(messages: Sequence[bytes]) -> bytes:
-    """Return an OSC bundle for immediate execution."""
-    parts = [b"#bundle\0", struct.pack(">Q", 1)]
-    for message in messages:
-        parts += [struct.pack(">i", len(message)), message]
-    return b"".join(parts)
-
-
-_BONE_HEADS = [_string("/VMC/Ext/Bone/Pos") + _string(",sfffffff") + _string(bone) for bone in BONES]
-_ROOT = _string("/VMC/Ext/Root/Pos") + _string(",sfffffff") + _string("root")
-_OK = _string("/VMC/Ext/OK") + _string(",i") + struct.pack(">i", 1)
-_TIME = _string("/VMC/Ext/T") + _string(",f")
+_BONE_HEADS = [osc_string("/VMC/Ext/Bone/Pos") + osc_string(",sfffffff") + osc_string(bone) for bone in BONES]
+_ROOT = osc_string("/VMC/Ext/Root/Pos") + osc_string(",sfffffff") + osc_string("root")
+_OK = osc_string("/VMC/Ext/OK") + osc_string(",i") + struct.pack(">i", 1)
+_TIME = osc_string("/VMC/Ext/T") + osc_string(",f")
 _HALF = (len(BONES) + 1) // 2
 """Bones in the first datagram: with all of them it would not fit into an Ethernet frame."""
 
@@ -103,25 +87,20 @@ class VmcSink(DatagramSink):
             self._start_s = pose.time_s
         rotations = pose.rotations.copy()
         rotations[_CHEST] = rotations[_CHEST] @ rotations[_UPPER_CHEST]
-        quats = matrix_to_quat(rotations[_INDEX])
         # Receivers that smooth or interpolate the numbers would turn a bone round where signs change.
-        opposite = (quats * self._quats).sum(axis=-1, keepdims=True) < 0.0
-        self._quats = np.where(opposite, -quats, quats)
+        self._quats = quat_near(matrix_to_quat(rotations[_INDEX]), self._quats)
         w, x, y, z = self._quats.T
         positions = self._positions.copy()
-        position = pose.translation
-        if position is None:
-            position = grounded_pelvis_position(pose.rotations, self._offsets)
         # The root stands on the floor below the pelvis, so that an avatar whose receiver keeps its own bone
         # positions walks, too.
-        x_m, height_m, z_m = position * TO_UNITY + 0.0  # no negative zeros
+        x_m, height_m, z_m = pelvis_position(pose, self._offsets) * TO_UNITY + 0.0  # no negative zeros
         root = _ROOT + struct.pack(">7f", x_m, 0, z_m, 0, 0, 0, 1)
         positions[0] = 0.0, height_m, 0.0
         numbers = np.column_stack([positions, x, -y, -z, w]).astype(">f4")
         bones = [head + row.tobytes() for head, row in zip(_BONE_HEADS, numbers, strict=True)]
         # Relative, because single precision cannot hold fractions of a second of Unix time.
         time_s = _TIME + struct.pack(">f", pose.time_s - self._start_s)
-        return _bundle([_OK, time_s, root, *bones[:_HALF]]), _bundle([time_s, *bones[_HALF:]])
+        return osc_bundle([_OK, time_s, root, *bones[:_HALF]]), osc_bundle([time_s, *bones[_HALF:]])
 
 
 def open_sink(target: Address, context: SinkContext) -> Sink:

@@ -126,7 +126,7 @@ class LiveSource:
             for spec in self._specs:
                 transport = spec.open()
                 stack.callback(transport.close)
-                line = LineReader(spec, transport, placement_owner, self._queue, _now, self._blocking)
+                line = LineReader(spec, transport, placement_owner, self._queue, unix_now, self._blocking)
                 self._lines.append(line)
             stack.pop_all()
         for line in self._lines:
@@ -145,17 +145,17 @@ class LiveSource:
         Raises:
             DeviceError: nothing usable comes at the start, or a line cannot be read.
         """
-        start_s = checked_s = now_s = _now()
+        start_s = checked_s = now_s = unix_now()
         read = _ReadTime(self._lines, start_s)
         for line in self._lines:
             line.start()
         try:
             for arrivals, since_s in self._wait_for_data() if self._blocking else self._poll_lines():
                 samples, raw, error = _decode_arrivals(arrivals)
-                arrival_s = max(now_s, *(arrival.time_s for arrival in arrivals)) if arrivals else _now()
+                arrival_s = max(now_s, *(arrival.time_s for arrival in arrivals)) if arrivals else unix_now()
                 now_s = read.update(arrivals, arrival_s)
                 if raw or error is None:
-                    yield Batch(now_s, samples, raw, _now() - min(arrival_s, since_s), arrival_s - now_s)
+                    yield Batch(now_s, samples, raw, unix_now() - min(arrival_s, since_s), arrival_s - now_s)
                 if error is not None:
                     raise error
                 for line in self._lines:
@@ -181,9 +181,9 @@ class LiveSource:
 
     def _poll_lines(self) -> Iterator[_Arrivals]:
         """Yield everything that has come since the last batch, without waiting."""
-        since_s = _now()
+        since_s = unix_now()
         while True:
-            poll_s = _now()
+            poll_s = unix_now()
             arrivals = [self._queue.get() for _ in range(self._queue.qsize())]
             polled = [line.poll() for line in self._lines]
             yield _Arrivals(arrivals + [arrival for arrival in polled if arrival is not None], since_s)
@@ -220,8 +220,8 @@ def _decode_arrivals(
     return samples, raw, None
 
 
-def _now() -> float:
-    """Unix time that never jumps."""
+def unix_now() -> float:
+    """Return the Unix time, seconds, on the clock of live sources, which never jumps."""
     return _unix_s() + time.monotonic()
 
 

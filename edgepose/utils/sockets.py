@@ -49,8 +49,6 @@ def bound_socket(host: str, port: int) -> socket.socket:
 CASTS = ("broadcast", "multicast")
 """Words that permit an address of many machines."""
 
-_FORMATS = ("format=json", "format=binary", "format=binary-v1")
-
 
 class Address(NamedTuple):
     """Host name or address, UDP port, and "broadcast" or "multicast" if it stands for many machines."""
@@ -61,11 +59,11 @@ class Address(NamedTuple):
 
 
 class Destination(NamedTuple):
-    """Destination of datagrams: as `Address`, with the format "json", "binary" or "binary-v1"."""
+    """Destination of datagrams: as `Address`, with the value of an option, such as a format."""
 
     host: str
     port: int
-    format: str
+    option: str
     cast: str = ""
 
 
@@ -115,17 +113,21 @@ def parse_datagram_address(text: str) -> Address:
     return Address(host, port, _last(options, CASTS, ""))
 
 
-def parse_destination(text: str) -> Destination:
-    """Parse "HOST:PORT[,format=json|binary|binary-v1][,broadcast|multicast]"; JSON is the default.
+def parse_destination(text: str, key: str, choices: Sequence[str]) -> Destination:
+    """Parse "HOST:PORT[,key=value][,broadcast|multicast]", see `parse_address`.
 
-    See `parse_address`.
+    Args:
+        text: the text.
+        key: name of the option.
+        choices: its values; the first is the default.
 
     Raises:
         ConfigError: the text has another form.
     """
-    host, port, options = _split_options(text, (*_FORMATS, *CASTS))
-    form = _last(options, _FORMATS, _FORMATS[0]).removeprefix("format=")
-    return Destination(host, port, form, _last(options, CASTS, ""))
+    values = [f"{key}={choice}" for choice in choices]
+    host, port, options = _split_options(text, (*values, *CASTS))
+    value = _last(options, values, values[0]).removeprefix(f"{key}=")
+    return Destination(host, port, value, _last(options, CASTS, ""))
 
 
 def _split_options(text: str, possible: Sequence[str]) -> tuple[str, int, list[str]]:

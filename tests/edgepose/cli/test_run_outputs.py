@@ -24,9 +24,10 @@ from tests.support.datagrams import Listener, free_address
 
 
 def test_all_outputs_say_the_same(command, wearer, tmp_path):
-    with Listener() as mailbox:
+    with Listener() as mailbox, Listener() as vrchat, Listener() as mocopi:
         result = command(
             *("run", "--file", wearer.short, "--realtime"),
+            *("--vrchat", f"{vrchat.address},trackers=6", "--mocopi", mocopi.address),
             *("--calibration", wearer.calibration, "--model", "rnn"),
             *("--csv", tmp_path / "a.csv", "--npz", f"{tmp_path / 'a.npz'},joints=52"),
             *("--bvh", tmp_path / "a.bvh"),
@@ -55,6 +56,8 @@ def test_all_outputs_say_the_same(command, wearer, tmp_path):
     true = wanted[:, [0, 15, 22, 11]]
     np.testing.assert_allclose(places - places[:, :1], true - true[:, :1], atol=1e-4)
     assert len(datagrams) == 2 * 180
+    assert len(vrchat.datagrams) == 180
+    assert len(mocopi.datagrams) == 180 + 3
     assert {message.address for message in OscBundle(datagrams[0])} >= {"/VMC/Ext/OK", "/VMC/Ext/Bone/Pos"}
 
 

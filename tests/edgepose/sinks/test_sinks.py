@@ -20,10 +20,11 @@ from edgepose.pose import PoseFrame, parse_status
 from edgepose.rotations import matrix_to_euler_zxy
 from edgepose.sinks import pose_file
 from edgepose.sinks.csv import CsvSink, pose_columns
+from edgepose.sinks.registry import SINKS
 from edgepose.sinks.udp import UdpSink, decode, decode_binary, encode_binary, encode_json
 from edgepose.sinks.vmc import VmcSink
 from edgepose.skeleton import JOINTS
-from edgepose.utils.sockets import parse_destination, resolve
+from edgepose.utils.sockets import resolve
 
 DOCS = Path(__file__).parents[3] / "docs" / "reference" / "outputs.md"
 STATUSES = ("ok", "held head", "held left_forearm pelvis; filling window", "filling window")
@@ -349,7 +350,7 @@ def test_json_with_the_place():
 
 @pytest.mark.parametrize(("form", "size"), [("binary", 444), ("binary-v1", 404)])
 def test_version_1_on_request(receiver, form, size):
-    destination = parse_destination(f"127.0.0.1:{receiver.getsockname()[1]},format={form}")
+    destination = SINKS["udp"].parse(f"127.0.0.1:{receiver.getsockname()[1]},format={form}")
     with UdpSink(*destination) as sink:
         sink.write(placed(1))
         data = receiver.recv(2048)
@@ -426,7 +427,7 @@ def test_udp_ipv6():
         pytest.skip("no IPv6 here")
     with sock:
         sock.settimeout(5)
-        destination = parse_destination(f"[::1]:{sock.getsockname()[1]},format=binary")
+        destination = SINKS["udp"].parse(f"[::1]:{sock.getsockname()[1]},format=binary")
         with UdpSink(*destination) as sink:
             sink.write(make_pose(1))
         assert decode_binary(sock.recv(2048)).index == 1
@@ -446,7 +447,7 @@ def test_broadcast_reaches_those_who_listen():
         receiver.bind(("", 0))
         receiver.settimeout(5)
         port = receiver.getsockname()[1]
-        destination = parse_destination(f"127.255.255.255:{port},format=binary,broadcast")
+        destination = SINKS["udp"].parse(f"127.255.255.255:{port},format=binary,broadcast")
         with UdpSink(*destination) as sink:
             sink.write(make_pose(1))
         assert decode_binary(receiver.recv(2048)).index == 1
@@ -485,7 +486,7 @@ def test_udp_unknown_host():
     ],
 )
 def test_parse_destination(text, expected):
-    assert parse_destination(text) == expected
+    assert SINKS["udp"].parse(text) == expected
 
 
 @pytest.mark.parametrize(
@@ -513,7 +514,7 @@ def test_parse_destination(text, expected):
 )
 def test_parse_destination_errors(text, message):
     with pytest.raises(EdgeposeError, match=message):
-        parse_destination(text)
+        SINKS["udp"].parse(text)
 
 
 def documented_receiver(language: str, port: int) -> str:

@@ -20,21 +20,7 @@ from edgepose.sinks.tcp import CLIENTS, TcpSink
 from edgepose.sinks.vmc import VmcSink
 from edgepose.skeleton import JOINTS, default_body, forward_kinematics, standing_pelvis_position
 from edgepose.utils.sockets import parse_address
-
-
-def pose(index: int = 0, where: np.ndarray | None = None, **turns: tuple[str, float]) -> PoseFrame:
-    """A T-pose in which some joints are turned about an axis, degrees."""
-    rotations = np.tile(np.eye(3, dtype=np.float32), (24, 1, 1))
-    for joint, (axis, angle) in turns.items():
-        rotations[JOINTS.index(joint)] = Rotation.from_euler(axis, angle, degrees=True).as_matrix()
-    return PoseFrame(index, 1.7e9 + index / 60, rotations, np.zeros(24, np.float32), where)
-
-
-def anything(index: int) -> PoseFrame:
-    rotations = Rotation.random(24, random_state=index).as_matrix().astype(np.float32)
-    where = np.random.default_rng(index).normal(size=3)
-    return PoseFrame(index, 1.7e9 + index / 60, rotations, np.zeros(24, np.float32), where)
-
+from tests.support.poses import anything, pose
 
 # --- VMC ----------------------------------------------------------------------------------------------------
 
