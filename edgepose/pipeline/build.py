@@ -105,6 +105,7 @@ class OpenWearer:
                 wearer=self._config.name,
                 about=about,
                 clock=unix_now if self._config.source.file is None else None,
+                paced=self._config.source.live,
             )
 
     def pipeline(

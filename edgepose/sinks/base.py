@@ -81,6 +81,7 @@ class SinkContext(NamedTuple):
         wearer: the wearer's name, for messages; empty for a single wearer.
         clock: returns the present time on the clock of the poses, seconds, if they are measured now; None
             for recordings.
+        paced: poses come at the pace of their measurement, so that no reader is waited for.
     """
 
     body: Body
@@ -95,6 +96,7 @@ class SinkContext(NamedTuple):
     stopped: Callable[[], bool] = lambda: False
     wearer: str = ""
     clock: Callable[[], float] | None = None
+    paced: bool = False
 
 
 SinkFactory = Callable[[Any, SinkContext], Sink]

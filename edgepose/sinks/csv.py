@@ -32,6 +32,7 @@ class CsvSink(PoseFileSink):
         overwrite: bool = True,
         follow: bool = True,
         stopped: Callable[[], bool] = lambda: False,
+        waits: bool = True,
     ) -> None:
         """Open the file and write the header.
 
@@ -44,6 +45,7 @@ class CsvSink(PoseFileSink):
             overwrite: replace an existing file.
             follow: write to the target of a symbolic link; if false, replace the link.
             stopped: whether the run is to end; a reader that has stopped reading is then not waited for.
+            waits: `write` waits for a slow reader of a pipe, which otherwise reads later.
 
         Raises:
             EdgeposeError: the file cannot be written.
@@ -57,7 +59,7 @@ class CsvSink(PoseFileSink):
         columns = pose_columns(rotations, std, translation, contacts)
         self._format = ",".join(["%d,%.6f,%s"] + ["%.6f"] * (len(columns) - 3)) + "\n"
         self._rows: list[str] = []
-        output = GrowingFile(path, "poses", overwrite=overwrite, follow=follow, stopped=stopped)
+        output = GrowingFile(path, "poses", overwrite=overwrite, follow=follow, stopped=stopped, waits=waits)
         super().__init__(output, (",".join(columns) + "\n").encode())
 
     def _add(self, pose: PoseFrame) -> bool:
@@ -89,4 +91,5 @@ def open_sink(target: FileTarget, context: SinkContext) -> Sink:
         *(target.path, rotations, context.std, context.translation, context.contacts),
         overwrite=context.overwrite,
         stopped=context.stopped,
+        waits=not context.paced,
     )

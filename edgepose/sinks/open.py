@@ -26,6 +26,7 @@ def open_outputs(
     wearer: str = "",
     about: Mapping[str, str] = MappingProxyType({}),
     clock: Callable[[], float] | None = None,
+    paced: bool = False,
 ) -> list[Sink]:
     """Open the sinks of one wearer. No file appears or is replaced before all of them are open.
 
@@ -40,6 +41,7 @@ def open_outputs(
         wearer: the wearer's name, for messages.
         about: origin of the poses, see `PoseSequence`.
         clock: see `SinkContext`.
+        paced: see `SinkContext`.
 
     Returns:
         The sinks in the order in which each pose should be written to them.
@@ -61,6 +63,7 @@ def open_outputs(
         stopped=stopped,
         wearer=wearer,
         clock=clock,
+        paced=paced,
     )
     targets = sorted(outputs.targets, key=_rank)
     sinks = [stack.enter_context(sink_factory(name)(target, context)) for name, target in targets]

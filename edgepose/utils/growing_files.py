@@ -40,6 +40,7 @@ class GrowingFile:
         overwrite: bool = True,
         follow: bool = True,
         stopped: Callable[[], bool] = never,
+        waits: bool = True,
     ) -> None:
         """Open the output; a file on a disk has a temporary name until it is started.
 
@@ -50,6 +51,7 @@ class GrowingFile:
             overwrite: replace an existing file.
             follow: write to the target of a symbolic link; if false, replace the link.
             stopped: whether the run is to end; a reader that has stopped reading is then not waited for.
+            waits: see `OutputStream`.
 
         Raises:
             EdgeposeError: the output cannot be written to.
@@ -62,7 +64,7 @@ class GrowingFile:
             find_target(name, what) if follow else Target(str(name), Path(name), False, os.path.lexists(name))
         )
         if self._target.stream:
-            self._stream = OutputStream(self._target, what, stopped)
+            self._stream = OutputStream(self._target, what, stopped, waits)
             self.file: Any = self._stream.file
             self.regular = self._stream.regular
             return

@@ -20,6 +20,9 @@ from edgepose.utils.output_targets import Target, descriptor, find_target, write
 PATIENCE_S = 1.0
 """Longest wait for the reader of a pipe once the run is to end, seconds."""
 
+BACKLOG = 1 << 24
+"""Bytes that wait for a slow reader where nothing else may be delayed: minutes of poses."""
+
 _PIECE = 4096  # a pipe that is writable accepts this many bytes at once
 _PIECE_TERMINAL = 256
 _POLL_MS = 100
@@ -40,19 +43,23 @@ class OutputStream:
         file: the file object to write to.
     """
 
-    def __init__(self, target: Target, what: str, stopped: Callable[[], bool] = never) -> None:
+    def __init__(
+        self, target: Target, what: str, stopped: Callable[[], bool] = never, waits: bool = True
+    ) -> None:
         """Open the output, waiting for a reader if it is a pipe.
 
         Args:
             target: the output.
             what: the output's content, for messages.
             stopped: whether the run is to end; a reader that has stopped reading is then not waited for.
+            waits: `write` waits for a slow reader; otherwise what it does not read is kept in memory.
 
         Raises:
             EdgeposeError: the output cannot be opened, or the pipe had no reader until the end of the run.
         """
         self._target, self._what, self._stopped = target, what, stopped
         self.unwritten = 0
+        self._waits, self._backlog = waits, bytearray()
         try:
             self.file = self._open()
         except OSError as error:
@@ -103,7 +110,20 @@ class OutputStream:
 
         Raises:
             OSError: writing failed.
+            EdgeposeError: more than `BACKLOG` bytes wait for the reader.
         """
+        if self._waits or self._poll is None:
+            self._write(data)
+            return len(data)
+        self._backlog += data
+        while self._backlog and self._poll.poll(0):
+            del self._backlog[: self.file.write(self._backlog[: self._piece]) or 0]
+        if len(self._backlog) > BACKLOG:
+            self.unwritten = len(self._backlog)
+            raise self._not_read()
+        return len(data)
+
+    def _write(self, data: bytes) -> None:
         done = 0
         while done < len(data):
             if not self._wait_until_writable():
@@ -111,7 +131,6 @@ class OutputStream:
                 break
             piece = data[done:] if self._poll is None else data[done : done + self._piece]
             done += self.file.write(piece) or 0
-        return len(data)
 
     def _wait_until_writable(self) -> bool:
         """Wait until the output is writable; return False if it is not by the end of the run."""
@@ -134,14 +153,22 @@ class OutputStream:
             OSError: closing failed.
             EdgeposeError: the reader has not read everything.
         """
-        if self._target.name != "-":
-            self.file.close()
+        rest, self._backlog = bytes(self._backlog), bytearray()
+        try:
+            if not self.unwritten:
+                self._write(rest)
+        finally:
+            if self._target.name != "-":
+                self.file.close()
         if self.unwritten:
-            name = "standard output" if self._target.name == "-" else self._target.name
-            raise EdgeposeError(
-                f"the program that reads the {self._what} from {name} has stopped reading: {self.unwritten} "
-                "bytes were not written"
-            )
+            raise self._not_read()
+
+    def _not_read(self) -> EdgeposeError:
+        name = "standard output" if self._target.name == "-" else self._target.name
+        return EdgeposeError(
+            f"the program that reads the {self._what} from {name} has stopped reading: {self.unwritten} "
+            "bytes were not written"
+        )
 
 
 def _poll_of(file: Any) -> Any:

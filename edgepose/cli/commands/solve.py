@@ -198,13 +198,13 @@ def solve(
         target = (stack, outputs, solver.rate, lambda: interrupted)
         contacts = place is not None
         sinks = open_outputs(*target, body=wearer_body, translation=True, contacts=contacts)
+        group = SinkGroup(sinks, say)
         solutions, interrupted = _collect(solve_all(measurements, settings, solver.jobs, _progress()))
         if not solutions:
             raise KeyboardInterrupt
         solution = residuals.concatenate(solutions)
         place = None if place is None else place[: len(solution.rotations)]
         path = pelvis_path(solution, settings.body.offsets, solver.rate, place)
-        group = SinkGroup(sinks, say)
         _write(group, solution, measurements, path)
         group.close()
     _report(solution, measurements)
@@ -212,10 +212,8 @@ def solve(
         residuals.plot(plot, solution, measurements, outputs.overwrite)
     if interrupted:
         raise KeyboardInterrupt
-    if group.error is not None:
-        raise group.error
-    if data.damage:
-        raise EdgeposeError(data.damage)
+    if group.error is not None or data.damage:
+        raise group.error or EdgeposeError(data.damage)
 
 
 def _check_outputs(outputs: OutputConfig, plot: Path | None, inputs: Mapping[str, Path | None]) -> None:

@@ -85,7 +85,8 @@ def test_one_signal_ends_a_run_whose_output_nobody_reads(wearer, tmp_path, numbe
         process.wait()
     assert "poses    " in errors
     assert re.search(
-        r"edgepose: the program that reads the poses from standard output has stopped reading: \d+ bytes",
+        r"edgepose: 1 of 2 outputs failed: the program that reads the poses from standard output has stopped "
+        r"reading: \d+ bytes",
         errors,
     )
     count = int(re.search(r"poses    (\d+) in", errors)[1])

@@ -176,6 +176,25 @@ def test_an_output_whose_reader_ends_costs_only_itself(wearer, tmp_path):
     assert len(read_poses(tmp_path / "a.csv").frames) == len(read_bvh(tmp_path / "a.bvh").rotations) == 720
 
 
+def test_a_reader_that_sleeps_delays_no_other_output(wearer, tmp_path):
+    words = ["run", "--file", wearer.short, "--calibration", wearer.calibration, "--model", "rnn"]
+    with processes.start(
+        *words, "--realtime", "--csv", "-", "--csv", tmp_path / "a.csv", stdout=subprocess.PIPE
+    ) as process:
+        try:
+            end_s = time.monotonic() + 120.0
+            while not (tmp_path / "a.csv").exists() or (tmp_path / "a.csv").read_text().count("\n") < 181:
+                assert time.monotonic() < end_s
+                assert process.poll() is None, process.stderr.read()
+                time.sleep(0.1)
+            lines, errors = process.communicate(timeout=120)
+        finally:
+            process.kill()
+    assert len(lines) > 1 << 16  # more than a pipe holds
+    assert lines == (tmp_path / "a.csv").read_text()
+    assert process.returncode == 0, errors
+
+
 def test_nobody_listens_for_osc(command, wearer):
     address = free_address()
     result = command(
