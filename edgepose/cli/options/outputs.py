@@ -87,8 +87,8 @@ def output_options(command: Command) -> Command:
     height_option = click.option(
         "--height",
         type=float,
-        help="The wearer's height, metres: for the length of their steps, and for the bones of --bvh, --osc "
-        f"and --view.  [default: the calibration's, or {DEFAULT_HEIGHT}]",
+        help="The wearer's height, metres: for the length of their steps, and for the bones of --bvh, --osc, "
+        f"--vrchat, --mocopi and --view.  [default: the calibration's, or {DEFAULT_HEIGHT}]",
     )
     other_sinks_option = click.option(
         "--sink",
