@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from edgepose.cli.options.outputs import check_files
 from edgepose.errors import EdgeposeError, prefix_errors
+from edgepose.sinks.registry import SINKS
 from edgepose.utils.output_targets import has_reader
 
 if TYPE_CHECKING:
@@ -60,12 +61,27 @@ def check_all_files(wearers: Sequence[WearerConfig], model: Path) -> None:
     for wearer in wearers:
         with prefix_errors(wearer.name):
             wearer.outputs.check()
+    _check_receivers(wearers)
     if len(wearers) > 1:
         for flag, file in outputs:
             if has_reader(file):
                 raise click.UsageError(
                     f"{flag} {file} is not a file on a disk: a slow reader of it would delay every wearer; "
                     "give each a file, --udp or --tcp"
+                )
+
+
+def _check_receivers(wearers: Sequence[WearerConfig]) -> None:
+    """Raise click.UsageError if a receiver that cannot tell wearers apart would get two."""
+    owners: dict[tuple[str, Any], str] = {}
+    for wearer in wearers:
+        for output in wearer.outputs.targets:
+            name = output[0]
+            other = owners.setdefault(output, wearer.name)
+            if other != wearer.name and name in SINKS and SINKS[name].one_wearer:
+                raise click.UsageError(
+                    f"{other} and {wearer.name} have the same {name}, whose receiver cannot tell them apart; "
+                    "give each their own"
                 )
 
 

@@ -56,6 +56,7 @@ class Output:
         parse: makes the sink's target from that value. Raises ConfigError if the value has another form.
         form: class of the targets; a tuple of the first of its values stands for one.
         suffix: ending of its files, such as ".csv"; empty if it does not write to a file.
+        one_wearer: its receivers cannot tell several wearers apart.
         part: returns the name of the file that holds the poses during a run, given that of the output; None
             if there is no such file.
     """
@@ -66,6 +67,7 @@ class Output:
     parse: Callable[[str], Any] = str
     form: Callable[..., Any] | None = None
     suffix: str = ""
+    one_wearer: bool = False
     part: Callable[[str], Path] | None = None
 
     def target(self, value: Any) -> Any:
@@ -125,6 +127,7 @@ SINKS = {
         "HOST:PORT[,broadcast|multicast]",
         parse_datagram_address,
         Address,
+        one_wearer=True,
     ),
     "vrchat": Output(
         "edgepose.sinks.vrchat:open_sink",
@@ -133,6 +136,7 @@ SINKS = {
         "HOST:PORT[,trackers=8|6|3][,broadcast|multicast]",
         partial(parse_destination, key="trackers", choices=("8", "6", "3")),
         Destination,
+        one_wearer=True,
     ),
     "mocopi": Output(
         "edgepose.sinks.mocopi:open_sink",
@@ -141,12 +145,14 @@ SINKS = {
         "HOST:PORT[,broadcast|multicast]",
         parse_datagram_address,
         Address,
+        one_wearer=True,
     ),
     "lsl": Output(
         "edgepose.sinks.lsl:open_sink",
         "Offer the poses as a stream of this name to the Lab Streaming Layer, to all of the network.",
         "NAME",
         parse_stream_name,
+        one_wearer=True,
     ),
     "tcp": Output(
         "edgepose.sinks.tcp:open_sink",

@@ -12,11 +12,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 
 from edgepose.calibration import load_calibration
 from edgepose.calibration.rezero import HeadingRezero
+from edgepose.cli.conflicts import check_all_files
 from edgepose.cli.options.wearer import read_rigs
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.registry import read_poses
@@ -255,6 +257,18 @@ def test_what_does_not_go_together(command, wearer, rig, tmp_path, ben, flags, s
     assert says in result.stderr
     assert "Traceback" not in result.stderr
     assert (tmp_path / "short.npz").read_bytes() == wearer.short.read_bytes()
+
+
+@pytest.mark.parametrize("name", ["osc", "vrchat", "mocopi", "lsl", "udp"])
+def test_a_receiver_that_cannot_tell_wearers_apart_gets_one(rig, name):
+    wearers = read_rigs(
+        [rig("anna", **{name: "127.0.0.1:9"}), rig("ben", **{name: ["[::1]:8", "127.0.0.1:9"]})]
+    )
+    if name == "udp":
+        check_all_files(wearers, Path("model.pt"))
+        return
+    with pytest.raises(click.UsageError, match=f"anna and ben have the same {name}, whose receiver cannot"):
+        check_all_files(wearers, Path("model.pt"))
 
 
 def test_outputs_of_all_wearers_are_opened_or_none(command, rig, tmp_path):
