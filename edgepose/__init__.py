@@ -29,9 +29,12 @@ if TYPE_CHECKING:
     from edgepose.sinks.base import Sink
     from edgepose.sinks.bvh import BvhSink
     from edgepose.sinks.csv import CsvSink
+    from edgepose.sinks.lsl import LslSink
+    from edgepose.sinks.mocopi import MocopiSink
     from edgepose.sinks.npz import NpzSink
     from edgepose.sinks.udp import UdpSink
     from edgepose.sinks.vmc import VmcSink
+    from edgepose.sinks.vrchat import VrchatSink
     from edgepose.skeleton import JOINTS
     from edgepose.sources import open_source
 
@@ -49,6 +52,8 @@ _MODULES = {
     "ImuFrame": "edgepose.imu",
     "ImuSample": "edgepose.imu",
     "JOINTS": "edgepose.skeleton",
+    "LslSink": "edgepose.sinks.lsl",
+    "MocopiSink": "edgepose.sinks.mocopi",
     "Model": "edgepose.inference.model",
     "ModelError": "edgepose.errors",
     "NpzSink": "edgepose.sinks.npz",
@@ -61,6 +66,7 @@ _MODULES = {
     "SourceConfig": "edgepose.config",
     "UdpSink": "edgepose.sinks.udp",
     "VmcSink": "edgepose.sinks.vmc",
+    "VrchatSink": "edgepose.sinks.vrchat",
     "WearerConfig": "edgepose.config",
     "load_calibration": "edgepose.calibration",
     "load_model": "edgepose.inference.model",
@@ -82,6 +88,8 @@ __all__ = [
     "FileFormatError",
     "ImuFrame",
     "ImuSample",
+    "LslSink",
+    "MocopiSink",
     "Model",
     "ModelError",
     "NpzSink",
@@ -93,6 +101,7 @@ __all__ = [
     "SourceConfig",
     "UdpSink",
     "VmcSink",
+    "VrchatSink",
     "WearerConfig",
     "load_calibration",
     "load_model",
