@@ -149,11 +149,13 @@ class OutputConfig:
         sinks = sinks or {}
         if own := sinks.keys() & SINKS.keys():
             raise ConfigError(f"{min(own)} is not an output of another package: give --{min(own)}")
-        given = [*((name, outputs[name]) for name in SINKS if name in outputs), *sinks.items()]
+        given = [*targets, *((name, outputs[name]) for name in SINKS if name in outputs), *sinks.items()]
         several = [(name, value if isinstance(value, list) else [value]) for name, value in given]
-        pairs = [*targets, *((name, value) for name, values in several for value in values)]
         pairs = [
-            (name, _target(name, value)) for name, value in pairs if value is not None and value is not False
+            (name, _target(name, value))
+            for name, values in several
+            for value in values
+            if value is not None and value is not False
         ]
         for i, (name, target) in enumerate(pairs):
             if (name, target) in pairs[:i]:

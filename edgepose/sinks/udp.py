@@ -227,7 +227,7 @@ class DatagramSink(Sink):
         if not self.unsent:
             return []
         question = f"is anything listening at {self._address}?"
-        return [f"{self.NAME}      {self.unsent} datagrams did not arrive; {question}"]
+        return [f"{self.NAME:<8} {self.unsent} datagrams did not arrive; {question}"]
 
     def _send(self, datagram: bytes) -> None:
         try:
