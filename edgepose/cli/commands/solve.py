@@ -196,24 +196,24 @@ def solve(
     with ExitStack() as stack:
         # Opened before the work, so that a wrong name is reported at once.
         target = (stack, outputs, solver.rate, lambda: interrupted)
-        contacts = place is not None
-        sinks = open_outputs(*target, body=wearer_body, translation=True, contacts=contacts)
-        group = SinkGroup(sinks, say)
+        opened = open_outputs(*target, body=wearer_body, translation=True, contacts=place is not None)
+        sinks = SinkGroup(opened, say)
         solutions, interrupted = _collect(solve_all(measurements, settings, solver.jobs, _progress()))
         if not solutions:
             raise KeyboardInterrupt
         solution = residuals.concatenate(solutions)
         place = None if place is None else place[: len(solution.rotations)]
         path = pelvis_path(solution, settings.body.offsets, solver.rate, place)
-        _write(group, solution, measurements, path)
-        group.close()
+        _write(sinks, solution, measurements, path)
     _report(solution, measurements)
     if plot is not None:
         residuals.plot(plot, solution, measurements, outputs.overwrite)
+    if sinks.error is not None:
+        raise sinks.error
     if interrupted:
         raise KeyboardInterrupt
-    if group.error is not None or data.damage:
-        raise group.error or EdgeposeError(data.damage)
+    if data.damage:
+        raise EdgeposeError(data.damage)
 
 
 def _check_outputs(outputs: OutputConfig, plot: Path | None, inputs: Mapping[str, Path | None]) -> None:
@@ -358,6 +358,7 @@ def _write(sinks: SinkGroup, solution: Solution, measurements: Measurements, pat
         if path.contacts is not None:
             pose = pose._replace(contacts=path.contacts[i])
         sinks.write(pose)
+    sinks.close()
 
 
 def _progress() -> OnProgress:
