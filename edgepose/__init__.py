@@ -29,9 +29,11 @@ if TYPE_CHECKING:
     from edgepose.sinks.base import Sink
     from edgepose.sinks.bvh import BvhSink
     from edgepose.sinks.csv import CsvSink
+    from edgepose.sinks.glb import GlbSink
     from edgepose.sinks.lsl import LslSink
     from edgepose.sinks.mocopi import MocopiSink
     from edgepose.sinks.npz import NpzSink
+    from edgepose.sinks.opensim import MotSink, StoSink
     from edgepose.sinks.udp import UdpSink
     from edgepose.sinks.vmc import VmcSink
     from edgepose.sinks.vrchat import VrchatSink
@@ -49,6 +51,7 @@ _MODULES = {
     "DeviceError": "edgepose.errors",
     "EdgeposeError": "edgepose.errors",
     "FileFormatError": "edgepose.errors",
+    "GlbSink": "edgepose.sinks.glb",
     "ImuFrame": "edgepose.imu",
     "ImuSample": "edgepose.imu",
     "JOINTS": "edgepose.skeleton",
@@ -56,6 +59,7 @@ _MODULES = {
     "MocopiSink": "edgepose.sinks.mocopi",
     "Model": "edgepose.inference.model",
     "ModelError": "edgepose.errors",
+    "MotSink": "edgepose.sinks.opensim",
     "NpzSink": "edgepose.sinks.npz",
     "OutputConfig": "edgepose.config",
     "PLACEMENTS": "edgepose.placements",
@@ -64,6 +68,7 @@ _MODULES = {
     "Recording": "edgepose.imu",
     "Sink": "edgepose.sinks.base",
     "SourceConfig": "edgepose.config",
+    "StoSink": "edgepose.sinks.opensim",
     "UdpSink": "edgepose.sinks.udp",
     "VmcSink": "edgepose.sinks.vmc",
     "VrchatSink": "edgepose.sinks.vrchat",
@@ -86,12 +91,14 @@ __all__ = [
     "DeviceError",
     "EdgeposeError",
     "FileFormatError",
+    "GlbSink",
     "ImuFrame",
     "ImuSample",
     "LslSink",
     "MocopiSink",
     "Model",
     "ModelError",
+    "MotSink",
     "NpzSink",
     "OutputConfig",
     "Pipeline",
@@ -99,6 +106,7 @@ __all__ = [
     "Recording",
     "Sink",
     "SourceConfig",
+    "StoSink",
     "UdpSink",
     "VmcSink",
     "VrchatSink",

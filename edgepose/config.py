@@ -15,6 +15,7 @@ from typing import Any
 from edgepose.errors import ConfigError, EdgeposeError
 from edgepose.formats.poses.csv_columns import ROTATION_FORMATS
 from edgepose.imu import FILTERS
+from edgepose.pose import RATES
 from edgepose.sinks.output_files import check_output
 from edgepose.sinks.registry import SINKS
 from edgepose.skeleton import DEFAULT_HEIGHT, Body, default_body
@@ -106,6 +107,7 @@ class OutputConfig:
         height: the wearer's height, metres; None for that of the calibration, or an average one.
         leg_length: length of the wearer's thigh and shank, metres; None for the average at this height.
         overwrite: replace existing files.
+        rate: poses per second that are written, interpolated; None for the network's.
     """
 
     targets: tuple[tuple[str, Any], ...]
@@ -114,6 +116,7 @@ class OutputConfig:
     height: float | None
     leg_length: float | None
     overwrite: bool
+    rate: float | None
 
     def __init__(
         self,
@@ -124,6 +127,7 @@ class OutputConfig:
         height: float | None = None,
         leg_length: float | None = None,
         overwrite: bool = False,
+        rate: float | None = None,
         sinks: Mapping[str, str | list[str]] | None = None,
         **outputs: Any,
     ) -> None:
@@ -136,6 +140,7 @@ class OutputConfig:
             height: the wearer's height, metres.
             leg_length: length of the wearer's thigh and shank, metres.
             overwrite: replace existing files.
+            rate: poses per second that are written; None for the network's.
             sinks: targets of outputs from other packages (entry points `edgepose.sinks`), by output name; a
                 list of them for several.
             **outputs: targets of this package's outputs, as text or parsed; True for `view`. A list stands
@@ -165,7 +170,9 @@ class OutputConfig:
             raise ConfigError(
                 f"rotations: {rotations!r} is not one of {', '.join(map(repr, ROTATION_FORMATS))}"
             )
-        values = (tuple(pairs), rotations, std, height, leg_length, overwrite)
+        if rate is not None and not RATES[0] <= rate <= RATES[1]:
+            raise ConfigError(f"rate: {rate:g} is not from {RATES[0]:g} to {RATES[1]:g} poses per second")
+        values = (tuple(pairs), rotations, std, height, leg_length, overwrite, rate)
         for each, value in zip(dataclasses.fields(self), values, strict=True):
             object.__setattr__(self, each.name, value)
 
@@ -333,6 +340,7 @@ _KEYS = {
     "height": _NUMBER,
     "leg-length": _NUMBER,
     "overwrite": _SWITCH,
+    "rate": _NUMBER,
     "no-place": _SWITCH,
     "control": _TEXT,
 }

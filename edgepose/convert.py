@@ -5,17 +5,20 @@ from __future__ import annotations
 import multiprocessing
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 from edgepose.errors import EdgeposeError
+from edgepose.formats.gltf import write_glb
 from edgepose.formats.poses.missing_frames import fill_missing_frames
 from edgepose.formats.poses.npz_amass import write_npz as write_poses_npz
 from edgepose.formats.poses.registry import is_poses, pose_suffixes, salvage_poses
+from edgepose.formats.poses.resampling import resample
 from edgepose.formats.recordings.csv import write_csv
 from edgepose.formats.recordings.npz import write_npz
 from edgepose.formats.recordings.registry import (
@@ -27,16 +30,18 @@ from edgepose.formats.recordings.registry import (
 from edgepose.imu import Recording
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseSequence
-from edgepose.sinks.base import Sink
-from edgepose.sinks.bvh import BvhSink
-from edgepose.sinks.csv import CsvSink
+from edgepose.sinks.base import SinkContext
+from edgepose.sinks.registry import SINKS, sink_factory
 from edgepose.skeleton import default_body
 from edgepose.sources.replay import CAN_LOGS, CAPTURES, is_can_log
 from edgepose.sources.whole_file import read_file
 from edgepose.utils.durable_files import replace_file
+from edgepose.utils.output_targets import FileTarget
 
 WRITERS: dict[str, Callable[[Path, Recording], None]] = {"csv": write_csv, "npz": write_npz}
 """Writers of recordings, by ending."""
+
+_OF_POSES = {name for name, output in SINKS.items() if output.suffix} - WRITERS.keys()
 
 
 def _endings() -> tuple[str, ...]:
@@ -68,9 +73,9 @@ class Options(NamedTuple):
         height_m: the wearer's stature, for the bones of BVH files, metres.
         overwrite: replace existing files.
         unit: of lengths in BVH files to read, a key of `UNITS` in `formats.poses.bvh`; None infers it.
-        joints: number of joints in NPZ files of poses, a key of `JOINT_COUNTS`.
-        names: names of the joints in BVH files to write, a key of `BVH_NAMES`.
         leg_length_m: length of the wearer's thigh and shank, metres; None for the average at `height_m`.
+        form: options of the files of poses to write, see `Output` in `sinks.registry`; others have defaults.
+        rate: poses per second to write; None keeps those of the file.
     """
 
     protocol: str = "auto"
@@ -79,9 +84,9 @@ class Options(NamedTuple):
     height_m: float = 1.75
     overwrite: bool = True
     unit: str | None = None
-    joints: int = 24
-    names: str = "smpl"
     leg_length_m: float | None = None
+    form: Mapping[str, str] = MappingProxyType({})
+    rate: float | None = None
 
 
 _DEFAULTS = Options()
@@ -213,11 +218,13 @@ def _is_hidden(path: Path) -> bool:
 def convert(job: Job, options: Options = _DEFAULTS) -> Result:
     """Convert one file, keeping its good part if it is damaged."""
     try:
-        if job.target.suffix == ".bvh" or is_poses(job.source):
+        if job.target.suffix[1:] in _OF_POSES or is_poses(job.source):
             if options.filter != "none":
                 raise EdgeposeError(f"{job.source}: --filter is for recordings, not for poses; leave it out")
             _make_folder(job.target.parent)
             return Result(job, *convert_poses(job.source, job.target, options))
+        if options.rate is not None:
+            raise EdgeposeError(f"{job.source}: --rate is for poses, not for recordings; leave it out")
         recording = read_file(job.source, options.protocol, options.sensors)
         data = recording.sensors.values()
         if not data:
@@ -302,18 +309,24 @@ def _ignore_interrupts() -> None:
 
 
 def _write_poses(path: Path, poses: PoseSequence, options: Options) -> None:
-    if path.suffix == ".npz":
-        write_poses_npz(path, [poses], len(poses.frames), poses.rate, options.joints, poses.about)
-        return
-    sink: Sink
-    if path.suffix == ".bvh":
-        body = default_body(options.height_m, leg_length_m=options.leg_length_m)
-        sink = BvhSink(path, poses.rate, body, options.names)
+    kind = path.suffix[1:]
+    form = {name: options.form.get(name, values[0]) for name, values in SINKS[kind].options.items()}
+    body = default_body(options.height_m, leg_length_m=options.leg_length_m)
+    if kind == "npz":
+        write_poses_npz(path, [poses], len(poses.frames), poses.rate, int(form["joints"]), poses.about)
+    elif kind == "glb":
+        write_glb(path, [poses], len(poses.frames), poses.rate, body.offsets, form["names"], poses.about)
     else:
-        sink = CsvSink(path, translation=poses.translation is not None, contacts=poses.contacts is not None)
-    with sink:
-        for pose in poses.pose_frames():
-            sink.write(pose)
+        context = SinkContext(
+            body=body,
+            rate=poses.rate,
+            translation=poses.translation is not None,
+            contacts=poses.contacts is not None,
+            overwrite=True,  # of the temporary file
+        )
+        with sink_factory(kind)(FileTarget(str(path), form) if form else str(path), context) as sink:
+            for pose in poses.pose_frames():
+                sink.write(pose)
 
 
 def convert_poses(source: Path, target: Path, options: Options = _DEFAULTS) -> tuple[int, float, str | None]:
@@ -321,7 +334,7 @@ def convert_poses(source: Path, target: Path, options: Options = _DEFAULTS) -> t
 
     Args:
         source: file that `edgepose.formats.poses.registry.read_poses` reads.
-        target: .csv, .npz or .bvh file.
+        target: file with the ending of an output.
         options: options of the conversion.
 
     Returns:
@@ -332,15 +345,19 @@ def convert_poses(source: Path, target: Path, options: Options = _DEFAULTS) -> t
     """
     poses, damage = salvage_poses(source, options.unit)
     read = poses
-    if target.suffix != ".csv":  # the others hold no frame numbers, or programs ignore them
+    # Formats other than CSV hold no frame numbers, or programs ignore them.
+    if target.suffix != ".csv" or options.rate is not None:
         poses, missing = fill_missing_frames(poses, str(source))
         if missing:
             gaps = f"{source}: {missing} frames are missing between its poses; they are interpolated"
             damage = gaps if damage is None else f"{damage}; {gaps}"
+    if options.rate is not None:
+        poses = resample(poses, options.rate)
     replace_file(
         target, lambda path: _write_poses(path, poses, options), "poses", overwrite=options.overwrite
     )
-    return len(read.frames), float(read.time_s[-1] - read.time_s[0]), damage
+    count = len(read.frames) if options.rate is None else len(poses.frames)
+    return count, float(read.time_s[-1] - read.time_s[0]), damage
 
 
 def outcome(result: Result) -> str:

@@ -20,6 +20,9 @@ CONTACTS = (
 )  # fmt: skip
 """Joints whose contacts are estimated, in the order of all arrays; "foot" is the base of the toes."""
 
+RATES = (1.0, 1000.0)
+"""Lowest and highest rate of poses that can be asked for, Hz."""
+
 _ORDER = {name: i for i, name in enumerate(SITES)}
 
 

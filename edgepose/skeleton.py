@@ -33,6 +33,9 @@ PREDICTED = (1, 2, 3, 4, 5, 6, 9, 12, 13, 14, 15, 16, 17, 18, 19)
 UNOBSERVED = (1, 2, 3, 6, 9, 12, 13, 14, 16, 17)
 """Predicted joints whose segments carry no sensor."""
 
+TIPS = {10: (0, 0, 0.06), 11: (0, 0, 0.06), 15: (0, 0.18, 0), 22: (0.08, 0, 0), 23: (-0.08, 0, 0)}
+"""End points of the bones without a joint at their end: joint, and tip in its frame, metres."""
+
 
 def forward_kinematics(
     local: ArrayLike, offsets: ArrayLike, translation: ArrayLike | None = None

@@ -22,6 +22,7 @@ from edgepose.pipeline.calibrated_settings import age_days, check_settings, with
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.network import Network
 from edgepose.pipeline.place_stage import PlaceStage
+from edgepose.pipeline.pose_resampler import PoseResampler
 from edgepose.pipeline.remote_control import Request, Requests
 from edgepose.pipeline.rig_comparison import changes, missing_heading_reset, missing_quantities
 from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
@@ -99,7 +100,7 @@ class OpenWearer:
                 "edgepose": edgepose.__version__,
             }
             self._sinks = open_outputs(
-                *(stack, self._config.outputs, network.rate_hz, stopped),
+                *(stack, self._config.outputs, self._config.outputs.rate or network.rate_hz, stopped),
                 translation=not self._config.no_place,
                 contacts=not self._config.no_place and network.has_place,
                 wearer=self._config.name,
@@ -119,7 +120,7 @@ class OpenWearer:
             several: align the ticks of live wearers, so that their poses can be compared and batched.
             on_pose: called after each pose.
         """
-        source = self._config.source
+        source, outputs = self._config.source, self._config.outputs
         headings = HeadingRezero(
             self._calibration,
             hold_first=source.live and _restarts_with_filter(self._calibration),
@@ -128,7 +129,7 @@ class OpenWearer:
         )
         place = None
         if not self._config.no_place:
-            place = PlaceStage(self._config.outputs.body, partial(self._requests.poll, "origin"), self.notify)
+            place = PlaceStage(outputs.body, partial(self._requests.poll, "origin"), self.notify)
         return WearerPipeline(
             FrameSynchronizer(rate, grid=several and source.file is None),
             headings,
@@ -141,6 +142,7 @@ class OpenWearer:
             self.notify,
             future / rate if source.live else None,
             place,
+            None if outputs.rate is None else PoseResampler(outputs.rate, rate),
         )
 
     def _rezero_requests(self) -> list[float]:
@@ -168,6 +170,8 @@ class OpenWearer:
             f"packets  {counts.packets} good, {counts.lost} lost, {counts.bad} bad; "
             f"{pipeline.clock.dropped} samples too late or duplicate"
         )
+        if self._config.outputs.rate is not None:
+            self.notify(f"rate     written at {self._config.outputs.rate:g} poses per second")
         if pipeline.skipped:
             self.notify(f"skipped  {pipeline.skipped} poses at live outputs: they came too late")
         if pipeline.clock.restarts:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import inf
 
+from edgepose.pipeline.pose_resampler import PoseResampler
 from edgepose.pose import PoseFrame
 from edgepose.sinks.group import SinkGroup
 
@@ -25,7 +26,13 @@ class PoseWriter:
         skipped: poses that live outputs have skipped.
     """
 
-    def __init__(self, sinks: SinkGroup, look_ahead_s: float | None, notify: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        sinks: SinkGroup,
+        look_ahead_s: float | None,
+        notify: Callable[[str], None],
+        resampler: PoseResampler | None = None,
+    ) -> None:
         """Store the sinks.
 
         Args:
@@ -33,11 +40,12 @@ class PoseWriter:
             look_ahead_s: age of each pose on a machine without delay, seconds; None if poses have no age,
                 because the samples come from a file as fast as it is read.
             notify: called with a message when live outputs skip poses.
+            resampler: changes the rate of the poses; None keeps it.
         """
         self.skipped = 0
         self._sinks = sinks
         self._oldest_s = inf if look_ahead_s is None or not sinks.has_live else OLD_S + look_ahead_s
-        self._notify = notify
+        self._notify, self._resampler = notify, resampler
         self._reported_s = -inf  # time of the pose at the last report
 
     def write(self, pose: PoseFrame, age_s: float) -> None:
@@ -52,4 +60,5 @@ class PoseWriter:
             if pose.time_s - self._reported_s >= QUIET_S:
                 self._reported_s = pose.time_s
                 self._notify(f"poses are {age_s:.1f} s late; live outputs skip those older than {OLD_S:g} s")
-        self._sinks.write(pose, live=not is_old)
+        for each in [pose] if self._resampler is None else self._resampler.add(pose):
+            self._sinks.write(each, live=not is_old)

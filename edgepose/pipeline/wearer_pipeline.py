@@ -21,6 +21,7 @@ from edgepose.pipeline.dropout import extrapolate_dropouts
 from edgepose.pipeline.dropout_monitor import DropoutMonitor
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.place_stage import PlaceStage
+from edgepose.pipeline.pose_resampler import PoseResampler
 from edgepose.pipeline.pose_writer import PoseWriter
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseFrame
@@ -104,6 +105,7 @@ class WearerPipeline:
         warn: Callable[[str], None] = lambda text: None,
         look_ahead_s: float | None = None,
         place: PlaceStage | None = None,
+        resampler: PoseResampler | None = None,
     ) -> None:
         """Join the stages.
 
@@ -121,13 +123,14 @@ class WearerPipeline:
             look_ahead_s: time by which poses come later than their frames, seconds, if samples come at their
                 own pace; see `PoseWriter`.
             place: follows the wearer through the room; None leaves the poses without translation.
+            resampler: changes the rate of the poses that are written; None keeps that of the frames.
         """
         self.summary, self.clock = RunSummary(), clock
         self.arrived = self._started = time.perf_counter()
         self._headings, self._orient, self._notify = headings, orient, notify
         self._on_pose, self._misfits, self._rig, self._warn = on_pose, misfits, rig, warn
         self._sinks = SinkGroup(sinks, warn)
-        self._writer, self._place = PoseWriter(self._sinks, look_ahead_s, warn), place
+        self._writer, self._place = PoseWriter(self._sinks, look_ahead_s, warn, resampler), place
         self._dropouts = DropoutMonitor()
         self._source_s = 0.0  # time on the source's clock at 0 of the clock of `arrived`
         self._bones: NDArray[np.float64] | None = None  # those of the previous frame

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
 from pkgutil import resolve_name
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from edgepose.errors import ConfigError
 from edgepose.formats.bvh_names import BVH_NAMES
+from edgepose.formats.opensim import MODELS
 from edgepose.formats.poses.csv_columns import ROTATION_FORMATS
 from edgepose.formats.poses.npz_amass import JOINT_COUNTS
 from edgepose.utils.output_targets import FileTarget, parse_file, part_path
@@ -56,6 +56,7 @@ class Output:
         parse: makes the sink's target from that value. Raises ConfigError if the value has another form.
         form: class of the targets; a tuple of the first of its values stands for one.
         suffix: ending of its files, such as ".csv"; empty if it does not write to a file.
+        options: options that may follow a file's name, with their values, the default first; it may be empty.
         one_wearer: its receivers cannot tell several wearers apart.
         part: returns the name of the file that holds the poses during a run, given that of the output; None
             if there is no such file.
@@ -67,6 +68,7 @@ class Output:
     parse: Callable[[str], Any] = str
     form: Callable[..., Any] | None = None
     suffix: str = ""
+    options: Mapping[str, Sequence[str]] = field(default_factory=dict)
     one_wearer: bool = False
     part: Callable[[str], Path] | None = None
 
@@ -79,7 +81,7 @@ class Output:
         if self.metavar is None and value is not True:
             raise ConfigError(f"{value!r} is neither True nor False")
         if isinstance(value, str | Path):
-            return self.parse(str(value))
+            return parse_file(str(value), self.options) if self.options else self.parse(str(value))
         return value if self.form is None else self.form(*value)
 
     def file(self, target: Any) -> str:
@@ -87,31 +89,53 @@ class Output:
         return target.path if isinstance(target, FileTarget) else str(target)
 
 
-_JOINTS = tuple(map(str, JOINT_COUNTS))
+_NAMES = ", ".join(BVH_NAMES)
 
 SINKS = {
     "csv": Output(
         "edgepose.sinks.csv:open_sink",
         "Write poses as CSV; - is standard output. FORMAT is as in --rotations, which holds without it.",
         "FILE[,rotations=FORMAT]",
-        partial(parse_file, key="rotations", choices=tuple(ROTATION_FORMATS), default=""),
         suffix=".csv",
+        options={"rotations": ("", *ROTATION_FORMATS)},
     ),
     "npz": Output(
         "edgepose.sinks.npz:open_sink",
         "Write poses as NPZ with the keys of AMASS at the end. Numbers of joints: "
         f"{', '.join(f'{count} as in {model}' for count, model in JOINT_COUNTS.items())}.",
-        f"FILE[,joints={'|'.join(_JOINTS)}]",
-        partial(parse_file, key="joints", choices=_JOINTS),
+        f"FILE[,joints={'|'.join(map(str, JOINT_COUNTS))}]",
         suffix=".npz",
+        options={"joints": tuple(map(str, JOINT_COUNTS))},
         part=part_path,
     ),
     "bvh": Output(
         "edgepose.sinks.bvh:open_sink",
-        f"Write poses as BVH, for Blender and similar programs. Names of the joints: {', '.join(BVH_NAMES)}.",
-        "FILE[,names=SKELETON]",
-        partial(parse_file, key="names", choices=tuple(BVH_NAMES)),
+        f"Write poses as BVH, for Blender and similar programs. Names of the joints: {_NAMES}.",
+        "FILE[,names=SKELETON][,unit=cm|m][,start=t-pose]",
         suffix=".bvh",
+        options={"names": tuple(BVH_NAMES), "unit": ("cm", "m"), "start": ("motion", "t-pose")},
+    ),
+    "glb": Output(
+        "edgepose.sinks.glb:open_sink",
+        "Write a figure that moves as binary glTF at the end, for Blender and browsers. Names of its joints: "
+        f"{_NAMES}.",
+        "FILE[,names=SKELETON]",
+        suffix=".glb",
+        options={"names": tuple(BVH_NAMES)},
+        part=part_path,
+    ),
+    "sto": Output(
+        "edgepose.sinks.opensim:open_sto_sink",
+        "Write orientations of bodies for OpenSim.",
+        suffix=".sto",
+    ),
+    "mot": Output(
+        "edgepose.sinks.opensim:open_mot_sink",
+        "Write joint angles for OpenSim's full-body models. Flexed knees are positive with rajagopal, "
+        "negative with gait2392.",
+        f"FILE[,model={'|'.join(MODELS)}]",
+        suffix=".mot",
+        options={"model": tuple(MODELS)},
     ),
     "udp": Output(
         "edgepose.sinks.udp:open_sink",

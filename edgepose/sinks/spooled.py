@@ -7,8 +7,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from edgepose.pose import PoseFrame
-from edgepose.sinks.base import Sink
+from edgepose.sinks.base import Sink, SinkContext
 from edgepose.utils.output_streams import copy_to_stream
+from edgepose.utils.output_targets import is_stream
 
 
 class SpooledSink(Sink):
@@ -58,3 +59,19 @@ class SpooledSink(Sink):
             self._closed = True
             with self._folder:
                 self._sink.discard()
+
+
+def open_file_sink(path: str, make: Callable[[str | Path, bool], Sink], context: SinkContext) -> Sink:
+    """Open a sink for a file; a device or pipe gets the file once it is complete.
+
+    Args:
+        path: the file, device or pipe.
+        make: opens the sink for a file, given whether an existing one may be replaced.
+        context: settings of the run.
+
+    Raises:
+        EdgeposeError: the file cannot be opened.
+    """
+    if path != "-" and is_stream(path):
+        return SpooledSink(path, lambda part: make(part, True), context.stopped)
+    return make(path, context.overwrite)

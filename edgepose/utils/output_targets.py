@@ -11,7 +11,7 @@ import os
 import re
 import stat
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -89,9 +89,13 @@ def identity(name: str | Path) -> object:
         return os.path.realpath(name)
 
 
-def part_path(npz: str | Path) -> Path:
-    """Return the file that holds the poses for an NPZ file during a run."""
-    return Path(npz).with_name(f"{Path(npz).stem}.part.csv")
+def part_path(output: str | Path) -> Path:
+    """Return the file that grows during a run, for an output that is written at its end.
+
+    `walk.npz` grows as `walk.part.csv`, any other as in `walk.glb.part.csv`.
+    """
+    path = Path(output)
+    return path.with_name(f"{path.stem if path.suffix == '.npz' else path.name}.part.csv")
 
 
 def check_free(paths: Iterable[Path], hint: str) -> None:
@@ -111,31 +115,36 @@ def check_free(paths: Iterable[Path], hint: str) -> None:
 
 
 class FileTarget(NamedTuple):
-    """File to write, and the value of an option that follows its name after a comma."""
+    """File to write, and the values of the options that follow its name after commas."""
 
     path: str
-    option: str
+    options: Mapping[str, str]
 
 
-def parse_file(text: str, key: str, choices: Sequence[str], default: str | None = None) -> FileTarget:
-    """Parse "FILE[,key=value]".
+def parse_file(text: str, choices: Mapping[str, Sequence[str]]) -> FileTarget:
+    """Parse "FILE[,key=value ...]".
 
     Args:
-        text: the text.
-        key: name of the option.
-        choices: its values.
-        default: value of the option if it is not given; None for the first choice.
+        text: name of a file, which may hold commas, and options.
+        choices: possible values of each option; the first is the default.
 
     Raises:
-        ConfigError: an unknown key or value.
+        ConfigError: an unknown key or value, or an option given twice.
     """
-    path, comma, option = text.rpartition(",")
-    name, equals, value = option.partition("=")
-    if not (comma and equals and name.isidentifier()):  # a comma in the name of a file
-        return FileTarget(text, choices[0] if default is None else default)
-    if name != key or value not in choices or not path:
-        raise ConfigError(f"unknown option {option!r} of {path}: possible are {key}={'|'.join(choices)}")
-    return FileTarget(path, value)
+    path, options = text, dict[str, str]()
+    while True:
+        rest, comma, option = path.rpartition(",")
+        key, equals, value = option.partition("=")
+        if not (comma and equals and key.isidentifier()):  # a comma in the name of a file
+            break
+        if not value or value not in choices.get(key, ()) or not rest:
+            known = ", ".join(f"{name}={'|'.join(filter(None, values))}" for name, values in choices.items())
+            raise ConfigError(f"unknown option {option!r} of {rest}: possible are {known}")
+        if key in options:
+            raise ConfigError(f"{text}: the option {key} is given twice")
+        path = rest
+        options[key] = value
+    return FileTarget(path, {key: options.get(key, values[0]) for key, values in choices.items()})
 
 
 def is_stream(name: str | Path) -> bool:

@@ -9,20 +9,37 @@ from typing import TYPE_CHECKING
 import click
 
 from edgepose.cli.options.body import leg_length_option
-from edgepose.cli.options.outputs import overwrite_option
+from edgepose.cli.options.outputs import overwrite_option, rate_option
 from edgepose.cli.options.source import protocol_option, sensors_option
 from edgepose.cli.terminal.messages import has_terminal, printable, progress_bar, say, show
 from edgepose.errors import EdgeposeError
-from edgepose.formats.bvh_names import BVH_NAMES
 from edgepose.formats.poses.bvh import UNITS
-from edgepose.formats.poses.npz_amass import JOINT_COUNTS
 from edgepose.formats.poses.registry import READERS as POSES
 from edgepose.formats.recordings.registry import READERS as RECORDINGS
 from edgepose.sinks.output_files import check_output
-from edgepose.utils.output_targets import check_free
+from edgepose.sinks.registry import SINKS
+from edgepose.utils.output_targets import FileTarget, check_free, parse_file
+from edgepose.utils.similar_names import choices
 
 if TYPE_CHECKING:
     from edgepose.convert import Job, Result
+
+_FORMATS = {name: output.options for name, output in SINKS.items() if output.suffix}
+_OF_POSES = [name for name in _FORMATS if name not in ("csv", "npz")]
+
+
+def _format(ctx: click.Context, param: click.Parameter, value: str) -> FileTarget:
+    """Parse the value of --to: a name and options."""
+    name = value.partition(",")[0]
+    try:
+        if name not in _FORMATS:
+            raise EdgeposeError(f"unknown format {name!r}; {choices(name, _FORMATS)}")
+        target = parse_file(value, _FORMATS[name])
+        if target.path != name:
+            raise EdgeposeError(f"{value!r}: write options as {name},OPTION=VALUE")
+        return target
+    except EdgeposeError as error:
+        raise click.BadParameter(str(error)) from None
 
 
 @click.command()
@@ -32,8 +49,11 @@ if TYPE_CHECKING:
 @click.option(
     "--to",
     required=True,
-    type=click.Choice(["csv", "npz", "bvh"]),
-    help="Format to write; bvh is for poses only.",
+    callback=_format,
+    shell_complete=lambda ctx, param, typed: [name for name in _FORMATS if name.startswith(typed)],
+    metavar="FORMAT[,OPTION=VALUE ...]",
+    help=f"Format to write: csv or npz, and of poses also {', '.join(_OF_POSES)}. Those of poses take the "
+    "options of the flags of `run`: npz,joints=52 or bvh,names=unity,unit=m.",
 )
 @click.option(
     "--out",
@@ -54,7 +74,7 @@ if TYPE_CHECKING:
     type=float,
     default=1.75,
     show_default=True,
-    help="The wearer's height, metres, for the bones of BVH files.",
+    help="The wearer's height, metres, for the bones of BVH, GLB and MOT files.",
 )
 @leg_length_option
 @click.option(
@@ -62,21 +82,7 @@ if TYPE_CHECKING:
     type=click.Choice(list(UNITS)),
     help="Unit of lengths in the BVH files to read.  [default: inferred from the length of the shanks]",
 )
-@click.option(
-    "--joints",
-    type=click.Choice(list(map(str, JOINT_COUNTS))),
-    default="24",
-    show_default=True,
-    help="Number of joints in NPZ files of poses: "
-    f"{', '.join(f'{count} as in {model}' for count, model in JOINT_COUNTS.items())}.",
-)
-@click.option(
-    "--names",
-    type=click.Choice(list(BVH_NAMES)),
-    default="smpl",
-    show_default=True,
-    help="Names of the joints in BVH files.",
-)
+@rate_option
 @protocol_option
 @sensors_option
 @click.option(
@@ -90,14 +96,13 @@ if TYPE_CHECKING:
 @overwrite_option
 def convert(
     inputs: tuple[Path, ...],
-    to: str,
+    to: FileTarget,
     out: Path,
     filter: str,
     height: float,
     leg_length: float | None,
     unit: str | None,
-    joints: str,
-    names: str,
+    rate: float | None,
     protocol: str,
     sensors: Path | None,
     jobs: int,
@@ -111,16 +116,17 @@ def convert(
     --sensors maps their serial numbers as ids (id = 0x64F61CB3). The good part of a damaged recording is
     written, and the poses of a BVH file before the first bad one; the exit code is then 1.
 
-    Poses become CSV, NPZ or BVH. From a recording with true poses, such as DIP-IMU's, --to bvh takes these.
+    Poses become CSV, NPZ, BVH, GLB, STO or MOT. From a recording with true poses, such as DIP-IMU's, the last
+    four take these.
     - reads CSV from standard input.
 
     \b
     Examples:
       edgepose convert walk.npz --to csv --out .
       edgepose convert sessions/ "more/*.bin" --to npz --out recordings --jobs 4
-      edgepose convert walk.part.csv --to npz --out saved
       edgepose convert raw.csv --to npz --out oriented --filter smoother
-      edgepose convert poses/ --to bvh --out for-blender --jobs 2 --height 1.68
+      edgepose convert poses/ --to bvh,names=mixamo --out for-blender --jobs 2 --height 1.68
+      edgepose convert poses.csv --to npz,joints=52 --out amass --rate 30
       edgepose run ... --csv - | edgepose convert - --to bvh --out .
     """
     from edgepose.convert import Options, Result, convert_all, plan
@@ -133,12 +139,12 @@ def convert(
     default_body(height, leg_length_m=leg_length)
     if sensors is not None:
         read_map(sensors)
-    planned = plan(inputs, to, out)
+    planned = plan(inputs, to.path, out)
     done = {job: Result(job, skipped=True) for job in planned if skip_existing and job.target.exists()}
     todo = [job for job in planned if job not in done]
-    _check_targets(todo, to, overwrite)
+    _check_targets(todo, to.path, overwrite)
     try:
-        flags = protocol, sensors, filter, height, overwrite, unit, int(joints), names, leg_length
+        flags = protocol, sensors, filter, height, overwrite, unit, leg_length, to.options, rate
         for result in _with_progress(convert_all(todo, Options(*flags), jobs), len(todo)):
             done[result.job] = result
     finally:

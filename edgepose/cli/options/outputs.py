@@ -13,6 +13,7 @@ from edgepose.cli.options.gathered import Command, gathered
 from edgepose.config import OutputConfig
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.csv_columns import ROTATION_FORMATS
+from edgepose.pose import RATES
 from edgepose.sinks.registry import SINKS, Output
 from edgepose.skeleton import DEFAULT_HEIGHT
 from edgepose.utils.output_targets import identity, is_null
@@ -68,6 +69,14 @@ overwrite_option = click.option("--overwrite", is_flag=True, help="Replace exist
 """The flag --overwrite."""
 
 
+rate_option = click.option(
+    "--rate",
+    type=click.FloatRange(*RATES),
+    metavar="HZ",
+    help="Poses per second of all outputs, interpolated.  [default: the network's, or the file's]",
+)
+"""The flag --rate."""
+
 _rotations_option = click.option(
     "--rotations",
     type=click.Choice(list(ROTATION_FORMATS)),
@@ -87,8 +96,8 @@ def output_options(command: Command) -> Command:
     height_option = click.option(
         "--height",
         type=float,
-        help="The wearer's height, metres: for the length of their steps, and for the bones of --bvh, --osc, "
-        f"--vrchat, --mocopi and --view.  [default: the calibration's, or {DEFAULT_HEIGHT}]",
+        help="The wearer's height, metres: for the length of their steps, and for the bones of --bvh, --glb, "
+        f"--mot, --osc, --vrchat, --mocopi and --view.  [default: the calibration's, or {DEFAULT_HEIGHT}]",
     )
     other_sinks_option = click.option(
         "--sink",
@@ -100,7 +109,7 @@ def output_options(command: Command) -> Command:
     )
     flags = [
         *_flags(SINKS, {"csv": [_rotations_option, std_option]}),
-        *(height_option, leg_length_option, overwrite_option, other_sinks_option),
+        *(rate_option, height_option, leg_length_option, overwrite_option, other_sinks_option),
     ]
     return gathered(command, flags, "outputs", OutputConfig)
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from edgepose.errors import FileFormatError
+from edgepose.formats.poses.resampling import interpolate
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseSequence
-from edgepose.rotations import Array, matrix_to_quat, quat_to_matrix, slerp
 
 MOST_MISSING = 10
 """Frames per pose that may be missing; a file with more has other frame numbers than edgepose's."""
@@ -40,26 +37,7 @@ def fill_missing_frames(poses: PoseSequence, name: str) -> tuple[PoseSequence, i
     after = np.searchsorted(poses.frames, frames)
     before = np.where(poses.frames[after] == frames, after, after - 1)
     share = (frames - poses.frames[before]) / np.maximum(1, poses.frames[after] - poses.frames[before])
-    quats = matrix_to_quat(poses.rotations)
-    between = share > 0.0
-    rotations = poses.rotations[before].copy()
-    rotations[between] = quat_to_matrix(
-        slerp(quats[before[between]], quats[after[between]], share[between, None])
-    )
-
-    def linear(values: NDArray[Any], share: Array) -> Array:
-        return np.asarray(values[before] + share * (values[after] - values[before]))
-
-    translation, contacts = poses.translation, poses.contacts
     everything = frozenset(PLACEMENTS)
-    filled = PoseSequence(
-        frames,
-        linear(poses.time_s, share),
-        rotations,
-        None if translation is None else linear(translation, share[:, None]),
-        [everything if gap else poses.held[i] for i, gap in zip(before, between, strict=True)],
-        [poses.warming_up[i] for i in before],
-        poses.about,
-        None if contacts is None else linear(contacts, share[:, None]).astype(np.float32),
-    )
-    return filled, missing
+    filled = interpolate(poses, before, share)
+    held = [everything if gap else poses.held[i] for i, gap in zip(before, share > 0.0, strict=True)]
+    return filled._replace(frames=frames, held=held), missing

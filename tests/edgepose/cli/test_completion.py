@@ -34,7 +34,7 @@ def completions(line: str) -> list[str]:
     ("line", "offered"),
     [
         ("edgepose re", {"record", "report"}),
-        ("edgepose convert --to ", {"csv", "npz", "bvh"}),
+        ("edgepose convert --to ", {"csv", "npz", "bvh", "glb", "sto", "mot"}),
         ("edgepose run --o", {"--online", "--osc", "--overwrite"}),
         ("edgepose synth", {"synthesize"}),
     ],

@@ -489,7 +489,9 @@ def test_impossible_plans(tmp_path, monkeypatch, inputs, out, says):
 @pytest.mark.parametrize(
     ("words", "code", "says"),
     [
-        ("REAL --to fbx --out o", 2, "--to"),
+        ("REAL --to fbx --out o", 2, "unknown format 'fbx'"),
+        ("REAL --to npz,joints=53 --out o", 2, "possible are joints=24|52|55"),
+        ("REAL --to npz,52 --out o", 2, "write options as npz,OPTION=VALUE"),
         ("--to csv --out o", 2, "IN"),
         ("REAL --to csv --out o --protocol nonsense", 2, "unknown protocol 'nonsense'"),
         ("REAL --to csv --out o --jobs 0", 2, "--jobs"),

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from edgepose.convert import Job, Options, convert
 from edgepose.errors import EdgeposeError
 from edgepose.formats.bvh import read_bvh
 from edgepose.formats.joint_tree import forward
@@ -388,12 +389,26 @@ def test_a_bad_row_costs_only_itself(tmp_path, form):
     np.testing.assert_allclose(read.rotations, [poses(30)[i].rotations for i in good], atol=1e-5)
 
 
+@pytest.mark.parametrize(("ending", "form"), [("glb", {"names": "unity"}), ("sto", {}), ("mot", {})])
+def test_formats_that_are_only_written(tmp_path, ending, form):
+    source, target = write(tmp_path / "a.csv", where=True), tmp_path / f"a.{ending}"
+    result = convert(Job(source, target), Options(height_m=1.6, form=form))
+    assert (result.problem, result.samples) == (None, 20)
+    if ending == "glb":
+        assert b'"name":"LeftUpperArm"' in target.read_bytes()
+    else:
+        assert len(target.read_text().partition("endheader\n")[2].splitlines()) == 21
+    target.write_bytes(b"old")
+    assert "already exists" in convert(Job(source, target), Options(overwrite=False)).problem
+    assert target.read_bytes() == b"old"
+
+
 def test_flags_for_other_programs(command, tmp_path):
     write(tmp_path / "a.csv")
-    words = ("--to", "bvh", "--names", "unity", "--out", tmp_path / "unity")
+    words = ("--to", "bvh,names=unity", "--out", tmp_path / "unity")
     assert command("convert", tmp_path / "a.csv", *words).returncode == 0
     assert "LeftUpperArm" in read_bvh(tmp_path / "unity" / "a.bvh").names
-    words = ("--unit", "cm", "--to", "npz", "--joints", "52", "--out", tmp_path / "amass")
+    words = ("--unit", "cm", "--to", "npz,joints=52", "--out", tmp_path / "amass")
     assert command("convert", tmp_path / "unity" / "a.bvh", *words).returncode == 0
     assert np.load(tmp_path / "amass" / "a.npz")["poses"].shape == (20, 156)
     check(write(tmp_path / "b.csv"), 20)

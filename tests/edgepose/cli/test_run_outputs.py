@@ -30,12 +30,18 @@ def test_all_outputs_say_the_same(command, wearer, tmp_path):
             *("--vrchat", f"{vrchat.address},trackers=6", "--mocopi", mocopi.address),
             *("--calibration", wearer.calibration, "--model", "rnn"),
             *("--csv", tmp_path / "a.csv", "--npz", f"{tmp_path / 'a.npz'},joints=52"),
-            *("--bvh", tmp_path / "a.bvh"),
+            *("--bvh", tmp_path / "a.bvh", "--glb", tmp_path / "a.glb"),
+            *("--sto", tmp_path / "a.sto", "--mot", tmp_path / "a.mot"),
             *("--osc", mailbox.address, "--tcp", free_address(), "--height", "1.9"),
         )
     datagrams = mailbox.datagrams
     assert result.returncode == 0, result.stderr
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.bvh", "a.csv", "a.npz"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        f"a.{ending}" for ending in ("bvh", "csv", "glb", "mot", "npz", "sto")
+    ]
+    assert (tmp_path / "a.glb").read_bytes().startswith(b"glTF\2\0\0\0")
+    for name in ("a.sto", "a.mot"):
+        assert len((tmp_path / name).read_text().partition("endheader\n")[2].splitlines()) == 1 + 180
     poses = read_poses(tmp_path / "a.csv")
     assert len(poses.frames) == 180
     again = read_poses(tmp_path / "a.npz")
@@ -59,6 +65,25 @@ def test_all_outputs_say_the_same(command, wearer, tmp_path):
     assert len(vrchat.datagrams) == 180
     assert len(mocopi.datagrams) == 180 + 3
     assert {message.address for message in OscBundle(datagrams[0])} >= {"/VMC/Ext/OK", "/VMC/Ext/Bone/Pos"}
+
+
+def test_another_rate(command, wearer, tmp_path):
+    """Half of the poses in all outputs, whose files say so; a rig file has the key, too."""
+    rig = tmp_path / "anna.toml"
+    rig.write_text(
+        f"file = '{wearer.short}'\ncalibration = '{wearer.calibration}'\nrate = 30\n"
+        "csv = 'a.csv'\nnpz = 'a.npz'\nbvh = 'a.bvh,unit=m,start=t-pose'\n"
+    )
+    result = command("run", "--rig", rig, "--model", "rnn", "--runtime", "numpy")
+    assert result.returncode == 0, result.stderr
+    poses = read_poses(tmp_path / "a.csv")
+    assert (len(poses.frames), poses.rate) == (90, 30.0)
+    assert "rate     written at 30 poses per second" in result.stderr
+    assert np.load(tmp_path / "a.npz")["mocap_framerate"] == 30.0
+    tree = read_bvh(tmp_path / "a.bvh")
+    assert (len(tree.rotations), tree.rate) == (91, 30.0)
+    result = command("run", "--rig", rig, "--rate", "0.5")
+    assert result.returncode == 2
 
 
 @pytest.mark.parametrize("numbers", [(signal.SIGINT, signal.SIGTERM), (signal.SIGTERM, signal.SIGINT)])
@@ -116,6 +141,7 @@ def test_an_interrupted_run_leaves_whole_files(wearer, tmp_path, numbers):
             2,
             "unknown option 'joints=53' of a.npz: possible are joints=24|52|55",
         ),
+        (["--bvh", "a.bvh,unit=m,unit=cm"], 2, "the option unit is given twice"),
         (["--bvh", "a.bvh,names=maya"], 2, "possible are names=smpl|mixamo|unity|motionbuilder|rokoko"),
         (["--tcp", "192.0.2.1:8888"], 1, "cannot listen for viewers at 192.0.2.1 port 8888"),
         (["--bvh", "a.bvh", "--height", "175"], 1, "height 175 m is not between"),

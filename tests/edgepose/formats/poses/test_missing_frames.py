@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from edgepose.convert import Job, convert, convert_poses
+from edgepose.convert import Job, Options, convert, convert_poses
 from edgepose.errors import EdgeposeError
 from edgepose.formats.bvh import read_bvh
 from edgepose.formats.poses.registry import read_poses
@@ -16,6 +16,7 @@ from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseFrame
 from edgepose.sinks.csv import CsvSink
 
+REAL = Path(__file__).parents[3] / "data" / "imu" / "six-sites-3s.npz"
 COUNT = 240
 TURNS = Rotation.from_rotvec(np.cumsum(np.full((COUNT, 3), [0.02, -0.01, 0.03]), axis=0))
 
@@ -120,3 +121,27 @@ def test_quotes_around_the_names_of_columns(tmp_path):
     path.write_text(",".join(f'"{name}"' for name in header.split(",")) + "\n" + rest)
     result = convert(Job(path, tmp_path / "b.npz"))
     assert (result.problem, result.samples) == (None, COUNT)
+
+
+@pytest.mark.parametrize(("step", "rate"), [(1, 24.0), (1, 90.0), (2, 30.0), (2, 60.0)])
+def test_another_rate(tmp_path, step, rate):
+    """Of a file in which rows are missing, too; if only every second row was kept, 30 Hz are its own."""
+    kept = [i for i in range(0, COUNT, step) if i not in (40, 42, 44)]
+    write(tmp_path / "a.csv", kept)
+    for to in ("csv", "bvh"):
+        result = convert(Job(tmp_path / "a.csv", tmp_path / f"b.{to}"), Options(rate=rate))
+        missing = COUNT // step - len(kept)
+        assert f"{missing} frames are missing between its poses; they are interpolated" in result.problem
+        poses = read_poses(tmp_path / f"b.{to}")
+        seconds = kept[-1] / 60.0
+        assert len(poses.frames) == result.samples == int(seconds * rate + 1e-6) + 1
+        assert poses.rate == rate
+        places = 60.0 / rate * np.arange(len(poses.frames))
+        wanted = Slerp(kept, TURNS[kept])(places).as_matrix()
+        np.testing.assert_allclose(poses.rotations[:, 5], wanted, atol=1e-4)
+    assert read_poses(tmp_path / "b.csv").held[0] == frozenset()
+
+
+def test_a_recording_has_no_rate_of_poses(tmp_path):
+    result = convert(Job(REAL, tmp_path / "a.csv"), Options(rate=30.0))
+    assert result.problem.endswith("--rate is for poses, not for recordings; leave it out")

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from edgepose.convert import convert_poses
 from edgepose.errors import EdgeposeError, FileFormatError
 from edgepose.formats.bvh import read_bvh
+from edgepose.formats.bvh_names import BVH_NAMES
 from edgepose.formats.joint_tree import forward
 from edgepose.formats.poses.csv import BLOCK, read_blocks
 from edgepose.formats.poses.registry import is_poses, read_poses, salvage_poses
@@ -386,6 +387,24 @@ def test_bvh_by_an_independent_reader(tmp_path):
             error = np.linalg.norm(place - wanted[frame, JOINTS.index(joint.Name)])
             assert error < 1e-4, (frame, joint.Name)
     assert bvhio.readAsBvh(str(tmp_path / "a.bvh")).FrameTime == pytest.approx(1 / 60, abs=1e-8)
+
+
+def test_bvh_in_metres_with_a_t_pose_first(tmp_path):
+    poses = [pose._replace(translation=np.array([0.4, 0.9, -1.0])) for pose in motion(20)]
+    body = default_body(1.82)
+    written(BvhSink(tmp_path / "a.bvh", 60.0, body, "mixamo", "m", "t-pose"), poses)
+    root = bvhio.readAsHierarchy(str(tmp_path / "a.bvh"))
+    standing = forward_kinematics(np.tile(np.eye(3), (24, 1, 1)), body.offsets)[1]
+    standing += [0.4, -standing[:, 1].min(), -1.0]
+    for frame, wanted in ((0, standing), (1, joints(poses, body.offsets)[0])):
+        root.loadPose(frame)
+        for joint, _, _ in root.layout():
+            place = np.array(joint.PositionWorld.to_tuple())
+            index = BVH_NAMES["mixamo"].index(joint.Name)
+            assert np.linalg.norm(place - wanted[index]) < 2e-6, (frame, joint.Name)
+    assert len(bvhio.readAsBvh(str(tmp_path / "a.bvh")).Root.Keyframes) == 21
+    again = read_poses(tmp_path / "a.bvh")  # the unit shows in the shanks
+    np.testing.assert_allclose(again.translation[1:], [pose.translation for pose in poses], atol=1e-6)
 
 
 def test_bvh_by_the_reader_of_motion_capture(tmp_path):
