@@ -156,12 +156,8 @@ class OutputConfig:
             raise ConfigError(f"{min(own)} is not an output of another package: give --{min(own)}")
         given = [*targets, *((name, outputs[name]) for name in SINKS if name in outputs), *sinks.items()]
         several = [(name, value if isinstance(value, list) else [value]) for name, value in given]
-        pairs = [
-            (name, _target(name, value))
-            for name, values in several
-            for value in values
-            if value is not None and value is not False
-        ]
+        flat = ((name, value) for name, values in several for value in values)
+        pairs = [(name, _target(name, value)) for name, value in flat if value not in (None, False)]
         for i, (name, target) in enumerate(pairs):
             if (name, target) in pairs[:i]:
                 what = "" if target is True else " with the same target"
