@@ -324,7 +324,9 @@ def _write_poses(path: Path, poses: PoseSequence, options: Options) -> None:
             contacts=poses.contacts is not None,
             overwrite=True,  # of the temporary file
         )
-        with sink_factory(kind)(FileTarget(str(path), form) if form else str(path), context) as sink:
+        with sink_factory(kind)(
+            FileTarget(str(path), tuple(form.items())) if form else str(path), context
+        ) as sink:
             for pose in poses.pose_frames():
                 sink.write(pose)
 

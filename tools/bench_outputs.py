@@ -87,7 +87,9 @@ def motion(count: int, rate: float) -> list[PoseFrame]:
 
 def outputs(folder: Path, ports: dict[str, int], viewer: int, dead: bool) -> OutputConfig:
     """Return all outputs; their files are in a folder."""
-    given: dict[str, list[str]] = {name: [str(folder / f"poses.{name}")] for name in ("csv", "npz", "bvh")}
+    given: dict[str, list[str]] = {
+        name: [str(folder / f"poses.{name}")] for name in ("csv", "npz", "bvh", "glb", "sto", "mot")
+    }
     given |= {name: [f"127.0.0.1:{port}"] for name, port in ports.items()}
     given["tcp"] = [f"127.0.0.1:{viewer}"]
     if find_spec("pylsl") is not None:

@@ -144,7 +144,7 @@ class BvhSink(RowFileSink):
 
 def open_sink(target: FileTarget, context: SinkContext) -> Sink:
     """Open a `BvhSink`; a device or pipe gets the file once it is complete."""
-    names, unit, start = (target.options[key] for key in ("names", "unit", "start"))
+    names, unit, start = (target.option(key) for key in ("names", "unit", "start"))
     settings = context.rate, context.body, names, unit, start
     return open_file_sink(
         target.path, lambda path, overwrite: BvhSink(path, *settings, overwrite=overwrite), context

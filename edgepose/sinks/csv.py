@@ -86,7 +86,7 @@ class CsvSink(PoseFileSink):
 
 def open_sink(target: FileTarget, context: SinkContext) -> Sink:
     """Open a `CsvSink`."""
-    rotations = target.options["rotations"] or context.rotations
+    rotations = target.option("rotations") or context.rotations
     return CsvSink(
         *(target.path, rotations, context.std, context.translation, context.contacts),
         overwrite=context.overwrite,

@@ -52,7 +52,7 @@ class GlbSink(PartFileSink):
 
 def open_sink(target: FileTarget, context: SinkContext) -> Sink:
     """Open a `GlbSink`; a device or pipe gets the file once it is complete."""
-    settings = context.rate, context.body, target.options["names"], context.translation, context.about
+    settings = context.rate, context.body, target.option("names"), context.translation, context.about
     return open_file_sink(
         target.path, lambda path, overwrite: GlbSink(path, *settings, overwrite=overwrite), context
     )

@@ -52,7 +52,7 @@ class NpzSink(PartFileSink):
 def open_sink(target: FileTarget, context: SinkContext) -> Sink:
     """Open an `NpzSink`; a device or pipe gets the file once it is complete."""
     place = context.translation, context.contacts
-    settings = context.rate, *place, int(target.options["joints"]), context.about
+    settings = context.rate, *place, int(target.option("joints")), context.about
     return open_file_sink(
         target.path, lambda path, overwrite: NpzSink(path, *settings, overwrite=overwrite), context
     )

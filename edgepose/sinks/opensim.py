@@ -107,7 +107,7 @@ def open_sto_sink(target: str, context: SinkContext) -> Sink:
 
 def open_mot_sink(target: FileTarget, context: SinkContext) -> Sink:
     """Open a `MotSink`; a device or pipe gets the file once it is complete."""
-    settings = context.body, target.options["model"]
+    settings = context.body, target.option("model")
     return open_file_sink(
         target.path, lambda path, overwrite: MotSink(path, *settings, overwrite=overwrite), context
     )

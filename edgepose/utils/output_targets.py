@@ -118,7 +118,11 @@ class FileTarget(NamedTuple):
     """File to write, and the values of the options that follow its name after commas."""
 
     path: str
-    options: Mapping[str, str]
+    options: tuple[tuple[str, str], ...]
+
+    def option(self, key: str) -> str:
+        """Return the value of an option."""
+        return dict(self.options)[key]
 
 
 def parse_file(text: str, choices: Mapping[str, Sequence[str]]) -> FileTarget:
@@ -144,7 +148,7 @@ def parse_file(text: str, choices: Mapping[str, Sequence[str]]) -> FileTarget:
             raise ConfigError(f"{text}: the option {key} is given twice")
         path = rest
         options[key] = value
-    return FileTarget(path, {key: options.get(key, values[0]) for key, values in choices.items()})
+    return FileTarget(path, tuple((key, options.get(key, values[0])) for key, values in choices.items()))
 
 
 def is_stream(name: str | Path) -> bool:

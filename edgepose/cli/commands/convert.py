@@ -144,7 +144,7 @@ def convert(
     todo = [job for job in planned if job not in done]
     _check_targets(todo, to.path, overwrite)
     try:
-        flags = protocol, sensors, filter, height, overwrite, unit, leg_length, to.options, rate
+        flags = protocol, sensors, filter, height, overwrite, unit, leg_length, dict(to.options), rate
         for result in _with_progress(convert_all(todo, Options(*flags), jobs), len(todo)):
             done[result.job] = result
     finally:
