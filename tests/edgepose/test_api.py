@@ -164,7 +164,7 @@ def test_outputs_by_name():
         csv=Path("a.csv"), udp="[::1]:9000,format=binary", view=True, osc=None, sinks={"mine": "x"}
     )
     assert outputs.targets == (
-        ("csv", ("a.csv", "")),
+        ("csv", ("a.csv", (("rotations", ""),))),
         ("udp", ("::1", 9000, "binary", "")),
         ("view", True),
         ("mine", "x"),
@@ -185,7 +185,7 @@ def test_several_outputs_of_a_kind():
         sinks={"m": ["x", "y"]},
     )
     assert outputs.targets == (
-        *(("csv", ("a.csv", "")), ("csv", ("b.csv", "quat"))),
+        *(("csv", ("a.csv", (("rotations", ""),))), ("csv", ("b.csv", (("rotations", "quat"),)))),
         *(("udp", ("127.0.0.1", port, "json", "")) for port in (1, 2)),
         *(("m", "x"), ("m", "y")),
     )
