@@ -6,9 +6,10 @@ are in radians, except those whose names end in `_deg`, which are for people to 
 
 from edgepose.calibration.body_frame import body_from_inertial, check_body_frame
 from edgepose.calibration.checks import HoldError, HoldSummary, MovedError, check_covered, check_hold
-from edgepose.calibration.functional import EXERCISE_S, ROUTINE, WeakMotionError, headings_from_motion
+from edgepose.calibration.functional import EXERCISE_S, ROUTINE, headings_from_motion
 from edgepose.calibration.heading_reset import (
     HeadingReset,
+    WeakMotionError,
     headings_from_axis,
     headings_from_mounting,
     headings_from_pose,
@@ -26,6 +27,7 @@ from edgepose.calibration.static_pose import (
     stillest_start,
     trim,
 )
+from edgepose.calibration.steps import STEPS_S, headings_from_steps
 from edgepose.imu import GRAVITY
 
 __all__ = [
@@ -33,6 +35,7 @@ __all__ = [
     "GRAVITY",
     "POSES",
     "ROUTINE",
+    "STEPS_S",
     "Calibration",
     "HeadingReset",
     "Hold",
@@ -53,6 +56,7 @@ __all__ = [
     "headings_from_motion",
     "headings_from_mounting",
     "headings_from_pose",
+    "headings_from_steps",
     "headings_side_by_side",
     "hold_from_recording",
     "hold_from_samples",

@@ -13,9 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from edgepose import rotations as rot
-from edgepose.calibration.heading_reset import HeadingReset
+from edgepose.calibration.heading_reset import HeadingReset, WeakMotionError
 from edgepose.calibration.static_pose import Hold, check_reported
-from edgepose.errors import CalibrationError
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 
@@ -25,10 +24,6 @@ MIN_LEAN_DEG = 6.0
 SPREAD_WARNING_DEG, SPREAD_LIMIT_DEG = 30.0, 40.0
 ONE_WAY = 0.4
 """Smallest surplus of lean to one side, as a share; with less, forward cannot be told from back."""
-
-
-class WeakMotionError(CalibrationError):
-    """Motion that shows no heading; the wearer can try again with clearer movements."""
 
 
 class Exercise(NamedTuple):
@@ -63,10 +58,10 @@ def headings_from_motion(moving: Hold, upright: Array) -> HeadingReset:
         WeakMotionError: a sensor was moved too little, in all directions, or forward as much as back.
     """
     check_reported(moving)
-    leans = [_leans(s.quat, mean) for s, mean in zip(moving, upright, strict=True)]
+    lean_of = [leans(s.quat, mean) for s, mean in zip(moving, upright, strict=True)]
     forward, spread, wrong = [], [], []
-    for name, lean in zip(PLACEMENTS, leans, strict=True):
-        direction, spread_deg, one_way = _direction(lean)
+    for name, lean in zip(PLACEMENTS, lean_of, strict=True):
+        direction, spread_deg, one_way = main_direction(lean)
         reach = np.degrees(np.arcsin(min(1.0, np.percentile(np.linalg.norm(lean, axis=-1), 98))))
         if reach < MIN_LEAN_DEG:
             wrong.append(f"{name} leaned by only {reach:.0f} deg")
@@ -87,17 +82,17 @@ def headings_from_motion(moving: Hold, upright: Array) -> HeadingReset:
         for name, spread_deg in zip(PLACEMENTS, spread, strict=True)
         if spread_deg > SPREAD_WARNING_DEG
     ]
-    warnings += _wrong_order([s.time_s for s in moving], leans)
+    warnings += _wrong_order([s.time_s for s in moving], lean_of)
     return HeadingReset(-np.arctan2(ahead[:, 1], ahead[:, 0]), np.array(spread), warnings)
 
 
-def _leans(quat: Array, upright: Array) -> Array:
+def leans(quat: Array, upright: Array) -> Array:
     """Return the level part (n, 2), in I, of the axis that was vertical in the straight pose."""
     vertical = rot.quat_rotate(rot.quat_conjugate(upright), [0.0, 0.0, 1.0])
     return rot.quat_rotate(quat, vertical)[:, :2]
 
 
-def _direction(lean: Array) -> tuple[Array, float, float]:
+def main_direction(lean: Array) -> tuple[Array, float, float]:
     """Return the main direction (2,) of lean, the spread about its line in degrees, and its surplus.
 
     The surplus is the share by which the lean to one side of the line exceeds that to the other. Direction

@@ -27,6 +27,10 @@ MOUNTING_TILT_LIMIT_DEG = 45.0
 AXIS_LIMIT_DEG = 45.0  # of an axis that should be level
 
 
+class WeakMotionError(CalibrationError):
+    """Motion that shows no heading; the wearer can try again with clearer movements."""
+
+
 class HeadingReset(NamedTuple):
     """Heading offsets of six sensors.
 
@@ -34,6 +38,7 @@ class HeadingReset(NamedTuple):
         offset: (6,) rotation about Z from each sensor's inertial frame to the common one, rad, -pi to pi.
         error_deg: (6,) uncertainty of each, degrees. Side by side, mounting and pose: the remaining tilt,
             which no rotation about Z can remove. Motion: RMS spread of the directions of its movements.
+            Steps: estimated from the ways.
         warnings: one line each, naming the sensor.
     """
 
@@ -58,7 +63,7 @@ def headings_side_by_side(still: Hold) -> HeadingReset:
     """
     mean = check_hold(still, "leave the sensors alone and repeat the heading reset").orientation
     reset = turn_about_z(mean, mean[ROOT])
-    if crooked := _over(reset.error_deg, RESET_TILT_LIMIT_DEG):
+    if crooked := over(reset.error_deg, RESET_TILT_LIMIT_DEG):
         raise CalibrationError(
             f"not lying like the {PLACEMENTS[ROOT]} sensor: {crooked}; "
             "lay all six side by side, same face up, same edge forward, and repeat the heading reset"
@@ -78,7 +83,7 @@ def headings_from_mounting(orientation: Array, mounting: Sequence[str]) -> Headi
     """
     mounted = np.stack([rotation_of(words) for words in mounting])
     reset = turn_about_z(orientation, rot.matrix_to_quat(_facing_x().T @ mounted))
-    if wrong := _over(reset.error_deg, MOUNTING_TILT_LIMIT_DEG):
+    if wrong := over(reset.error_deg, MOUNTING_TILT_LIMIT_DEG):
         raise CalibrationError(
             f"not mounted as the sensor map says, judged by gravity: {wrong}; "
             "is it upside down, or swapped with another one?"
@@ -95,7 +100,7 @@ def headings_from_axis(orientation: Array, axis: str) -> HeadingReset:
     sign = -1.0 if axis.startswith("-") else 1.0
     forward = sign * rot.quat_to_matrix(orientation)[:, :, "xyz".index(axis[-1])]
     slope = np.array([abs(90.0 - tilt_deg(v)) for v in forward])
-    if steep := _over(slope, AXIS_LIMIT_DEG):
+    if steep := over(slope, AXIS_LIMIT_DEG):
         raise CalibrationError(
             f"axis {axis} does not face forward: {steep} from level; "
             "name the axis that does, or give each sensor its mounting in the sensor map"
@@ -123,7 +128,7 @@ def _facing_x() -> Array:
     return body_from_inertial(np.zeros((len(PLACEMENTS), 4)), "heading:0")
 
 
-def _over(angle_deg: Array, limit_deg: float) -> str:
+def over(angle_deg: Array, limit_deg: float) -> str:
     """List the sensors whose angle is over a limit, with the angle, for a message."""
     return ", ".join(
         f"{name} ({angle:.0f} deg)"

@@ -14,7 +14,14 @@ from edgepose.calibration import HeadingReset, Hold, HoldSummary
 from edgepose.cli.guide.guide import Guide
 from edgepose.cli.guide.stage import LISTEN, Stage
 from edgepose.cli.options.recording_time import RecordingTime
-from edgepose.cli.prompts import collect, record_hold, record_motion, wait_for_all_sensors, wait_for_start
+from edgepose.cli.prompts import (
+    collect,
+    record_hold,
+    record_motion,
+    record_steps,
+    wait_for_all_sensors,
+    wait_for_start,
+)
 from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.base import iter_samples
@@ -41,7 +48,7 @@ ROUTINE_S = 30.0
 
 def finds_forward(heading_reset: str | None) -> bool:
     """Return whether this kind of heading reset also finds the direction that the wearer faces."""
-    return heading_reset is not None and heading_reset.partition(":")[0] in ("motion", "mounting")
+    return heading_reset is not None and heading_reset.partition(":")[0] in ("motion", "mounting", "steps")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +58,7 @@ class CalibrationPlan:
     Attributes:
         pose: pose of the hold.
         body_frame: the direction that the wearer faces; None is the default for the heading reset.
-        heading_reset: "live", "motion", "mounting[:AXIS]" or a file; None for none.
+        heading_reset: "live", "motion", "steps", "mounting[:AXIS]" or a file; None for none.
         motion: start and end of the movements in a recording.
         hold_s: length of the hold, seconds.
         start: start of the hold in a recording; None looks for the stillest part.
@@ -134,6 +141,14 @@ def measure_live(
                 guide,
                 lambda moving: calibration.headings_from_motion(moving, upright),
             )
+        elif plan.heading_reset == "steps":
+            upright = summary.orientation
+            reset = record_steps(
+                batches,
+                plan.countdown_s,
+                guide,
+                lambda moving: calibration.headings_from_steps(moving, upright),
+            )
     return Measured(summary, reset or _mounted(plan, summary), None, opened.devices, damaged)
 
 
@@ -180,17 +195,26 @@ def measure_recorded(
     if plan.heading_reset == "motion":
         moving = _movements(source.name, everything, plan, start_s + plan.hold_s)
         reset = calibration.headings_from_motion(moving, summary.orientation)
+    elif plan.heading_reset == "steps":
+        moving = _movements(source.name, everything, plan, start_s)  # with the stand before the steps
+        reset = calibration.headings_from_steps(moving, summary.orientation, must_stop=False)
     reset = reset or _mounted(plan, summary)
     return Measured(summary, reset, start_s, devices, damaged or damage is not None)
 
 
-def _movements(name: str, everything: Hold, plan: CalibrationPlan, hold_end_s: float) -> Hold:
+def _movements(name: str, everything: Hold, plan: CalibrationPlan, begin_s: float) -> Hold:
     """Return the part of a recording with the movements of a heading reset.
+
+    Args:
+        name: of the recording.
+        everything: its samples.
+        plan: of the calibration.
+        begin_s: start of the movements without --motion, on the recording's clock, seconds.
 
     Raises:
         EdgeposeError: the recording does not contain it, or a sensor reports nothing in it.
     """
-    span = hold_end_s, hold_end_s + ROUTINE_S
+    span = begin_s, begin_s + ROUTINE_S
     if plan.motion is not None:
         first_s, last_s = _extent(everything)
         start_s, end_s = (time.on_clock(first_s) for time in plan.motion)

@@ -29,6 +29,8 @@ _INSTRUCTIONS = {
     "lying": "Lay all six sensors side by side, same face up, same edge forward, and let go of them.",
 }
 
+_STEPS = "Take two or three steps straight ahead, stop with arms hanging, and stand still."
+
 _MOVES = {
     "head": ("BOW", "bow"),
     "left_forearm": ("LEFT", "forearm"),
@@ -149,16 +151,52 @@ def record_motion(
     """
     guide.instruct("Keep facing the same way and follow the instructions.")
     wait_s = min(countdown_s, MOVE_COUNTDOWN_S)
-    for left in range(REPEATS, -1, -1):
-        samples = []
+
+    def movements() -> Iterator[ImuSample]:
         for exercise in calibration.ROUTINE:
             word, figure = _MOVES[exercise.sensors[0]]
             text = exercise.text
             if wait_s:
                 collect(batches, Stage(COUNTDOWN, "", text, figure, wait_s), guide)
-            samples += collect(batches, Stage(MOVE, word, text, figure, calibration.EXERCISE_S), guide)[0]
+            yield from collect(batches, Stage(MOVE, word, text, figure, calibration.EXERCISE_S), guide)[0]
+
+    return _until_clear(movements, guide, check)
+
+
+def record_steps(
+    batches: Iterator[Batch], countdown_s: float, guide: Guide, check: Callable[[Hold], Any]
+) -> Any:
+    """Record some steps, with the stand before them, and return what `check` returns for them.
+
+    Args:
+        batches: samples of the live source.
+        countdown_s: time before the hold, seconds; that before the steps is `MOVE_COUNTDOWN_S` at most.
+        guide: shows the wearer what to do.
+        check: evaluates the steps; if it raises WeakMotionError, they are repeated.
+
+    Raises:
+        WeakMotionError: every repetition was refused.
+        EdgeposeError: the source ended too early.
+    """
+    guide.instruct(f"Stand still until the steps begin. {_STEPS}")
+    wait_s = min(countdown_s, MOVE_COUNTDOWN_S) or 1.0  # the stand before the steps is needed
+    stand = Stage(COUNTDOWN, "", f"Stand still. Then: {_STEPS}", "step", wait_s)
+    walk = Stage(MOVE, "STEPS", _STEPS, "step", calibration.STEPS_S)
+
+    def steps() -> Iterator[ImuSample]:
+        for stage in (stand, walk):
+            yield from collect(batches, stage, guide)[0]
+
+    return _until_clear(steps, guide, check)
+
+
+def _until_clear(
+    record: Callable[[], Iterator[ImuSample]], guide: Guide, check: Callable[[Hold], Any]
+) -> Any:
+    """Record movements until `check` accepts them, and return what it returns for them."""
+    for left in range(REPEATS, -1, -1):
         try:
-            return check(calibration.hold_from_samples(samples))
+            return check(calibration.hold_from_samples(record()))
         except WeakMotionError as error:
             if not left:
                 raise

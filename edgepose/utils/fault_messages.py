@@ -15,7 +15,7 @@ GRAVITY_SCALE_LIMIT = 0.05
 NO_GRAVITY_M_S2 = 0.5
 """Acceleration at rest below which gravity has been removed, m/s^2."""
 
-HEADING_RESETS = "--heading-reset motion, live or mounting"
+HEADING_RESETS = "--heading-reset steps, motion, live or mounting"
 """Advice for headings that no reset aligns."""
 
 JUMPS_OF_TWO = 20

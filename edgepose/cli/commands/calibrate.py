@@ -93,20 +93,20 @@ _PLAN_FLAGS = [
     click.option(
         "--heading-reset",
         callback=_heading_reset,
-        metavar="FILE|live|motion|mounting[:AXIS]",
+        metavar="FILE|live|motion|steps|mounting[:AXIS]",
         help="Align the headings of sensors without a common north. FILE: by a recording of all six "
         "lying side by side in one orientation. live: the same, with the sensors themselves. motion: by "
-        "movements after the hold. mounting: by the mountings in the sensor map. mounting:AXIS: by this "
-        "axis of every sensor, which faces forward in the pose.  [default: none, the sensors share a "
-        "north]",
+        "movements after the hold. steps: by some steps straight ahead after the hold. mounting: by the "
+        "mountings in the sensor map. mounting:AXIS: by this axis of every sensor, which faces forward in "
+        "the pose.  [default: none, the sensors share a north]",
     ),
     click.option(
         "--motion",
         callback=_span,
         metavar="FROM:TO",
-        help="Start and end of the movements for --heading-reset motion on the clock of --file, "
-        f"seconds; with a plus sign, since its start.  [default: up to {ROUTINE_S:g} s from the end of the "
-        "hold on]",
+        help="Start and end of the movements for --heading-reset motion, or of the stand, the steps and the "
+        "stand for steps, on the clock of --file, seconds; with a plus sign, since its start.  [default: up "
+        f"to {ROUTINE_S:g} s from the end of the hold on; for steps from its start on]",
     ),
     click.option(
         "--hold",
@@ -304,10 +304,13 @@ def _check_use(source: SourceConfig, plan: CalibrationPlan, page: tuple[str, int
         raise click.UsageError(
             f"--heading-reset live needs {_LINES}; give a recording of the sensors lying side by side instead"
         )
-    if plan.motion is not None and plan.heading_reset != "motion":
-        raise click.UsageError("--motion needs --heading-reset motion")
-    if plan.heading_reset == "motion" and plan.pose != "straight":
-        raise click.UsageError("--heading-reset motion starts with hanging arms: use --pose straight")
+    moves = plan.heading_reset in ("motion", "steps")
+    if plan.motion is not None and not moves:
+        raise click.UsageError("--motion needs --heading-reset motion or steps")
+    if moves and plan.pose == "t-pose":
+        raise click.UsageError(
+            f"--heading-reset {plan.heading_reset} starts with hanging arms: use --pose straight"
+        )
 
 
 def _all_mountings(mountings: Mapping[str, str | None]) -> list[str]:

@@ -16,7 +16,7 @@ class Stage(NamedTuple):
         kind: one of the kinds above.
         word: the same in one word of at most five letters; a countdown shows its seconds instead.
         text: the same in a sentence.
-        figure: key of the picture: a pose, "lying", "bow", "forearm" or "heel".
+        figure: key of the picture: a pose, "lying", "bow", "forearm", "heel" or "step".
         total_s: its length, seconds; 0 if it waits for the wearer.
         what: a line of text for each second of a countdown; empty for one line at its beginning.
     """

@@ -1,0 +1,146 @@
+"""Ways of sensors during a walk, from their accelerations integrated twice between two stands."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from edgepose import rotations as rot
+from edgepose.calibration.heading_reset import WeakMotionError
+from edgepose.calibration.static_pose import Hold, SensorHold
+from edgepose.errors import CalibrationError
+from edgepose.placements import PLACEMENTS
+from edgepose.rotations import Array
+
+LONGEST_S, LONGEST_OPEN_S = 10.0, 4.5
+"""Longest walk from stand to stand, and longest used part of one without a stop; errors grow with time."""
+
+STAND_S = 0.8
+"""Shortest stand, seconds."""
+
+_EDGE_S = 0.3  # part of a stand that counts as walking, because movement starts slowly
+_TURN_S, _STILL_DEG = 0.3, 3.0  # a sensor is still if it turns by less in this time
+_HEAD_STILL_DEG = 9.0  # wearers look around
+_GRID_S = 0.05
+_GAP_S = 0.15  # longest time without a sample
+_STRIDE_S = 1.1
+
+
+class Walk(NamedTuple):
+    """A walk that starts from a stand.
+
+    Attributes:
+        start_s: its start, on the clock of the samples, seconds.
+        end_s: its end.
+        stops: whether the wearer stands still after it.
+        ways: (6, 3) way of each sensor in its own inertial frame, metres; without a stop, its mean over the
+            last stride.
+    """
+
+    start_s: float
+    end_s: float
+    stops: bool
+    ways: Array
+
+    @property
+    def lengths_m(self) -> Array:
+        """Lengths (6,) of the level ways, metres."""
+        return np.linalg.norm(self.ways[:, :2], axis=1)
+
+    @property
+    def length_m(self) -> float:
+        """Length of the level way of most sensors, metres."""
+        return float(np.median(self.lengths_m))
+
+
+def find_walk(moving: Hold, must_stop: bool) -> Walk:
+    """Return the longest way from stand to stand; without one, that of the first seconds after a stand.
+
+    Args:
+        moving: samples with orientation of a wearer who stands, walks and stands.
+        must_stop: refuse a walk without a stand after it.
+
+    Raises:
+        WeakMotionError: there is no stand before the walk, or none after it.
+        CalibrationError: a sensor measures no acceleration, or lost samples.
+    """
+    sensors = [_complete(sensor) for sensor in moving]
+    if without := [n for n, s in zip(PLACEMENTS, sensors, strict=True) if len(s.time_s) < 2]:
+        raise CalibrationError(f"no acceleration from {', '.join(without)}: use another --heading-reset")
+    stands = list(_stands(sensors))
+    if not stands:
+        raise WeakMotionError("the wearer did not stand still before the steps; first stand for a second")
+    between = [(a[1], b[0]) for a, b in pairwise(stands) if b[0] - a[1] < LONGEST_S]
+    walks = [_walk(sensors, start, end, True) for start, end in between]
+    longest = max(walks, key=lambda walk: walk.length_m, default=None)
+    last = min(s.time_s[-1] for s in sensors)
+    if longest is None or (not must_stop and longest.length_m < 0.3):
+        starts = [end for _, end in stands if last - end > 2.0 * _STRIDE_S]
+        if must_stop or not starts:
+            what = "did not stand still after the steps" if starts else "did not take a step"
+            raise WeakMotionError(
+                f"the wearer {what}; take two or three steps straight ahead, and stand still until the end"
+            )
+        return _walk(sensors, starts[0], min(starts[0] + LONGEST_OPEN_S, last), False)
+    return longest
+
+
+def _complete(sensor: SensorHold) -> SensorHold:
+    """Return the samples with an acceleration, in the order of time."""
+    order = np.argsort(sensor.time_s, kind="stable")
+    order = order[np.isfinite(sensor.acc[order]).all(axis=1)]
+    order = order[np.diff(sensor.time_s[order], prepend=-np.inf) > 0.0]
+    return SensorHold(*(column[order] for column in sensor))
+
+
+def _stands(sensors: Hold) -> Iterator[tuple[float, float]]:
+    """Yield start and end of the times in which no sensor turns, without their edges."""
+    first, last = max(s.time_s[0] for s in sensors), min(s.time_s[-1] for s in sensors)
+    grid = np.arange(first, last - _TURN_S, _GRID_S)
+    still = np.ones(len(grid), bool)
+    for name, s in zip(PLACEMENTS, sensors, strict=True):
+        one, other = (s.quat[np.searchsorted(s.time_s, times)] for times in (grid, grid + _TURN_S))
+        turned = 2.0 * np.arccos(np.clip(np.abs(np.sum(one * other, axis=1)), 0.0, 1.0))
+        still &= np.degrees(turned) < (_HEAD_STILL_DEG if name == "head" else _STILL_DEG)
+    edges = np.flatnonzero(np.diff(still.astype(int), prepend=0, append=0)).reshape(-1, 2)
+    for begin, end in edges:
+        # The edges of the samples are no edges of the stand.
+        start_s = first if begin == 0 else grid[begin] + _EDGE_S
+        end_s = last if end == len(grid) else grid[end - 1] + _TURN_S - _EDGE_S
+        if end_s - start_s > STAND_S - 2.0 * _EDGE_S:
+            yield float(start_s), float(end_s)
+
+
+def _walk(sensors: Hold, start_s: float, end_s: float, stops: bool) -> Walk:
+    gaps = [np.diff(s.time_s[(s.time_s >= start_s) & (s.time_s <= end_s)]).max(initial=0.0) for s in sensors]
+    if lossy := [f"{n} for {gap:.2f} s" for n, gap in zip(PLACEMENTS, gaps, strict=True) if gap > _GAP_S]:
+        raise CalibrationError(
+            f"silent during the steps: {', '.join(lossy)}; check power and link, and repeat"
+        )
+    ways = [_way(sensor, start_s, end_s, stops) for sensor in sensors]
+    return Walk(start_s, end_s, stops, np.array(ways))
+
+
+def _way(sensor: SensorHold, start_s: float, end_s: float, stops: bool) -> Array:
+    """Return the way (3,) of one sensor in its inertial frame, metres."""
+    time_s = sensor.time_s
+    force = rot.quat_rotate(sensor.quat, sensor.acc)
+    rows = (time_s >= start_s) & (time_s <= end_s)
+    t = time_s[rows] - start_s
+    share = (t / t[-1])[:, None]
+    # At rest, everything but gravity is an error, which changes with the orientation.
+    before = force[(time_s > start_s - 1.0) & (time_s <= start_s)].mean(axis=0)
+    after = force[(time_s >= end_s) & (time_s < end_s + 1.0)].mean(axis=0) if stops else before
+    velocity = _integral(force[rows] - before - share * (after - before), t)
+    if stops:
+        velocity -= share * velocity[-1]
+    way = _integral(velocity, t)
+    return np.asarray(way[-1] if stops else way[t > t[-1] - _STRIDE_S].mean(axis=0))
+
+
+def _integral(rows: Array, t: Array) -> Array:
+    steps = 0.5 * (rows[1:] + rows[:-1]) * np.diff(t)[:, None]
+    return np.concatenate([np.zeros((1, rows.shape[1])), np.cumsum(steps, axis=0)])
