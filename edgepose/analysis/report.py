@@ -27,9 +27,10 @@ from edgepose.analysis.joint_angles import (
     walking_bouts,
 )
 from edgepose.analysis.way import draw_way, seen_from_above, way_of
-from edgepose.placements import PLACEMENTS
+from edgepose.calibration.slip import Slip, SlipMonitor
+from edgepose.placements import BONES, PLACEMENTS
 from edgepose.pose import PoseSequence, held_sensors, longest_holds
-from edgepose.skeleton import Body
+from edgepose.skeleton import Body, forward_kinematics
 from edgepose.utils.durable_files import write_whole
 
 Array = NDArray[np.float64]
@@ -40,6 +41,9 @@ FIGURES = 8
 
 POINTS = 3000
 """Largest number of points of a plotted line; more would not be visible."""
+
+SLIP_RATE = 10.0
+"""Poses a second in which slipped sensors are looked for."""
 
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 60rem; margin: 2rem auto; }
@@ -89,6 +93,10 @@ def write_report(
         _ranges(angles, held),
         "<h2>Sensors</h2>",
         *_sensors(poses),
+        *[
+            f"<p>{slip.placement.replace('_', ' ')} has {slip.message}.</p>"
+            for slip in find_slips(poses, body)
+        ],
     ]
     page = (
         f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{html.escape(name)}</title>"
@@ -259,6 +267,19 @@ def _way(poses: PoseSequence, bouts: Sequence[WalkingBout], body: Body) -> list[
         _table(("way of the pelvis", ""), rows),
         _image(draw_way(poses, body), "Path seen from above"),
         f"<p class='note'>{note}</p>",
+    ]
+
+
+def find_slips(poses: PoseSequence, body: Body) -> list[Slip]:
+    """Return the sensors that seem to have turned on their limbs."""
+    rows = np.arange(0, len(poses.rotations), max(1, round(poses.rate / SLIP_RATE)))
+    rows = rows[~held_sensors([poses.held[row] for row in rows]).any(axis=1)]
+    bones = forward_kinematics(poses.rotations[rows], body.offsets)[0][:, list(BONES)]
+    monitor = SlipMonitor(north=False)
+    return [
+        slip
+        for time_s, instant in zip(poses.time_s[rows].tolist(), bones, strict=True)
+        for slip in monitor.update(time_s, instant)
     ]
 
 

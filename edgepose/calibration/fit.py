@@ -104,8 +104,7 @@ def fit_pose(calibration: Calibration, orientation: Array) -> PoseFit:
         2.0
         * np.arctan2(np.hypot(between[..., 1], between[..., 2]), np.hypot(between[..., 0], between[..., 3]))
     )
-    # Without a common north, headings that were reset drift: only tilts can be compared.
-    north = calibration.north and not np.any(calibration.heading_offset)
+    north = calibration.compares_headings
     yaw = rot.yaw_of_quat(between) - calibration.heading_offset[:, None]
     placements = np.arange(len(PLACEMENTS))
     own_tilt, own_heading = tilt[placements, placements], from_median(-yaw[placements, placements])

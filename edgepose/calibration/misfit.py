@@ -11,6 +11,7 @@ from edgepose import rotations as rot
 from edgepose.calibration import Calibration
 from edgepose.calibration.fit import PoseFit, fit_pose
 from edgepose.calibration.impossible import ImpossibleBones
+from edgepose.calibration.slip import Slip, SlipMonitor
 from edgepose.imu import ImuFrame
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
@@ -34,7 +35,11 @@ _EVERY_S = 0.5
 
 
 class MisfitDetector:
-    """Checks frames against the calibration and warns of each problem once."""
+    """Checks frames against the calibration and warns of each problem once.
+
+    Attributes:
+        slips: sensors that have turned on their limbs, as far as found.
+    """
 
     def __init__(self, calibration: Calibration, compare: Callable[[], list[str]] = list) -> None:
         """Create the detector.
@@ -52,6 +57,9 @@ class MisfitDetector:
         self._nearest: PoseFit | None = None  # of the rests so far
         self._warned_no_pose = False
         self._impossible = ImpossibleBones()
+        self._slip_monitor = SlipMonitor(calibration.compares_headings)
+        self.slips: list[Slip] = []
+        self._swapped = False
         self._explained = False  # whether a reported swap or slip explains impossible bones
 
     def update(self, frame: ImuFrame, bones: Array) -> list[str]:
@@ -67,11 +75,12 @@ class MisfitDetector:
             self._frames.append(frame)
             while self._frames[0].time_s < frame.time_s - REST_S:
                 self._frames.popleft()
+        lines = self._check_slips(frame, bones)
         if frame.time_s < self._next_s:
-            return []
+            return lines
         self._next_s = frame.time_s + _EVERY_S
         passed_s = frame.time_s - self._start_s
-        lines = self._check_bones(frame, bones)
+        lines += self._check_bones(frame, bones)
         if not self._compared and passed_s >= COMPARE_S:
             lines += self._comparison()
         if self._looking:
@@ -86,6 +95,21 @@ class MisfitDetector:
     def _comparison(self) -> list[str]:
         self._compared = True
         return [f"warning: {line}" for line in self._compare()]
+
+    def _check_slips(self, frame: ImuFrame, bones: Array) -> list[str]:
+        if frame.held.any():
+            return []
+        found = self._slip_monitor.update(frame.time_s, bones)
+        if not found or self._swapped:
+            return []
+        self.slips += found
+        self._explained = True  # one wrong sensor makes others look impossible, too
+        known = self._nearest.slipped if self._warned_no_pose and self._nearest is not None else None
+        return [
+            f"warning: {slip.placement} has {slip.message}"
+            for slip in found
+            if known is None or slip.placement != known[0]
+        ]
 
     def _check_bones(self, frame: ImuFrame, bones: Array) -> list[str]:
         if self._explained:
@@ -104,7 +128,7 @@ class MisfitDetector:
             fit = fit_pose(self._calibration, rest)
             self._looking = fit.swapped is None and not fit.good
             if fit.swapped is not None:
-                self._explained = True
+                self._explained = self._swapped = True
                 return [f"warning: {fit.swapped}"]
             if self._nearest is None or fit.off_deg < self._nearest.off_deg:
                 self._nearest = fit

@@ -62,6 +62,11 @@ class Calibration:
     north: bool = True
     height_m: float | None = None
 
+    @property
+    def compares_headings(self) -> bool:
+        """Whether headings can be compared: without a common north, those that were reset drift."""
+        return self.north and not np.any(self.heading_offset)
+
     @cached_property
     def _maps(self) -> tuple[Array, Array, Array]:
         """Maps from q q^T to R_TB (6, 16, 9) and from force rows in I to T (6, 3, 3); gravity in T (3,)."""

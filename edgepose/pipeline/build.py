@@ -184,6 +184,8 @@ class OpenWearer:
             self.notify(
                 "held     " + ", ".join(f"{name} in {count} frames" for count, name in worst if count)
             )
+        for slip in summary.slips:
+            self.notify(f"slipped  {slip.placement} by about {slip.angle_deg:.0f} deg")
         if summary.way_m is not None:
             self.notify(f"way      {summary.way_m:.1f} m walked")
         if summary.latencies_s and self._config.source.live:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from edgepose.calibration import apply_calibration
 from edgepose.calibration.misfit import MisfitDetector
 from edgepose.calibration.rezero import HeadingRezero
+from edgepose.calibration.slip import Slip
 from edgepose.diagnostics.rig_monitor import RigMonitor
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuFrame, ImuSample
@@ -46,6 +47,7 @@ class RunSummary:
         seconds: wall time from the first samples to the end.
         latency_s: time from the arrival of the newest packet here until the newest pose was sent, seconds.
         latencies_s: latencies of the newest LATENCIES poses, in no order, seconds.
+        slips: sensors that have turned on their limbs, as far as found.
         way_m: way walked, metres, see `PlaceStage`; None if the place is not followed.
         error: the error that ended the run early, if any.
     """
@@ -58,6 +60,7 @@ class RunSummary:
     seconds: float = 0.0
     latency_s: float = 0.0
     latencies_s: array[float] = field(default_factory=lambda: array("f"), repr=False)
+    slips: list[Slip] = field(default_factory=list)
     way_m: float | None = None
     error: EdgeposeError | None = None
 
@@ -129,6 +132,8 @@ class WearerPipeline:
         self.arrived = self._started = time.perf_counter()
         self._headings, self._orient, self._notify = headings, orient, notify
         self._on_pose, self._misfits, self._rig, self._warn = on_pose, misfits, rig, warn
+        if misfits is not None:
+            self.summary.slips = misfits.slips
         self._sinks = SinkGroup(sinks, warn)
         self._writer, self._place = PoseWriter(self._sinks, look_ahead_s, warn, resampler), place
         self._dropouts = DropoutMonitor()

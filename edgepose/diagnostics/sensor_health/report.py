@@ -38,7 +38,7 @@ class SensorHealth:
         pose_tilt_deg: tilt against the calibration's pose in which the wearer stands, or should.
         in_pose: whether most sensors say that the wearer stands in it.
         swapped_with: the placement with which it must be swapped to fit that pose.
-        impossible: what is wrong with its bone if that has been in an orientation that no body can take.
+        impossible: what is wrong with its bone over time: an orientation that no body can take, or a slip.
         repeated_percent: samples that are the same as the one before, in motion.
         frozen: quantity that does not change while the sensor moves, or "everything" if only the other
             sensors change.

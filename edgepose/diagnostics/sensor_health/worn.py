@@ -14,6 +14,7 @@ from edgepose.calibration.fit import POSE_TILT_DEG, PoseFit, fit_pose
 from edgepose.calibration.heading_reset import headings_from_pose
 from edgepose.calibration.impossible import ImpossibleBones
 from edgepose.calibration.sensor_to_segment import Calibration, apply_calibration
+from edgepose.calibration.slip import SlipMonitor
 from edgepose.diagnostics.sensor_health.columns import QUAT, TIME
 from edgepose.diagnostics.sensor_health.rest import Rest
 from edgepose.diagnostics.sensor_health.sensor import Sensor
@@ -21,7 +22,7 @@ from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 
 _POSE_OFF_DEG = 30.0  # sum over six sensors: accuracy with which a wearer takes the pose again
-_EVERY_S = 0.5  # time between two checks of the bones
+_EVERY_S = 0.1  # time between two checks of the bones
 
 
 class WornComparison:
@@ -39,6 +40,8 @@ class WornComparison:
         self._headings: Array | None = None
         self._bones = ImpossibleBones()
         self._impossible: dict[str, str] = {}
+        self._slip_monitor = SlipMonitor(calibration.compares_headings)
+        self._slips: dict[str, str] = {}
         self._next_s = -math.inf
 
     def compare_pose(self, rests: Sequence[Rest]) -> None:
@@ -73,15 +76,19 @@ class WornComparison:
         self._next_s = float(times[-1]) + _EVERY_S
         rows = [np.minimum(np.searchsorted(w[:, TIME], times), len(w) - 1) for w in windows]
         quats = np.stack([w[row, QUAT] for w, row in zip(windows, rows, strict=True)], axis=1)
-        quats = quats[np.abs(np.linalg.norm(quats, axis=-1) - 1.0).max(axis=1) < 0.01]
+        unit = np.abs(np.linalg.norm(quats, axis=-1) - 1.0).max(axis=1) < 0.01
+        times, quats = times[unit], quats[unit]
         bones, _ = apply_calibration(self._calibration, quats, np.zeros((*quats.shape[:2], 3)))
-        for instant in bones:
+        for time_s, instant in zip(times.tolist(), bones, strict=True):
             self._impossible |= self._bones.update(instant, [False] * len(PLACEMENTS), _EVERY_S)
+            for slip in self._slip_monitor.update(time_s, instant):
+                self._slips[slip.placement] = f"it has {slip.message}"
 
     def result(self) -> list[dict[str, Any]]:
         """Return fields for the `SensorHealth` of each sensor."""
         # A sensor that does not fit the pose makes others look impossible, too.
         impossible = self._impossible if self._fit is None or self._fit.good else {}
+        impossible = self._slips or impossible
         fields: list[dict[str, Any]] = [{"impossible": impossible.get(name)} for name in PLACEMENTS]
         for i, of_sensor in enumerate(fields):
             if self._fit is not None:
