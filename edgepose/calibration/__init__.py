@@ -28,6 +28,14 @@ from edgepose.calibration.static_pose import (
     trim,
 )
 from edgepose.calibration.steps import STEPS_S, headings_from_steps
+from edgepose.calibration.two_poses import (
+    TWO_POSES,
+    facing_deg,
+    forward_of_raised_arms,
+    t_pose_start,
+    with_raised_arms,
+    with_t_pose,
+)
 from edgepose.imu import GRAVITY
 
 __all__ = [
@@ -36,6 +44,7 @@ __all__ = [
     "POSES",
     "ROUTINE",
     "STEPS_S",
+    "TWO_POSES",
     "Calibration",
     "HeadingReset",
     "Hold",
@@ -51,6 +60,8 @@ __all__ = [
     "check_covered",
     "check_hold",
     "check_reported",
+    "facing_deg",
+    "forward_of_raised_arms",
     "from_json",
     "headings_from_axis",
     "headings_from_motion",
@@ -65,6 +76,9 @@ __all__ = [
     "mounting_warnings",
     "save",
     "stillest_start",
+    "t_pose_start",
     "to_json",
     "trim",
+    "with_raised_arms",
+    "with_t_pose",
 ]

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from edgepose import calibration
-from edgepose.calibration import HeadingReset, Hold, HoldSummary
+from edgepose.calibration import TWO_POSES, HeadingReset, Hold, HoldSummary
 from edgepose.cli.guide.guide import Guide
 from edgepose.cli.guide.stage import LISTEN, Stage
 from edgepose.cli.options.recording_time import RecordingTime
 from edgepose.cli.prompts import (
+    MOVE_COUNTDOWN_S,
     collect,
     record_hold,
     record_motion,
@@ -29,6 +30,7 @@ from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import ImuSample
 from edgepose.orientation.stage import OrientationStage
 from edgepose.pipeline.rig_comparison import without_common_heading
+from edgepose.rotations import Array
 from edgepose.sources import Batch, Device, open_source
 from edgepose.sources.replay import is_recording
 from edgepose.utils.fault_messages import HEADING_RESETS
@@ -56,7 +58,7 @@ class CalibrationPlan:
     """Steps of a calibration; all fields except `mounting` are flags of `edgepose calibrate`.
 
     Attributes:
-        pose: pose of the hold.
+        pose: pose of the hold, or `TWO_POSES`.
         body_frame: the direction that the wearer faces; None is the default for the heading reset.
         heading_reset: "live", "motion", "steps", "mounting[:AXIS]" or a file; None for none.
         motion: start and end of the movements in a recording.
@@ -74,6 +76,11 @@ class CalibrationPlan:
     start: RecordingTime | None
     countdown_s: float
     mounting: Sequence[str] = ()
+
+    @property
+    def first_pose(self) -> str:
+        """The pose of the first hold."""
+        return self.pose.partition("+")[0]
 
     @property
     def side_by_side(self) -> Path | None:
@@ -96,6 +103,7 @@ class Measured(NamedTuple):
         from_s: start of the hold in a recording, seconds; None if it was live.
         devices: the devices that sent the samples, by placement.
         damaged: a part of a recording was left out.
+        t_pose: a second hold, of the T-pose, if the plan asks for it.
     """
 
     summary: HoldSummary
@@ -103,6 +111,7 @@ class Measured(NamedTuple):
     from_s: float | None
     devices: Mapping[int, Device]
     damaged: bool = False
+    t_pose: HoldSummary | None = None
 
     @property
     def warnings(self) -> list[str]:
@@ -128,11 +137,18 @@ def measure_live(
             )
             if guide.phone is None:  # otherwise every hold begins with its start button
                 text = "Put the sensors on. Press Enter when the wearer is ready."
-                wait_for_start(batches, guide, text, plan.pose)
+                wait_for_start(batches, guide, text, plan.first_pose)
         summary = record_hold(
-            batches, plan.pose, plan.countdown_s, plan.hold_s, guide, calibration.check_hold
+            batches, plan.first_pose, plan.countdown_s, plan.hold_s, guide, calibration.check_hold
         )
         _check_north(orient, plan, opened.devices)
+        t_pose = None
+        if plan.pose == TWO_POSES:
+            straight = summary.orientation
+            wait_s = min(plan.countdown_s, MOVE_COUNTDOWN_S)
+            t_pose = record_hold(
+                batches, "t-pose", wait_s, plan.hold_s, guide, lambda held: _raised(straight, held)
+            )
         if plan.heading_reset == "motion":
             upright = summary.orientation
             reset = record_motion(
@@ -149,7 +165,7 @@ def measure_live(
                 guide,
                 lambda moving: calibration.headings_from_steps(moving, upright),
             )
-    return Measured(summary, reset or _mounted(plan, summary), None, opened.devices, damaged)
+    return Measured(summary, reset or _mounted(plan, summary), None, opened.devices, damaged, t_pose)
 
 
 def _check_before_hold(
@@ -166,7 +182,7 @@ def _check_before_hold(
     """
     samples: list[ImuSample] = []
     for left in range(LISTENS - 1, -1, -1):
-        listening = Stage(LISTEN, "...", "Listening to the sensors.", plan.pose, LISTEN_S)
+        listening = Stage(LISTEN, "...", "Listening to the sensors.", plan.first_pose, LISTEN_S)
         samples += collect(batches, listening, guide)[0]
         try:
             calibration.check_reported(calibration.hold_from_samples(samples))
@@ -192,6 +208,13 @@ def measure_recorded(
     if plan.start is None:
         guide("If the wearer stood in the pose at another time, give its start with --from.")
     summary = calibration.check_hold(still, "choose a still part with --from, or record again")
+    t_pose = None
+    if plan.pose == TWO_POSES:
+        end_s = start_s + plan.hold_s
+        t_start_s = calibration.t_pose_start(everything, summary.orientation, end_s, plan.hold_s)
+        guide(f"{source.name}: T-pose from {t_start_s:.2f} to {t_start_s + plan.hold_s:.2f} s.")
+        held = calibration.trim(everything, t_start_s, t_start_s + plan.hold_s)
+        t_pose = _raised(summary.orientation, held)
     if plan.heading_reset == "motion":
         moving = _movements(source.name, everything, plan, start_s + plan.hold_s)
         reset = calibration.headings_from_motion(moving, summary.orientation)
@@ -199,7 +222,14 @@ def measure_recorded(
         moving = _movements(source.name, everything, plan, start_s)  # with the stand before the steps
         reset = calibration.headings_from_steps(moving, summary.orientation, must_stop=False)
     reset = reset or _mounted(plan, summary)
-    return Measured(summary, reset, start_s, devices, damaged or damage is not None)
+    return Measured(summary, reset, start_s, devices, damaged or damage is not None, t_pose)
+
+
+def _raised(straight: Array, held: Hold) -> HoldSummary:
+    """Check the hold of the T-pose that follows a straight pose, (6, 4) mean quaternions."""
+    summary = calibration.check_hold(held)
+    calibration.forward_of_raised_arms(straight, summary.orientation)
+    return summary
 
 
 def _movements(name: str, everything: Hold, plan: CalibrationPlan, begin_s: float) -> Hold:

@@ -20,6 +20,7 @@ from edgepose.cli.calibration_session import (
     ROUTINE_S,
     CalibrationPlan,
     Measured,
+    finds_forward,
     measure_live,
     measure_recorded,
 )
@@ -76,10 +77,11 @@ def _span(
 _PLAN_FLAGS = [
     click.option(
         "--pose",
-        type=click.Choice(list(calibration.POSES)),
+        type=click.Choice([*calibration.POSES, calibration.TWO_POSES]),
         default="straight",
         show_default=True,
-        help="Pose to hold: arms hanging, or arms out to the sides.",
+        help="Pose to hold: arms hanging, arms out to the sides, or one after the other, which also shows "
+        "the direction that the wearer faces.",
     ),
     click.option(
         "--body-frame",
@@ -222,7 +224,7 @@ def _repeated(job: _Job, guide: Guide, out: str, overwrite: bool) -> bool:
         try:
             measured, result, warnings = _calibrated(job, guide)
         except EdgeposeError as error:
-            if not guide.wants_repeat(end_stage("REDO", str(error), job.plan.pose)):
+            if not guide.wants_repeat(end_stage("REDO", str(error), job.plan.first_pose)):
                 raise
             continue
         guide.close_page()
@@ -239,7 +241,7 @@ def _repeated(job: _Job, guide: Guide, out: str, overwrite: bool) -> bool:
         if out != "-" and not measured.damaged:
             guide("Next:")
             terminal.show(f"  {next_command(job.source, out)}")  # in one line, to be copied
-        if not guide.wants_repeat(end_stage(judgement.word, judgement.text, job.plan.pose)):
+        if not guide.wants_repeat(end_stage(judgement.word, judgement.text, job.plan.first_pose)):
             if out == "-":  # once only, whatever the wearer repeats
                 click.echo(calibration.to_json(result), nl=False)
                 guide("Wrote stdout.")
@@ -266,11 +268,12 @@ def _calibrated(job: _Job, guide: Guide) -> tuple[Measured, Calibration, list[st
     source, plan = job.source, job.plan
     orient = OrientationStage(job.filter, job.magnetometer)
     measured = (measure_live if source.live else measure_recorded)(source, plan, orient, guide)
-    reset = measured.reset
+    reset, facing = _facing(plan, measured, guide)
+    measured = measured._replace(reset=reset)
     result = calibration.calibrate(
         measured.summary,
-        pose=plan.pose,
-        body_frame=plan.facing,
+        pose=plan.first_pose,
+        body_frame=facing,
         created=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         heading_offset=None if reset is None else reset.offset,
         metadata=_metadata(source, plan, measured),
@@ -279,10 +282,33 @@ def _calibrated(job: _Job, guide: Guide) -> tuple[Measured, Calibration, list[st
         height_m=job.height_m,
     )
     warnings = list(measured.warnings)
+    if measured.t_pose is not None:
+        result, differences = calibration.with_t_pose(result, measured.t_pose.orientation)
+        warnings += differences
     if job.sensor_map is not None:
         stated = {name: device.mounting for name, device in job.sensor_map.devices.items()}
         warnings += calibration.mounting_warnings(result, stated, job.sensor_map.path)
     return measured, result, warnings
+
+
+def _facing(
+    plan: CalibrationPlan, measured: Measured, guide: Guide
+) -> tuple[calibration.HeadingReset | None, str]:
+    """Return the heading reset and the body frame, both improved by the raised arms of a T-pose.
+
+    Raises:
+        EdgeposeError: the arms contradict each other, or the heading reset.
+    """
+    reset = measured.reset
+    if measured.t_pose is None:
+        return reset, plan.facing
+    arms = calibration.forward_of_raised_arms(measured.summary.orientation, measured.t_pose.orientation)
+    if reset is not None and finds_forward(plan.heading_reset):
+        return calibration.with_raised_arms(reset, arms), plan.facing
+    offset = np.zeros(len(PLACEMENTS)) if reset is None else reset.offset
+    angle_deg, error_deg = calibration.facing_deg(arms, offset)
+    guide(f"The raised arms show that the wearer faces {angle_deg:.1f} deg, to within {error_deg:.0f} deg.")
+    return reset, plan.body_frame or f"heading:{angle_deg:.2f}"
 
 
 def _announce(phone: PhonePage, guide: Guide) -> None:
