@@ -14,7 +14,7 @@ from edgepose import rotations as rot
 from edgepose.calibration.checks import HoldError
 from edgepose.calibration.heading_reset import HeadingReset, over
 from edgepose.calibration.sensor_to_segment import POSES, Calibration
-from edgepose.calibration.static_pose import Hold, unit_or_zero
+from edgepose.calibration.static_pose import Hold, stillest_start, trim, unit_or_zero
 from edgepose.errors import CalibrationError
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
@@ -154,13 +154,13 @@ def with_t_pose(calibration: Calibration, t_pose: Array) -> tuple[Calibration, l
 
 
 def t_pose_start(everything: Hold, straight: Array, after_s: float, seconds: float) -> float:
-    """Return the start of the first time with raised arms, on the clock of the samples, seconds.
+    """Return the start of the stillest part of the first time with raised arms, seconds.
 
     Args:
         everything: samples of a recording.
         straight: (6, 4) mean quaternions of the straight pose.
         after_s: end of the straight pose.
-        seconds: length of the time.
+        seconds: length of the part.
 
     Raises:
         CalibrationError: there is none.
@@ -173,11 +173,12 @@ def t_pose_start(everything: Hold, straight: Array, after_s: float, seconds: flo
         rows = np.searchsorted(everything[i].time_s[order], times).clip(max=len(order) - 1)
         up = _turned_up(straight[i], unit_or_zero(everything[i].quat[order][rows]))
         raised &= np.abs(np.degrees(np.arccos(np.clip(up[:, 2], -1.0, 1.0))) - 90.0) < 20.0
-    needed = round(seconds / _STEP_S) + 1
-    runs = np.convolve(raised, np.ones(needed))[needed - 1 : len(times)] > needed - 0.5
-    if not runs.any():
-        raise CalibrationError(
-            f"no T-pose of {seconds:g} s after the straight pose: the arms were not raised to the sides; "
-            "record again, or use --pose straight"
-        )
-    return float(times[int(np.argmax(runs))])
+    edges = np.flatnonzero(np.diff(raised.astype(int), prepend=0, append=0)).reshape(-1, 2)
+    for begin, end in edges:
+        if (end - begin) * _STEP_S > seconds + _STEP_S:
+            start_s = float(times[begin])
+            return stillest_start(trim(everything, start_s, start_s + (end - begin) * _STEP_S), seconds)
+    raise CalibrationError(
+        f"no T-pose of {seconds:g} s after the straight pose: the arms were not raised to the sides; "
+        "record again, or use --pose straight"
+    )

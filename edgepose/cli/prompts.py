@@ -29,7 +29,7 @@ _INSTRUCTIONS = {
     "lying": "Lay all six sensors side by side, same face up, same edge forward, and let go of them.",
 }
 
-_STEPS = "Take two or three steps straight ahead, stop with arms hanging, and stand still."
+_STEPS = "Take two or three steps straight ahead, stop with arms hanging, and stand still"
 
 _MOVES = {
     "head": ("BOW", "bow"),
@@ -178,7 +178,7 @@ def record_steps(
         WeakMotionError: every repetition was refused.
         EdgeposeError: the source ended too early.
     """
-    guide.instruct(f"Stand still until the steps begin. {_STEPS}")
+    guide.instruct(f"Stand still until the steps begin. {_STEPS}.")
     wait_s = min(countdown_s, MOVE_COUNTDOWN_S) or 1.0  # the stand before the steps is needed
     stand = Stage(COUNTDOWN, "", f"Stand still. Then: {_STEPS}", "step", wait_s)
     walk = Stage(MOVE, "STEPS", _STEPS, "step", calibration.STEPS_S)

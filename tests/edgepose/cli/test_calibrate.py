@@ -25,9 +25,10 @@ from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.base import recording_from_samples
 from edgepose.formats.recordings.csv import write_csv
+from edgepose.formats.recordings.npz import write_npz
 from edgepose.formats.recordings.raw_capture import times_header, times_path, times_row
 from edgepose.formats.recordings.registry import read_recording
-from edgepose.imu import ImuSample
+from edgepose.imu import ImuSample, Recording, SensorData
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose_export.synthesis.heading_routine import ASIDE_DEG, exercises
 from firmware_protocols import native, native_packet
@@ -35,6 +36,7 @@ from firmware_protocols.registry import PROTOCOLS
 from firmware_protocols.sample import Sample
 from tests.support import processes
 from tests.support.ports import Port, Sender
+from tests.support.walkers import HEADINGS, walker
 
 REAL = Path(__file__).parents[2] / "data" / "imu" / "six-sites-3s.npz"
 
@@ -245,13 +247,14 @@ def test_recordings_that_do_not_do(arguments: list[object], message: str) -> Non
         (["--file", REAL, "--heading-reset", "live"], "--heading-reset live needs --port"),
         (["--port", "x", "--from", 3], "--from needs a recording"),
         (["--port", "x", "--heading-reset", "motion", "--motion", "1:2"], "--motion needs a recording"),
-        (["--file", REAL, "--motion", "1:2"], "--motion needs --heading-reset motion"),
+        (["--file", REAL, "--motion", "1:2"], "--motion needs --heading-reset motion or steps"),
         (["--file", REAL, "--heading-reset", "motion", "--motion", "2:1"], "'2:1' is not FROM:TO"),
         (
             ["--file", REAL, "--heading-reset", "motion", "--motion", "nan:1"],
             "'nan' is not a time in seconds",
         ),
         (["--file", REAL, "--heading-reset", "motion", "--pose", "t-pose"], "starts with hanging arms"),
+        (["--file", REAL, "--heading-reset", "steps", "--pose", "t-pose"], "steps starts with hanging arms"),
         (["--file", REAL, "--heading-reset", "mounting:up"], "an axis is x, y or z"),
         (["--file", REAL, "--filter", "madgwick"], "'madgwick' is not one of 'none', 'kalman', 'vqf'"),
         (["--file", REAL, "--hold", -1], "-1"),
@@ -420,6 +423,60 @@ def test_a_wearer_who_does_not_do_the_exercises(
     assert result.output.count("Trying again.") == 3
 
 
+def walk_file(path: Path, stand_s: tuple[float, float] = (4.0, 2.0), **wearer: float) -> Path:
+    """A recording of sensors without a common north whose wearer stands, takes some steps, and stands."""
+    sensors = {
+        name: SensorData(s.time_s, s.quat, s.acc, None)
+        for name, s in zip(PLACEMENTS, walker(stand_s=stand_s, **wearer), strict=True)
+    }
+    write_npz(path, Recording(sensors, {}))
+    return path
+
+
+def test_headings_from_steps_in_a_recording(tmp_path: Path) -> None:
+    out = tmp_path / "calib.json"
+    words = ("--hold", 2, "--from", 0.5, "--heading-reset", "steps", "--out", out)
+    result = run("--file", walk_file(tmp_path / "walk.npz"), *words)
+    assert result.exit_code == 0, result
+    assert "The calibration is good." in result.output
+    calibration = cal.load_calibration(out)
+    assert (calibration.body_frame, calibration.north) == ("heading:0", False)
+    assert calibration.metadata["heading_reset"]["source"] == "steps"
+    apart = np.degrees(np.angle(np.exp(1j * (calibration.heading_offset + HEADINGS))))
+    assert np.abs(apart).max() < 1.5
+    # A recording that ends in the walk, and one that --motion cuts.
+    walked = walk_file(tmp_path / "on.npz", (4.0, 0.0))
+    result = run("--file", walked, *words, "--overwrite")
+    assert "the wearer did not stand still after the steps: headings are less certain" in result.stderr
+    result = run("--file", walk_file(tmp_path / "back.npz", way_m=-1.4), *words, "--overwrite")
+    assert error_of(result).startswith("no heading from these steps: the wearer walked backwards; ")
+    result = run("--file", walked, *words, "--motion", "+5:+50", "--overwrite")
+    assert "choose --motion within that" in error_of(result)
+
+
+def test_straight_pose_and_then_t_pose(tmp_path: Path) -> None:
+    """Without --body-frame, the raised arms show which way the wearer faces."""
+
+    def quats(t: float) -> np.ndarray:
+        raised = min(max(t - 12.0, 0.0), 1.0)
+        bones = cal.POSES["straight"].copy()
+        for i, side in enumerate((1.0, -1.0)):
+            bones[i] = rot.rotation_about_axis("z", side * raised * math.pi / 2) @ bones[i]
+        return worn(bones, np.zeros(6))
+
+    file, out = write_recording(tmp_path / "both.csv", quats, 5.0), tmp_path / "calib.json"
+    words = ("--hold", 1, "--from", 10.5, "--pose", "straight+t-pose", "--out", out)
+    result = run("--file", file, *words)
+    assert result.exit_code == 0, result
+    assert "T-pose from 13.0" in result.output
+    assert "The raised arms show that the wearer faces 70.0 deg, to within 0 deg." in result.output
+    calibration = cal.load_calibration(out)
+    assert (calibration.pose, calibration.body_frame) == ("straight", "heading:70.00")
+    assert_recovers(calibration, np.zeros(6), 0.1)
+    result = run("--file", file, *words, "--from", 13.5, "--overwrite")
+    assert error_of(result).startswith("no T-pose of 1 s after the straight pose: the arms were not raised")
+
+
 def test_headings_from_the_mounting_in_a_map(tmp_path: Path) -> None:
     file = write_recording(tmp_path / "pose.csv", lambda t: worn(cal.POSES["straight"]))
     found = cal.mounting(
@@ -534,7 +591,8 @@ def test_devices_without_a_common_heading(tmp_path: Path, words: tuple[str, ...]
     times_path(rig).write_text(noted)
     result = run("--file", rig, "--protocol", "haritorax", "--out", tmp_path / "c.json", *words)
     says = (
-        "sensors of haritorax have no common heading: calibrate with --heading-reset motion, live or mounting"
+        "sensors of haritorax have no common heading: calibrate with --heading-reset steps, motion, live or "
+        "mounting"
     )
     text = str(result.exception) + result.output
     assert (says in text) == (not words)

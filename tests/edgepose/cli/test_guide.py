@@ -11,24 +11,30 @@ import subprocess
 import sys
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 
+from edgepose.calibration import headings_from_steps
 from edgepose.cli.guide.big_words import big_word
-from edgepose.cli.guide.guide import end_stage, start_stage
+from edgepose.cli.guide.guide import Guide, end_stage, start_stage
 from edgepose.cli.guide.phone_page import PhonePage, address_in_network
 from edgepose.cli.guide.stage import COUNTDOWN, HOLD, MOVE, Stage
 from edgepose.cli.guide.terminal_page import page_lines
-from edgepose.cli.prompts import _INSTRUCTIONS, _MOVES
+from edgepose.cli.prompts import _INSTRUCTIONS, _MOVES, _STEPS, record_steps
 from edgepose.errors import DeviceError
+from edgepose.imu import ImuSample
+from edgepose.sources import Batch
 from tests.support import processes
 from tests.support.browser import Browser, needs_browser, until
 from tests.support.datagrams import free_address
 from tests.support.processes import ROOT, simulated
+from tests.support.walkers import HEADINGS, walker
 
 CLIP = ROOT / "tools" / "data" / "09_12.bvh"
 STAGES = [
     *(Stage(HOLD, "HOLD", f"Hold still. {text}", pose, 4.0) for pose, text in _INSTRUCTIONS.items()),
     *(Stage(MOVE, word, "Lift it", figure, 4.0) for word, figure in _MOVES.values()),
+    Stage(MOVE, "STEPS", _STEPS, "step", 8.0),
     Stage(COUNTDOWN, "", "Stand", "straight", 10.0),
 ]
 
@@ -55,6 +61,38 @@ def test_the_page_fits_the_terminal(stage, columns, rows):
         few = page_lines(stage, 1.2, ["All six sensors report."], columns, rows)
         assert len(few) < rows
         assert sum("█" in line for line in few) >= 10
+
+
+def batches_of(*walks: dict[str, object]) -> Iterator[Batch]:
+    """Samples of one wearer who walks several times, at ten batches a second."""
+    begin_s = 0.0
+    for options in walks:
+        sensors = walker(stand_s=(3.5, 4.6), **options)
+        for k in range(0, len(sensors[0].time_s), 6):
+            rows = [(i, s, j) for i, s in enumerate(sensors) for j in range(k, min(k + 6, len(s.time_s)))]
+            yield Batch(
+                begin_s + float(sensors[0].time_s[k]),
+                [
+                    ImuSample(i, begin_s + float(s.time_s[j]), tuple(s.quat[j]), tuple(s.acc[j]))
+                    for i, s, j in rows
+                ],
+            )
+        begin_s += float(sensors[0].time_s[-1])
+
+
+def test_steps_are_guided_and_repeated(capsys):
+    upright = np.stack([sensor.quat[0] for sensor in walker()])
+    with Guide() as guide:
+        reset = record_steps(
+            batches_of({"way_m": 0.1}, {}), 10.0, guide, lambda moving: headings_from_steps(moving, upright)
+        )
+    assert np.degrees(np.abs(np.angle(np.exp(1j * (reset.offset + HEADINGS))))).max() < 1.5
+    lines = capsys.readouterr().out.splitlines()
+    walk = "Take two or three steps straight ahead, stop with arms hanging, and stand still."
+    assert lines[0] == f"Stand still until the steps begin. {walk}"
+    assert lines[1:3] == [f"In 3 s: Stand still. Then: {walk}", f"{walk} (8 s)."]
+    assert "too short" in lines[3]
+    assert lines[3].endswith("Trying again.")
 
 
 @contextlib.contextmanager

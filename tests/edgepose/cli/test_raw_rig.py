@@ -162,7 +162,7 @@ def test_without_a_filter_the_message_names_it(command, rig, wearer, tmp_path):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ((), "headings are arbitrary: add --heading-reset motion, live or mounting"),
+        ((), "headings are arbitrary: add --heading-reset steps, motion, live or mounting"),
         (
             ("--heading-reset", "RAW"),
             "with arbitrary headings, which another recording cannot reset",

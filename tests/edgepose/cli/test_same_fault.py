@@ -101,7 +101,7 @@ FAULTS = {
     "no common north": Fault(
         of_all(lambda s: s),
         r"sensors of haritorax have no common heading: "
-        r"calibrate with --heading-reset motion, live or mounting",
+        r"calibrate with --heading-reset steps, motion, live or mounting",
         codes=(None, 1, 0),  # the times of packets without a time depend on this machine
         protocol="haritorax",
     ),
