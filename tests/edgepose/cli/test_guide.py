@@ -67,16 +67,12 @@ def batches_of(*walks: dict[str, object]) -> Iterator[Batch]:
     """Samples of one wearer who walks several times, at ten batches a second."""
     begin_s = 0.0
     for options in walks:
-        sensors = walker(stand_s=(3.5, 4.6), **options)
+        sensors = walker(stand_s=(3.6, 5.0), **options)
         for k in range(0, len(sensors[0].time_s), 6):
             rows = [(i, s, j) for i, s in enumerate(sensors) for j in range(k, min(k + 6, len(s.time_s)))]
-            yield Batch(
-                begin_s + float(sensors[0].time_s[k]),
-                [
-                    ImuSample(i, begin_s + float(s.time_s[j]), tuple(s.quat[j]), tuple(s.acc[j]))
-                    for i, s, j in rows
-                ],
-            )
+            times = begin_s + sensors[0].time_s
+            samples = [ImuSample(i, float(times[j]), tuple(s.quat[j]), tuple(s.acc[j])) for i, s, j in rows]
+            yield Batch(float(times[k]), samples)
         begin_s += float(sensors[0].time_s[-1])
 
 
@@ -88,8 +84,8 @@ def test_steps_are_guided_and_repeated(capsys):
         )
     assert np.degrees(np.abs(np.angle(np.exp(1j * (reset.offset + HEADINGS))))).max() < 1.5
     lines = capsys.readouterr().out.splitlines()
-    walk = "Take two or three steps straight ahead, stop with arms hanging, and stand still."
-    assert lines[0] == f"Stand still until the steps begin. {walk}"
+    walk = "Take two or three steps straight ahead, stop with arms hanging, and stand still"
+    assert lines[0] == f"Stand still until the steps begin. {walk}."
     assert lines[1:3] == [f"In 3 s: Stand still. Then: {walk}", f"{walk} (8 s)."]
     assert "too short" in lines[3]
     assert lines[3].endswith("Trying again.")
