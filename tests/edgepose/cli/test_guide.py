@@ -86,7 +86,7 @@ def test_steps_are_guided_and_repeated(capsys):
     lines = capsys.readouterr().out.splitlines()
     walk = "Take two or three steps straight ahead, stop with arms hanging, and stand still"
     assert lines[0] == f"Stand still until the steps begin. {walk}."
-    assert lines[1:3] == [f"In 3 s: Stand still. Then: {walk}", f"{walk} (8 s)."]
+    assert lines[1:3] == [f"In 3 s: Stand still. Then: {walk}.", f"{walk} (8 s)."]
     assert "too short" in lines[3]
     assert lines[3].endswith("Trying again.")
 
