@@ -3,8 +3,8 @@
 \b
     bench_slip.py RECORDING.npz...
 
-The recordings are of `edgepose synthesize`; those in one folder are joined to one long run, without noise. Each
-sensor slips at its beginning by each angle, about six level axes. Runs that are too short are passed over.
+The recordings are of `edgepose synthesize`; those in one folder are joined to one long run, without noise.
+Each sensor slips at its beginning by each angle, about six level axes. Runs that are too short are passed over.
 """
 
 from __future__ import annotations

@@ -116,10 +116,10 @@ def worn(motion: Motion, seed: int, filter: str) -> tuple[Hold, Hold]:
     }
     if filter == "none":  # exact orientations, with other norths
         norths = rot.quat_about_z(np.random.default_rng(seed).uniform(-np.pi, np.pi, len(PLACEMENTS)))
-        turned = [
-            rot.quat_multiply(north, data.quat) for north, data in zip(norths, ideal.values(), strict=True)
-        ]
-        chips = {name: chips[name]._replace(quat=quat) for name, quat in zip(PLACEMENTS, turned, strict=True)}
+        chips = {
+            name: chips[name]._replace(quat=rot.quat_multiply(north, ideal[name].quat))
+            for name, north in zip(PLACEMENTS, norths, strict=True)
+        }
         measured = Recording(chips, {})
     else:
         orienter = OrientationEstimator(filter, magnetometer=False)
@@ -186,9 +186,8 @@ def main(motions: tuple[Path, ...], filters: tuple[str, ...]) -> None:
             except EdgeposeError as error:
                 refused += 1
                 click.echo(f"wearer {seed}, {filter}: {error}", err=True)
-        click.echo(
-            row("true orientations" if filter == "none" else f"`{filter}`", len(found), refused, results)
-        )
+        name = "true orientations" if filter == "none" else f"`{filter}`"
+        click.echo(row(name, len(found), refused, results))
     click.echo(row("real walker", 1, 0, [real()]))
 
 
