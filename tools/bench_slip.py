@@ -4,7 +4,7 @@
     bench_slip.py RECORDING.npz...
 
 The recordings are of `edgepose synthesize`; those in one folder are joined to one long run, without noise.
-Each sensor slips at its beginning by each angle, about six level axes. Runs that are too short are passed over.
+Each sensor slips at its beginning by each angle, about four level axes. Short runs are passed over.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from edgepose.rotations import Array
 from edgepose.skeleton import default_body, forward_kinematics
 
 ANGLES_DEG = (20.0, 25.0, 30.0, 35.0, 40.0, 50.0)
-AXES = 6
+AXES = 4
 RATE = 10.0
 
 
