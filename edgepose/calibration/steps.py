@@ -12,15 +12,12 @@ from edgepose import rotations as rot
 from edgepose.calibration.functional import leans, main_direction
 from edgepose.calibration.heading_reset import HeadingReset, WeakMotionError, over
 from edgepose.calibration.static_pose import Hold, check_reported, trim
-from edgepose.calibration.walks import Walk, find_walk
+from edgepose.calibration.walks import ADVICE, Walk, find_walk
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 
 STEPS_S = 8.0
 """Time for the steps and the stand after them, seconds."""
-
-SHORTEST_M = 0.4
-"""Shortest way that counts."""
 
 ERROR_WARNING_DEG, ERROR_LIMIT_DEG = 10.0, 16.0
 TURN_LIMIT_DEG = 20.0
@@ -28,7 +25,6 @@ POSE_LIMIT_DEG = 25.0
 
 _LEGS = [PLACEMENTS.index(name) for name in ("left_lower_leg", "right_lower_leg")]
 _WAY_ERROR_DEG, _LEAN_ERROR_DEG = 3.0, 6.0  # of the best ways, and of the plane in which a lower leg swings
-_ADVICE = "let the arms hang, take two or three calm steps straight ahead, and stand still as before"
 
 
 def headings_from_steps(moving: Hold, upright: Array, must_stop: bool = True) -> HeadingReset:
@@ -46,10 +42,6 @@ def headings_from_steps(moving: Hold, upright: Array, must_stop: bool = True) ->
     """
     check_reported(moving)
     walk = find_walk(moving, must_stop)
-    if walk.length_m < SHORTEST_M:
-        raise WeakMotionError(
-            f"no heading from these steps: the way of {walk.length_m:.1f} m is too short; {_ADVICE}"
-        )
     if walk.stops:
         _check_end(trim(moving, walk.end_s, np.inf), upright)
     reset = _headings(walk, trim(moving, walk.start_s, walk.end_s), upright)
@@ -57,7 +49,7 @@ def headings_from_steps(moving: Hold, upright: Array, must_stop: bool = True) ->
         lengths = ", ".join(f"{length:.1f}" for length in walk.lengths_m)
         raise WeakMotionError(
             f"no heading from these steps: the way of {uncertain} does not fit the others "
-            f"(in m: {lengths}); {_ADVICE}"
+            f"(in m: {lengths}); {ADVICE}"
         )
     return reset
 
@@ -73,11 +65,11 @@ def _check_end(end: Hold, upright: Array) -> None:
     turned = float(np.degrees(np.median(np.angle(np.exp(1j * rot.yaw_of_quat(between))))))
     if abs(turned) > TURN_LIMIT_DEG:
         raise WeakMotionError(
-            f"no heading from these steps: the wearer turned by {abs(turned):.0f} deg; {_ADVICE}"
+            f"no heading from these steps: the wearer turned by {abs(turned):.0f} deg; {ADVICE}"
         )
     tilt = np.degrees(2.0 * np.arcsin(np.clip(np.hypot(between[:, 1], between[:, 2]), 0.0, 1.0)))
     if other := over(tilt, POSE_LIMIT_DEG):
-        raise WeakMotionError(f"no heading from these steps: another pose after them: {other}; {_ADVICE}")
+        raise WeakMotionError(f"no heading from these steps: another pose after them: {other}; {ADVICE}")
 
 
 def _headings(walk: Walk, moving: Hold, upright: Array) -> HeadingReset:
@@ -101,7 +93,7 @@ def _headings(walk: Walk, moving: Hold, upright: Array) -> HeadingReset:
             forward[i], error_deg[i], lean, np.hypot(spread_deg / 2.0, _LEAN_ERROR_DEG)
         )
     if surplus < 0.0:  # heels rise behind
-        raise WeakMotionError(f"no heading from these steps: the wearer walked backwards; {_ADVICE}")
+        raise WeakMotionError(f"no heading from these steps: the wearer walked backwards; {ADVICE}")
     warnings = [
         f"the heading of {name} is only known to {error:.0f} deg: its way differs from the others'"
         for name, error in zip(PLACEMENTS, error_deg, strict=True)

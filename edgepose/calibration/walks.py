@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +16,11 @@ from edgepose.rotations import Array
 
 LONGEST_S, LONGEST_OPEN_S = 10.0, 4.5
 """Longest walk from stand to stand, and longest used part of one without a stop; errors grow with time."""
+
+SHORTEST_M = 0.4
+"""Shortest way that counts, metres."""
+
+ADVICE = "let the arms hang, take two or three calm steps straight ahead, and stand still as before"
 
 STAND_S = 0.8
 """Shortest stand, seconds."""
@@ -64,28 +68,31 @@ def find_walk(moving: Hold, must_stop: bool) -> Walk:
         must_stop: refuse a walk without a stand after it.
 
     Raises:
-        WeakMotionError: there is no stand before the walk, or none after it.
+        WeakMotionError: there is no stand before the walk, or none after it, or the way is too short.
         CalibrationError: a sensor measures no acceleration, or lost samples.
     """
     sensors = [_complete(sensor) for sensor in moving]
     if without := [n for n, s in zip(PLACEMENTS, sensors, strict=True) if len(s.time_s) < 2]:
         raise CalibrationError(f"no acceleration from {', '.join(without)}: use another --heading-reset")
     stands = list(_stands(sensors))
-    if not stands:
+    first, last = max(sensor.time_s[0] for sensor in sensors), min(sensor.time_s[-1] for sensor in sensors)
+    if not stands or (len(stands) == 1 and stands[0][0] > first + _STRIDE_S):
         raise WeakMotionError("the wearer did not stand still before the steps; first stand for a second")
-    between = [(a[1], b[0]) for a, b in pairwise(stands) if b[0] - a[1] < LONGEST_S]
-    walks = [_walk(sensors, start, end, True) for start, end in between]
+    starts = [end for _, end in stands]
+    ends = [start for start, _ in stands[1:]]
+    closed = [(start, end) for start, end in zip(starts, ends, strict=False) if end - start < LONGEST_S]
+    walks = [_walk(sensors, start, end, True) for start, end in closed]
     longest = max(walks, key=lambda walk: walk.length_m, default=None)
-    last = min(s.time_s[-1] for s in sensors)
-    if longest is None or (not must_stop and longest.length_m < 0.3):
-        starts = [end for _, end in stands if last - end > 2.0 * _STRIDE_S]
-        if must_stop or not starts:
-            what = "did not stand still after the steps" if starts else "did not take a step"
-            raise WeakMotionError(
-                f"the wearer {what}; take two or three steps straight ahead, and stand still until the end"
-            )
-        return _walk(sensors, starts[0], min(starts[0] + LONGEST_OPEN_S, last), False)
-    return longest
+    if longest is not None and longest.length_m >= SHORTEST_M:
+        return longest
+    spans = zip(starts, [*ends, last], strict=True)
+    opened = [start for start, end in spans if end - start > 2.0 * _STRIDE_S]
+    if opened and not must_stop:
+        return _walk(sensors, opened[0], min(opened[0] + LONGEST_OPEN_S, last), False)
+    if opened and opened[0] not in [start for start, _ in closed]:
+        raise WeakMotionError(f"the wearer did not stand still after the steps; {ADVICE}")
+    length_m = 0.0 if longest is None else longest.length_m
+    raise WeakMotionError(f"no heading from these steps: the way of {length_m:.1f} m is too short; {ADVICE}")
 
 
 def _complete(sensor: SensorHold) -> SensorHold:

@@ -12,8 +12,9 @@ from edgepose import rotations as rot
 from edgepose.analysis.report import find_slips
 from edgepose.calibration.misfit import MisfitDetector
 from edgepose.calibration.slip import Slip, SlipMonitor
+from edgepose.diagnostics.sensor_health import SensorHealthMonitor
 from edgepose.formats.recordings.registry import read_recording
-from edgepose.imu import ImuFrame
+from edgepose.imu import ImuFrame, ImuSample
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.pose import PoseSequence
 from edgepose.skeleton import default_body, local_from_global
@@ -101,6 +102,20 @@ def test_a_run_warns_once_and_keeps_it(walked):
     assert lines[0].startswith("warning: pelvis has turned on its limb by about 4")
     assert lines[0].endswith("its tilt disagreed with all others; put it back, or calibrate again")
     assert [slip.placement for slip in detector.slips] == ["pelvis"]
+
+
+def test_check_finds_it_in_a_recording(walked):
+    made, quats = walked
+    later = np.concatenate([quats[:100], turned(made, quats, 5, "x", 40.0)[100:1000]])
+    forces = rot.quat_rotate(rot.quat_conjugate(later), [0.0, 0.0, cal.GRAVITY])
+    monitor = SensorHealthMonitor(made)
+    rows = [(i, k) for k in range(len(later)) for i in range(6)]
+    samples = [ImuSample(i, k / RATE, tuple(later[k, i]), tuple(forces[k, i])) for i, k in rows]
+    for first in range(0, len(samples), 600):
+        monitor.add(samples[first : first + 600])
+    found = {row.placement: row.impossible for row in monitor.report(len(later) / RATE) if row.impossible}
+    assert list(found) == ["pelvis"]
+    assert found["pelvis"].startswith("it has turned on its limb by about 4")
 
 
 def test_poses_of_a_file_show_it():

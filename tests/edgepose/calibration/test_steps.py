@@ -59,7 +59,7 @@ def test_steps_of_a_real_wearer():
         ({"way_m": 0.2}, r"the way of 0\.2 m is too short; .* two or three calm steps"),
         ({"way_m": -1.4}, "the wearer walked backwards"),
         ({"turn_deg": 40.0}, "the wearer turned by 40 deg"),
-        ({"stand_s": (0.0, 2.0)}, "did not stand still before the steps|did not take a step"),
+        ({"stand_s": (0.0, 2.0)}, "did not stand still before the steps"),
         ({"stand_s": (2.0, 0.0)}, "did not stand still after the steps"),
         ({"lifted_deg": 40.0}, r"another pose after them: right_forearm \(40 deg\)"),
         (
