@@ -189,7 +189,7 @@ def test_calibrations_that_would_be_wrong_are_refused(rig, tmp_path, words, says
     ("words", "says"),
     [
         ((), "no orientation from left_forearm, right_forearm, left_lower_leg"),
-        (("--filter", "kalman"), "headings are arbitrary: add --heading-reset motion"),
+        (("--filter", "kalman"), "headings are arbitrary: add --heading-reset steps, motion"),
     ],
 )
 def test_a_live_wearer_hears_at_once_what_is_missing(rig, tmp_path, monkeypatch, words, says):
