@@ -150,22 +150,23 @@ def simulated(motion: Motion, seed: int, filter: str) -> Result:
 
 
 def real() -> Result:
-    """Calibrate the real walker, who walks on, by the first steps; forward is unknown and counts as right."""
+    """Calibrate the real walker, who walks on, by the first steps; forward is unknown."""
     everything = cal.hold_from_recording(read_recording(REAL))
     straight = cal.check_hold(cal.trim(everything, *REAL_HOLD)).orientation
     reset = cal.headings_from_steps(cal.trim(everything, *REAL_STEPS), straight, must_stop=False)
     return result(reset, np.full(len(PLACEMENTS), np.angle(np.exp(1j * reset.offset).mean())))
 
 
-def row(name: str, wearers: int, refused: int, results: list[Result]) -> str:
-    """Return a row of the table."""
+def row(name: str, wearers: int, refused: int, results: list[Result], known: bool = True) -> str:
+    """Return a row of the table; `known` says whether forward is."""
     apart = np.abs([r.apart_deg for r in results])
     cells = [f"{of_sensor.mean():.1f}, {of_sensor.max():.1f}" for of_sensor in apart.T]
     forward = np.abs([r.forward_deg for r in results])
+    ahead = f"{forward.mean():.1f}, {forward.max():.1f}" if known else "-"
     estimated = np.mean([r.estimated_deg for r in results])
     return (
-        f"| {name} | {wearers} | {refused} | {' | '.join(cells)} | {apart.mean():.1f} | "
-        f"{forward.mean():.1f}, {forward.max():.1f} | {estimated:.1f} |"
+        f"| {name} | {wearers} | {refused} | {' | '.join(cells)} | {apart.mean():.1f} | {ahead} | "
+        f"{estimated:.1f} |"
     )
 
 
@@ -188,7 +189,7 @@ def main(motions: tuple[Path, ...], filters: tuple[str, ...]) -> None:
                 click.echo(f"wearer {seed}, {filter}: {error}", err=True)
         name = "true orientations" if filter == "none" else f"`{filter}`"
         click.echo(row(name, len(found), refused, results))
-    click.echo(row("real walker", 1, 0, [real()]))
+    click.echo(row("real walker", 1, 0, [real()], known=False))
 
 
 if __name__ == "__main__":

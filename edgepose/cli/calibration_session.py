@@ -147,7 +147,9 @@ def measure_live(
             straight = summary.orientation
             wait_s = min(plan.countdown_s, MOVE_COUNTDOWN_S)
             t_pose = record_hold(
-                batches, "t-pose", wait_s, plan.hold_s, guide, lambda held: _raised(straight, held)
+                *(batches, "t-pose", wait_s, plan.hold_s, guide),
+                lambda held: _raised(straight, held),
+                at_once=True,
             )
         if plan.heading_reset == "motion":
             upright = summary.orientation

@@ -78,6 +78,7 @@ def record_hold(
     hold_s: float,
     guide: Guide,
     check: Callable[[Hold], Any],
+    at_once: bool = False,
 ) -> Any:
     """Record a live hold, and return what `check` returns for it.
 
@@ -88,13 +89,14 @@ def record_hold(
         hold_s: length of the hold, seconds.
         guide: shows the wearer what to do.
         check: evaluates the hold; if it raises HoldError, the hold is repeated.
+        at_once: do not wait for the phone's start button: the wearer must not move away.
 
     Raises:
         HoldError: there was movement, or a silent sensor, in every repetition.
         EdgeposeError: the source ended too early.
     """
     text = _INSTRUCTIONS[pose]
-    if guide.phone is not None:
+    if guide.phone is not None and not at_once:
         wait_for_start(batches, guide, f"Press start; {countdown_s:g} s later the hold begins. {text}", pose)
     guide.instruct(text)
     countdown = Stage(COUNTDOWN, "", text, pose, countdown_s, "The hold starts in {} s")
