@@ -108,6 +108,7 @@ class OutputConfig:
         leg_length: length of the wearer's thigh and shank, metres; None for the average at this height.
         overwrite: replace existing files.
         rate: poses per second that are written, interpolated; None for the network's.
+        page_port: TCP port of the viewer's page; None for 8080 or the next one that is free.
     """
 
     targets: tuple[tuple[str, Any], ...]
@@ -117,6 +118,7 @@ class OutputConfig:
     leg_length: float | None
     overwrite: bool
     rate: float | None
+    page_port: int | None
 
     def __init__(
         self,
@@ -128,6 +130,7 @@ class OutputConfig:
         leg_length: float | None = None,
         overwrite: bool = False,
         rate: float | None = None,
+        page_port: int | None = None,
         sinks: Mapping[str, str | list[str]] | None = None,
         **outputs: Any,
     ) -> None:
@@ -141,6 +144,7 @@ class OutputConfig:
             leg_length: length of the wearer's thigh and shank, metres.
             overwrite: replace existing files.
             rate: poses per second that are written; None for the network's.
+            page_port: TCP port of the viewer's page.
             sinks: targets of outputs from other packages (entry points `edgepose.sinks`), by output name; a
                 list of them for several.
             **outputs: targets of this package's outputs, as text or parsed; True for `view`. A list stands
@@ -168,7 +172,9 @@ class OutputConfig:
             )
         if rate is not None and not RATES[0] <= rate <= RATES[1]:
             raise ConfigError(f"rate: {rate:g} is not from {RATES[0]:g} to {RATES[1]:g} poses per second")
-        values = (tuple(pairs), rotations, std, height, leg_length, overwrite, rate)
+        if page_port is not None and not (1 <= page_port <= 65535 and "view" in dict(pairs)):
+            raise ConfigError(f"--page-port {page_port}: give a port up to 65535, for the page of --view")
+        values = (tuple(pairs), rotations, std, height, leg_length, overwrite, rate, page_port)
         for each, value in zip(dataclasses.fields(self), values, strict=True):
             object.__setattr__(self, each.name, value)
 
@@ -309,8 +315,8 @@ class WearerConfig:
 _TEXT, _SWITCH, _WHOLE, _NUMBER = "text in quotes", "true or false", "a whole number", "a number"
 _TEXTS = "text in quotes or a list of such texts"
 
-_TYPES: dict[str, tuple[type, ...]] = {_TEXT: (str,), _SWITCH: (bool,), _WHOLE: (int,), _NUMBER: (int, float)}
-_TYPES[_TEXTS] = (str,)
+_TYPES: dict[str, Any] = dict.fromkeys((_TEXT, _TEXTS), (str,))
+_TYPES |= {_SWITCH: (bool,), _WHOLE: (int,), _NUMBER: (int, float)}
 
 _FILES = ("file", "sensors", "calibration", *(name for name, output in SINKS.items() if output.suffix))
 """Keys whose values are files, relative to the TOML file; that of `protocol` may be one too."""
@@ -337,6 +343,7 @@ _KEYS = {
     "leg-length": _NUMBER,
     "overwrite": _SWITCH,
     "rate": _NUMBER,
+    "page-port": _WHOLE,
     "no-place": _SWITCH,
     "control": _TEXT,
 }

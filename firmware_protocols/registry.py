@@ -35,6 +35,8 @@ BUILT_IN = {
     "witmotion-can": "witmotion_can:PROTOCOL",
     "ximu3": "ximu3:PROTOCOL",
     "slimevr": "slimevr:PROTOCOL",
+    "slimevr-hid": "slimevr_hid:PROTOCOL",
+    "dot": "dot:PROTOCOL",
     "haritorax": "haritorax:PROTOCOL",
     "lpms": "lpms:PROTOCOL",
     "bno08x-rvc": "bno08x:PROTOCOL",

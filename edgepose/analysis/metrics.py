@@ -73,12 +73,21 @@ def joint_angle_error(predicted: ArrayLike, true: ArrayLike, joints: Sequence[in
         true: (T, 24, 3, 3) local rotations.
         joints: the 15 joints that a network predicts, or `UNOBSERVED`, the 10 of them without a sensor.
     """
+    return angle_errors(predicted, true)[:, list(joints)].mean(axis=-1)
+
+
+def angle_errors(predicted: ArrayLike, true: ArrayLike) -> Array:
+    """Return the geodesic distances (T, 24), degrees, of the root-aligned global rotations of all joints.
+
+    Args:
+        predicted: (T, 24, 3, 3) local rotations.
+        true: (T, 24, 3, 3) local rotations.
+    """
     predicted, true = _same_shape(predicted, true)
     no_offsets = np.zeros((24, 3))
     rotations, _ = _root_aligned(predicted, no_offsets)
     reference, _ = _root_aligned(true, no_offsets)
-    chosen = list(joints)
-    return np.rad2deg(geodesic_angle(rotations[:, chosen], reference[:, chosen])).mean(axis=-1)
+    return np.rad2deg(geodesic_angle(rotations, reference))
 
 
 def position_error(predicted: ArrayLike, true: ArrayLike, offsets: ArrayLike) -> Array:

@@ -17,6 +17,7 @@ from typing import NoReturn
 import click
 
 from edgepose import __version__
+from edgepose.cli import exit_codes
 from edgepose.cli.repeated_options import refuse_repeats
 from edgepose.cli.terminal.messages import prepare, say
 from edgepose.cli.terminal.stop_signal import stop_signals
@@ -89,7 +90,9 @@ class LazyGroup(click.Group):
 
 
 @click.group(
-    cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110}
+    cls=LazyGroup,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    epilog=f"\b\nExit codes:\n{exit_codes.table()}",
 )
 @click.version_option(__version__, prog_name="edgepose")
 @click.option("--debug", is_flag=True, help="Show the full traceback of an error.")
@@ -111,7 +114,7 @@ def _terminate(number: int, frame: FrameType | None) -> NoReturn:
 def main() -> NoReturn:
     """Run the command line, and report an error as one line on stderr.
 
-    Exit codes: 0 done, 1 the job failed, 2 wrong use, 130 interrupted.
+    `edgepose.cli.exit_codes` lists the exit codes.
     """
     prepare()
     # Like Ctrl-C, these signals end a run with complete files and a summary. Under nohup, SIGHUP is ignored.
@@ -135,13 +138,13 @@ def main() -> NoReturn:
         sys.exit(error.exit_code)
     except (click.Abort, KeyboardInterrupt):
         say("edgepose: stopped")
-        sys.exit(130)
+        sys.exit(exit_codes.INTERRUPTED)
     except BrokenPipeError:  # stdout: its buffer must not be flushed again at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        sys.exit(1)
+        sys.exit(exit_codes.FAILED)
     except Exception as error:
         say(traceback.format_exc().rstrip() if debug else f"edgepose: {as_edgepose_error(error)}")
-        sys.exit(1)
+        sys.exit(exit_codes.FAILED)
     finally:
         # An interrupt while Python shuts down would only print a traceback.
         for number in stop_signals():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -34,6 +34,9 @@ from edgepose.rotations import Array
 from edgepose.sources import Batch, Device, open_source
 from edgepose.sources.replay import is_recording
 from edgepose.utils.fault_messages import HEADING_RESETS
+
+Notify = Callable[[str], None]
+"""Shows a line to the user."""
 
 END_S = 0.1
 """Longest time from the last sample of a recording to its end, seconds."""
@@ -196,25 +199,25 @@ def _check_before_hold(
 
 
 def measure_recorded(
-    source: SourceConfig, plan: CalibrationPlan, orient: OrientationStage, guide: Guide
+    source: SourceConfig, plan: CalibrationPlan, orient: OrientationStage, notify: Notify
 ) -> Measured:
     """Find the hold and the heading reset in a recording.
 
     Raises:
         EdgeposeError: they are not in it, the wearer moved, or headings would be arbitrary.
     """
-    reset, damaged = _side_by_side(source, plan, orient, guide)
+    reset, damaged = _side_by_side(source, plan, orient, notify)
     everything, damage, devices = _read(source, orient)
     _check_north(orient, plan, devices)
-    still, start_s = _window(source.name, (everything, damage), plan.start, plan.hold_s, guide)
+    still, start_s = _window(source.name, (everything, damage), plan.start, plan.hold_s, notify)
     if plan.start is None:
-        guide("If the wearer stood in the pose at another time, give its start with --from.")
+        notify("If the wearer stood in the pose at another time, give its start with --from.")
     summary = calibration.check_hold(still, "choose a still part with --from, or record again")
     t_pose = None
     if plan.pose == TWO_POSES:
         end_s = start_s + plan.hold_s
         t_start_s = calibration.t_pose_start(everything, summary.orientation, end_s, plan.hold_s)
-        guide(f"{source.name}: T-pose from {t_start_s:.2f} to {t_start_s + plan.hold_s:.2f} s.")
+        notify(f"{source.name}: T-pose from {t_start_s:.2f} to {t_start_s + plan.hold_s:.2f} s.")
         held = calibration.trim(everything, t_start_s, t_start_s + plan.hold_s)
         t_pose = _raised(summary.orientation, held)
     if plan.heading_reset == "motion":
@@ -266,7 +269,7 @@ def _movements(name: str, everything: Hold, plan: CalibrationPlan, begin_s: floa
 
 
 def _side_by_side(
-    source: SourceConfig, plan: CalibrationPlan, orient: OrientationStage, guide: Guide
+    source: SourceConfig, plan: CalibrationPlan, orient: OrientationStage, notify: Notify
 ) -> tuple[HeadingReset | None, bool]:
     """Return the heading reset from a recording of the sensors lying side by side, if the plan names one.
 
@@ -278,7 +281,7 @@ def _side_by_side(
     path = plan.side_by_side
     if path is None:
         return None, False
-    guide(f"Heading reset from {path}.")
+    notify(f"Heading reset from {path}.")
     fresh = orient.fresh()
     everything, damage, _ = _read(dataclasses.replace(source, file=path, port=None, can=None), fresh)
     if not fresh.north:
@@ -286,7 +289,7 @@ def _side_by_side(
             "without magnetometers the filter starts each recording with arbitrary headings, which another "
             f"recording cannot reset: use {HEADING_RESETS}"
         )
-    lying, _ = _window(str(path), (everything, damage), None, plan.hold_s, guide)
+    lying, _ = _window(str(path), (everything, damage), None, plan.hold_s, notify)
     return calibration.headings_side_by_side(lying), damage is not None
 
 
@@ -348,12 +351,16 @@ def _serial_numbers(sensors: Path | None) -> Mapping[int, str] | None:
 
 
 def _window(
-    name: str, read: tuple[Hold, str | None], at: RecordingTime | None, seconds: float, guide: Guide
+    name: str,
+    read: tuple[Hold, str | None],
+    at: RecordingTime | None,
+    seconds: float,
+    notify: Notify,
 ) -> tuple[Hold, float]:
     """Return the hold in a recording, and its start on the recording's clock, seconds."""
     everything, damage = read
     if damage:
-        guide(f"warning: {damage}")
+        notify(f"warning: {damage}")
     first, last = _extent(everything)
     start = calibration.stillest_start(everything, seconds) if at is None else at.on_clock(first)
     if at is not None and not first - 1e-6 <= start <= last - seconds + END_S:
@@ -362,7 +369,7 @@ def _window(
             f"{last:.2f} s, choose --from and --hold within that"
         )
     why = "" if at is not None else ", the first of the stillest parts"
-    guide(f"{name}: hold from {start:.2f} to {start + seconds:.2f} s{why}.")
+    notify(f"{name}: hold from {start:.2f} to {start + seconds:.2f} s{why}.")
     hold = calibration.trim(everything, start, start + seconds)
     calibration.check_covered(hold, start, start + seconds)
     return hold, start

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Sequence
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +15,9 @@ from edgepose.cli.calibration_session import Measured
 from edgepose.config import SourceConfig
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
+
+DAMAGED = "a part of the recording was left out, see the warnings"
+"""Problem of a calibration from the good part of a damaged recording."""
 
 GOOD_RESIDUAL_DEG, GOOD_HEADING_DEG = 1.0, 15.0
 
@@ -70,3 +74,41 @@ def table(result: Calibration, measured: Measured) -> str:
             f"{'-' if math.isnan(force) else f'{force:.2f}':>7}{heading:>8}{error:>10}  {sits}"
         )
     return "\n".join(lines)
+
+
+def values(
+    source: SourceConfig, out: str, measured: Measured, result: Calibration, warnings: Sequence[str]
+) -> dict[str, Any]:
+    """Return a calibration for scripts; docs/reference/scripts.md describes the keys."""
+    summary, reset = measured.summary, measured.reset
+    judgement = judge(result, measured, warnings)
+    nothing = np.full(len(PLACEMENTS), math.nan)
+    return {
+        "source": source.name,
+        "out": out,
+        "result": "damaged" if measured.damaged else "ok",
+        "problem": DAMAGED if measured.damaged else None,
+        "verdict": judgement.word,
+        "advice": judgement.text,
+        "hold_from_s": measured.from_s,
+        "warnings": list(warnings),
+        "sensors": [
+            {
+                "placement": name,
+                "samples": summary.samples[i],
+                "residual_deg": result.residual_deg[i],
+                "force_m_s2": np.linalg.norm(summary.force[i]),
+                "heading_deg": math.nan if reset is None else math.degrees(reset.offset[i]),
+                "heading_error_deg": (nothing if reset is None else reset.error_deg)[i],
+                "mounting": mounted,
+            }
+            for i, (name, mounted) in enumerate(zip(PLACEMENTS, mounting(result), strict=True))
+        ],
+    }
+
+
+def values_of_failed(source: Path, out: Path, problem: str) -> dict[str, Any]:
+    """Return the same keys for a recording that gave no calibration."""
+    unknown = dict.fromkeys(("verdict", "advice", "hold_from_s"))
+    about = {"source": source, "out": out, "result": "failed", "problem": problem}
+    return {**about, **unknown, "warnings": [], "sensors": []}

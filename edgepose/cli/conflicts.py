@@ -33,6 +33,14 @@ def check_lines(wearers: Sequence[WearerConfig]) -> None:
                 )
 
 
+def check_pages(wearers: Sequence[WearerConfig]) -> None:
+    """Raise EdgeposeError if two wearers want their pages at the same port."""
+    for wearer, other in combinations(wearers, 2):
+        port = wearer.outputs.page_port
+        if port is not None and port == other.outputs.page_port:
+            raise EdgeposeError(f"{wearer.path}, {other.path}: both have page-port {port}; give each its own")
+
+
 def check_all_live(wearers: Sequence[WearerConfig]) -> None:
     """Raise click.UsageError if some wearers are live and others are read at once."""
     live = wearers[0].source.live

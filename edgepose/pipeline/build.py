@@ -8,15 +8,13 @@ from datetime import datetime
 from functools import partial
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 import edgepose
 from edgepose.calibration import load_calibration
 from edgepose.calibration.misfit import MisfitDetector
 from edgepose.calibration.rezero import HeadingRezero
 from edgepose.config import WearerConfig
 from edgepose.diagnostics.rig_monitor import RigMonitor
-from edgepose.errors import EdgeposeError, FileFormatError, prefix_errors
+from edgepose.errors import FileFormatError, prefix_errors
 from edgepose.orientation.stage import OrientationStage
 from edgepose.pipeline.calibrated_settings import age_days, check_settings, with_calibrated_settings
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
@@ -25,8 +23,8 @@ from edgepose.pipeline.place_stage import PlaceStage
 from edgepose.pipeline.pose_resampler import PoseResampler
 from edgepose.pipeline.remote_control import Request, Requests
 from edgepose.pipeline.rig_comparison import changes, missing_heading_reset, missing_quantities
+from edgepose.pipeline.run_report import RunReport, about, latency
 from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
-from edgepose.placements import PLACEMENTS
 from edgepose.sinks.open import open_outputs
 from edgepose.sources import open_source
 from edgepose.sources.live import unix_now
@@ -107,6 +105,7 @@ class OpenWearer:
                 about=about,
                 clock=unix_now if self._config.source.file is None else None,
                 paced=self._config.source.live,
+                press=self._requests.press if self._config.source.live else None,
             )
 
     def pipeline(
@@ -158,55 +157,28 @@ class OpenWearer:
             *missing_quantities(self._calibration, [], self._orient.without_field),
         ]
 
-    def report(self, pipeline: WearerPipeline, rate: float, future: int) -> EdgeposeError | None:
-        """Report the counts of a finished pipeline; return the error that ended it, if any."""
-        summary, counts = pipeline.summary, self.source.counters
-        speed = summary.poses / summary.seconds if summary.seconds else 0.0
-        self.notify(
-            f"poses    {summary.poses} in {summary.seconds:.1f} s, {speed:.1f} per second; "
-            f"{summary.warming_up} while the window was filling"
+    def report(self, pipeline: WearerPipeline, rate: float, future: int) -> RunReport:
+        """Return the report on a finished pipeline, with the error that ended it, if any."""
+        config, summary = self._config, pipeline.summary
+        notes = [
+            *self._orient.summary_lines(),
+            *(line for sink in self._sinks for line in sink.summary_lines()),
+        ]
+        if config.outputs.rate is not None:
+            notes.insert(0, f"rate     written at {config.outputs.rate:g} poses per second")
+        damage = FileFormatError(self.source.damage) if self.source.damage else None
+        return RunReport(
+            **about(config),
+            summary=summary,
+            packets=self.source.counters,
+            late=pipeline.clock.dropped,
+            skipped=pipeline.skipped,
+            restarts=pipeline.clock.restarts,
+            latency=latency(summary, future / rate) if config.source.live else None,
+            frames=future,
+            notes=(*notes, *self._requests.summary_lines()),
+            error=summary.error or damage,
         )
-        self.notify(
-            f"packets  {counts.packets} good, {counts.lost} lost, {counts.bad} bad; "
-            f"{pipeline.clock.dropped} samples too late or duplicate"
-        )
-        if self._config.outputs.rate is not None:
-            self.notify(f"rate     written at {self._config.outputs.rate:g} poses per second")
-        if pipeline.skipped:
-            self.notify(f"skipped  {pipeline.skipped} poses at live outputs: they came too late")
-        if pipeline.clock.restarts:
-            self.notify(
-                f"clock    restarted {pipeline.clock.restarts} times, "
-                "after all sensors were silent for a minute or more"
-            )
-        if summary.held:
-            worst = sorted(zip(summary.held_by_sensor, PLACEMENTS, strict=True), reverse=True)
-            self.notify(
-                "held     " + ", ".join(f"{name} in {count} frames" for count, name in worst if count)
-            )
-        for slip in summary.slips:
-            self.notify(f"slipped  {slip.placement} by about {slip.angle_deg:.0f} deg")
-        if summary.way_m is not None:
-            self.notify(f"way      {summary.way_m:.1f} m walked")
-        if summary.latencies_s and self._config.source.live:
-            self.notify(_latency(summary, rate, future))
-        lines = self._orient.summary_lines()
-        for sink in self._sinks:
-            lines += sink.summary_lines()
-        for line in lines + self._requests.summary_lines():
-            self.notify(line)
-        if summary.error is None and self.source.damage:
-            return FileFormatError(self.source.damage)
-        return summary.error
-
-
-def _latency(summary: RunSummary, rate: float, future: int) -> str:
-    p50, p99, most = np.percentile(np.array(summary.latencies_s) * 1e3, [50, 99, 100])
-    ahead = f" plus {future} frames of look-ahead, {future / rate * 1e3:.0f} ms" if future else ""
-    return (
-        f"latency  {p50:.1f} ms median, {p99:.1f} ms p99, {most:.1f} ms max "
-        f"from last packet to pose sent{ahead}"
-    )
 
 
 def load_wearer(config: WearerConfig, notify: Notify) -> tuple[WearerConfig, Calibration]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from edgepose.errors import ConfigError
 
@@ -107,19 +107,27 @@ class Network:
 
         return has_place(self.info.metadata)
 
+    def values(self) -> Mapping[str, Any]:
+        """Return the network for scripts; docs/reference/scripts.md describes the keys."""
+        return {
+            "model": self.config.model,
+            "kind": self.kind,
+            "mode": "window" if self.windowed else "stream",
+            "rate_hz": self.rate_hz,
+            "look_ahead_s": self.future / self.rate_hz,
+        }
+
     @property
     def faster(self) -> list[str]:
         """Flags of `edgepose run` that would make it faster."""
         flags = ["--online stream"] if self.windowed else []
         return flags if self.kind == "rnn" else [*flags, "--model rnn"]
 
-    def load(
-        self, wearers: Sequence[WearerConfig], notify: Callable[[str], None]
-    ) -> tuple[Engine | MultiWearerEngine, str]:
-        """Load the network, and return an engine for these wearers and how it runs, "fp16" for example.
+    def load(self, no_place: bool, notify: Callable[[str], None]) -> ReadyNetwork:
+        """Load the network.
 
         Args:
-            wearers: one wearer, or several who share the network.
+            no_place: no wearer is followed through the room.
             notify: called with one message if the precision is slow here or had to be changed, and one if
                 the model cannot tell where wearers are.
 
@@ -130,35 +138,58 @@ class Network:
 
         config = self.config
         loaded = load(self.info, config.trust, config.runtime, config.precision, notify)
-        place = not all(wearer.no_place for wearer in wearers)
-        if place and not self.has_place:
+        if not no_place and not self.has_place:
             notify(
                 f"{config.model} does not estimate contacts: the lowest foot counts as standing still, "
                 "so the path is less accurate"
             )
-            place = False
-        described = loaded.precision + (" with numpy" if loaded.runtime == "numpy" else "")
-        return self._engine(loaded, wearers, place), described
+        return ReadyNetwork(self, loaded, self.has_place and not no_place)
 
-    def _engine(
-        self, loaded: LoadedNetwork, wearers: Sequence[WearerConfig], place: bool
-    ) -> Engine | MultiWearerEngine:
-        from edgepose.inference.engine import (
-            FRAMES_PER_STEP,
-            MultiWearerEngine,
-            StreamEngine,
-            WindowEngine,
+
+class ReadyNetwork(NamedTuple):
+    """A network that is loaded.
+
+    Attributes:
+        network: what was loaded, and how it is to run.
+        loaded: its module.
+        place: whether it estimates where wearers are.
+    """
+
+    network: Network
+    loaded: LoadedNetwork
+    place: bool
+
+    @property
+    def precision(self) -> str:
+        """How it runs, "fp16" for example."""
+        return self.loaded.precision + (" with numpy" if self.loaded.runtime == "numpy" else "")
+
+    def engine(self, wearer: WearerConfig) -> Engine:
+        """Return a new engine for one wearer."""
+        from edgepose.inference.engine import FRAMES_PER_STEP, StreamEngine, WindowEngine
+
+        network, module = self.network, self.loaded.module
+        if network.windowed:
+            return WindowEngine(module, network.past, network.future, place=self.place)
+        # No one waits for single poses of a recording, so several frames go into a step.
+        source = wearer.source
+        recorded = not source.live and source.file is not None and source.file.is_file()
+        together = recorded and self._batched and hasattr(module, "stream_many")
+        frames_per_step = FRAMES_PER_STEP if together else 1
+        return StreamEngine(module, network.past, network.future, frames_per_step, place=self.place)
+
+    def engine_for_all(self, wearers: Sequence[WearerConfig]) -> Engine | MultiWearerEngine:
+        """Return a new engine for one wearer, or for several who share the network."""
+        from edgepose.inference.engine import MultiWearerEngine
+
+        if len(wearers) == 1:
+            return self.engine(wearers[0])
+        network, isolate = self.network, not self._batched
+        return MultiWearerEngine(
+            *(self.loaded.module, network.past, network.future, len(wearers), isolate), place=self.place
         )
 
+    @property
+    def _batched(self) -> bool:
         # int8 activations share one scale per batch, so batching would change results.
-        module, batched = loaded.module, loaded.precision != "int8"
-        if len(wearers) > 1:
-            return MultiWearerEngine(module, self.past, self.future, len(wearers), not batched, place=place)
-        if self.windowed:
-            return WindowEngine(module, self.past, self.future, place=place)
-        # No one waits for single poses of a recording, so several frames go into a step.
-        source = wearers[0].source
-        recorded = not source.live and source.file is not None and source.file.is_file()
-        together = recorded and batched and hasattr(module, "stream_many")
-        frames_per_step = FRAMES_PER_STEP if together else 1
-        return StreamEngine(module, self.past, self.future, frames_per_step, place=place)
+        return self.loaded.precision != "int8"

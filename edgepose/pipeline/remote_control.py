@@ -1,12 +1,14 @@
-"""Requests during a run, by key or over UDP: to re-zero the headings, or to reset the place to the origin.
+"""Requests during a run: to re-zero the headings, or to reset the place to the origin.
 
-Over UDP they are the texts `rezero` and `origin`, or the OSC messages /edgepose/rezero and /edgepose/origin.
+They come by key, by a button of the viewer, or over UDP: the texts `rezero` and `origin`, or the OSC messages
+/edgepose/rezero and /edgepose/origin.
 """
 
 from __future__ import annotations
 
 import math
 import struct
+from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
@@ -127,10 +129,17 @@ class Requests:
         self._control = None if control is None else stack.enter_context(Control(*control))
         self._by_key = by_key
         self._pending: dict[Action, float] = {}
+        self._pressed: deque[str] = deque(maxlen=16)
+
+    def press(self, key: str) -> None:
+        """Press a key of `KEYS` in an output such as the viewer; other threads may call this."""
+        self._pressed.append(key)
 
     def poll(self, action: Action) -> list[float]:
         """Return the delay of a new request for an action, the shortest of several, seconds."""
-        for request in self._by_key() + ([] if self._control is None else self._control.requests()):
+        pressed = [self._pressed.popleft() for _ in range(len(self._pressed))]
+        buttons = [KEYS[key] for key in pressed if key in KEYS]
+        for request in buttons + self._by_key() + ([] if self._control is None else self._control.requests()):
             # Only one is kept, so that a flood for an action that is not polled yet takes no memory.
             self._pending[request.action] = min(self._pending.get(request.action, inf), request.delay_s)
         return [self._pending.pop(action)] if action in self._pending else []

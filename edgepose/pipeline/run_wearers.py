@@ -14,6 +14,7 @@ from edgepose.pipeline.multi_wearer import POLL_S, Wearer, run_together
 from edgepose.pipeline.network import Network
 from edgepose.pipeline.remote_control import key_requests
 from edgepose.pipeline.run import run as run_alone
+from edgepose.pipeline.run_report import RunReport
 from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
 
 
@@ -81,25 +82,24 @@ def _ignore(summary: RunSummary) -> None:
 
 
 def report_wearers(
-    wearers: Sequence[WearerConfig],
-    opened: Sequence[OpenWearer],
-    pipelines: Sequence[WearerPipeline],
-    network: Network,
-) -> None:
-    """Report the counts of all wearers.
+    opened: Sequence[OpenWearer], pipelines: Sequence[WearerPipeline], network: Network
+) -> list[RunReport]:
+    """Report the counts of all wearers to their users, and return the reports."""
+    reports = []
+    for wearer, pipeline in zip(opened, pipelines, strict=True):
+        reports.append(wearer.report(pipeline, network.rate_hz, network.future))
+        for line in reports[-1].lines():
+            wearer.notify(line)
+    return reports
 
-    Raises:
-        EdgeposeError: a wearer's run ended in an error.
-    """
-    errors = [
-        wearer.report(pipeline, network.rate_hz, network.future)
-        for wearer, pipeline in zip(opened, pipelines, strict=True)
-    ]
-    failed = {wearer.name: error for wearer, error in zip(wearers, errors, strict=True) if error is not None}
+
+def raise_failures(reports: Sequence[RunReport]) -> None:
+    """Raise EdgeposeError if a wearer's run ended in an error, or a part of the source was damaged."""
+    failed = {report.wearer: report.error for report in reports if report.error is not None}
     if not failed:
         return
     first = next(iter(failed.values()))
-    if len(wearers) == 1:
+    if len(reports) == 1:
         raise first
     details = "; ".join(f"{name}: {error}" for name, error in failed.items())
-    raise EdgeposeError(f"{len(failed)} of {len(wearers)} wearers failed: {details}") from first
+    raise EdgeposeError(f"{len(failed)} of {len(reports)} wearers failed: {details}") from first

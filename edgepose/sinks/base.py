@@ -82,6 +82,8 @@ class SinkContext(NamedTuple):
         clock: returns the present time on the clock of the poses, seconds, if they are measured now; None
             for recordings.
         paced: poses come at the pace of their measurement, so that no reader is waited for.
+        page_port: TCP port of a page in the browser; None for any.
+        press: passes on keys that a user presses in an output, such as "r"; None if the run takes none.
     """
 
     body: Body
@@ -97,6 +99,8 @@ class SinkContext(NamedTuple):
     wearer: str = ""
     clock: Callable[[], float] | None = None
     paced: bool = False
+    page_port: int | None = None
+    press: Callable[[str], None] | None = None
 
 
 SinkFactory = Callable[[Any, SinkContext], Sink]

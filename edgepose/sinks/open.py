@@ -27,6 +27,7 @@ def open_outputs(
     about: Mapping[str, str] = MappingProxyType({}),
     clock: Callable[[], float] | None = None,
     paced: bool = False,
+    press: Callable[[str], None] | None = None,
 ) -> list[Sink]:
     """Open the sinks of one wearer. No file appears or is replaced before all of them are open.
 
@@ -42,6 +43,7 @@ def open_outputs(
         about: origin of the poses, see `PoseSequence`.
         clock: see `SinkContext`.
         paced: see `SinkContext`.
+        press: passes on keys that a user presses in an output, see `SinkContext`.
 
     Returns:
         The sinks in the order in which each pose should be written to them.
@@ -64,6 +66,8 @@ def open_outputs(
         wearer=wearer,
         clock=clock,
         paced=paced,
+        page_port=outputs.page_port,
+        press=press,
     )
     targets = sorted(outputs.targets, key=_rank)
     sinks = [stack.enter_context(sink_factory(name)(target, context)) for name, target in targets]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import entry_points
@@ -19,6 +19,7 @@ from edgepose.utils.output_targets import FileTarget, parse_file, part_path
 from edgepose.utils.sockets import (
     Address,
     Destination,
+    address_text,
     parse_datagram_address,
     parse_destination,
     parse_host_and_port,
@@ -88,6 +89,11 @@ class Output:
     def file(self, target: Any) -> str:
         """Return the file to which a target of an output with a suffix leads."""
         return target.path if isinstance(target, FileTarget) else str(target)
+
+    def in_folder(self, target: Any, name: Path) -> Any:
+        """Return the target of a file of some name, without ending, in the folder to which a target leads."""
+        path = str(Path(self.file(target)) / name.parent / f"{name.name}{self.suffix}")
+        return target._replace(path=path) if isinstance(target, FileTarget) else path
 
 
 _NAMES = ", ".join(BVH_NAMES)
@@ -190,6 +196,24 @@ SINKS = {
     ),
 }
 """All outputs of this package by name, in the order of their flags."""
+
+
+def target_texts(targets: Iterable[tuple[str, Any]]) -> list[tuple[str, str]]:
+    """Return name and target of outputs as text: a file, an address, or empty."""
+    return [(name, _target_text(name, target)) for name, target in targets]
+
+
+def described(targets: Iterable[tuple[str, Any]]) -> list[dict[str, str]]:
+    """Return outputs for scripts; docs/reference/scripts.md describes the keys."""
+    return [{"kind": name, "target": text} for name, text in target_texts(targets)]
+
+
+def _target_text(name: str, target: Any) -> str:
+    if name in SINKS and SINKS[name].suffix:
+        return SINKS[name].file(target)
+    if isinstance(target, tuple):
+        return address_text(*target[:2])
+    return "" if target is True else str(target)
 
 
 def sink_factory(name: str) -> SinkFactory:

@@ -6,6 +6,7 @@ import logging
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
 from importlib.util import find_spec
 from threading import Thread
 from typing import IO
@@ -15,6 +16,7 @@ from edgepose.pose import PoseFrame
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.sinks.udp import UdpSink
 from edgepose.skeleton import Body
+from edgepose.utils.sockets import check_page
 
 _log = logging.getLogger(__name__)
 
@@ -27,19 +29,29 @@ class ViewSink(Sink):
 
     live = True
 
-    def __init__(self, body: Body, wearer: str = "") -> None:
+    def __init__(
+        self,
+        body: Body,
+        wearer: str = "",
+        page_port: int | None = None,
+        press: Callable[[str], None] | None = None,
+    ) -> None:
         """Store the settings; `start` starts the viewer.
 
         Args:
             body: body of the figure, whose height and leg length the viewer gets.
             wearer: name before the viewer's messages.
+            page_port: TCP port of the page; None for the next one that is free.
+            press: called with the key of each button that is pressed on the page; None shows no buttons.
 
         Raises:
-            EdgeposeError: a package that the viewer needs is not installed.
+            EdgeposeError: a package that the viewer needs is not installed, or the port is taken.
         """
         if find_spec("viser") is None:
             raise EdgeposeError("the viewer needs viser: install it with pip install 'edgepose[view]'")
-        self._body, self._wearer = body, wearer
+        if page_port is not None:
+            check_page("127.0.0.1", page_port)
+        self._body, self._wearer, self._page_port, self._press = body, wearer, page_port, press
         self._viewer: subprocess.Popen[str] | None = None
 
     def start(self) -> None:
@@ -49,15 +61,22 @@ class ViewSink(Sink):
             port = free.getsockname()[1]
         command = [sys.executable, "-m", "edgepose", "view", "--udp", f"127.0.0.1:{port}", "--with-parent"]
         size = ["--height", str(self._body.height_m), "--leg-length", str(self._body.leg_length_m)]
+        if self._page_port is not None:
+            size += ["--page-port", str(self._page_port)]
+        # Buttons come back through a pipe, which no other program can write to.
+        buttons = [] if self._press is None else ["--buttons"]
         self._viewer = subprocess.Popen(
-            [*command, *size],
+            [*command, *size, *buttons],
             stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL if self._press is None else subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
         )
         assert self._viewer.stderr is not None
         Thread(target=_log_lines, args=(self._viewer.stderr, self._wearer), daemon=True).start()
+        if self._press is not None:
+            assert self._viewer.stdout is not None
+            Thread(target=_press_keys, args=(self._viewer.stdout, self._press), daemon=True).start()
         self._datagrams = UdpSink("127.0.0.1", port, "binary")
 
     def write(self, pose: PoseFrame) -> None:
@@ -86,6 +105,12 @@ def _log_lines(lines: IO[str], wearer: str) -> None:
                 _log.warning("%s%s", f"{wearer}: " if wearer else "", message)
 
 
+def _press_keys(lines: IO[str], press: Callable[[str], None]) -> None:
+    with lines:
+        for line in lines:
+            press(line.rstrip())
+
+
 def open_sink(target: bool, context: SinkContext) -> Sink:
     """Open a `ViewSink`."""
-    return ViewSink(context.body, context.wearer)
+    return ViewSink(context.body, context.wearer, context.page_port, context.press)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -43,6 +44,28 @@ def table(solution: Solution, measurements: Measurements) -> str:
         held = int(measurements.held[:frames, i].sum())
         lines.append(f"{name:18}{angle:15.2f}{acceleration:20.2f}{held:6d}")
     return "\n".join(lines)
+
+
+def values(solution: Solution, measurements: Measurements) -> dict[str, Any]:
+    """Return the same for scripts; docs/reference/scripts.md describes the keys."""
+    frames = len(solution.rotations)
+    sensors = [
+        {
+            "name": name,
+            "orientation_deg": angle,
+            "acceleration_m_s2": acceleration,
+            "held": int(measurements.held[:frames, i].sum()),
+        }
+        for i, (name, angle, acceleration) in enumerate(_residuals(solution, measurements))
+    ]
+    return {
+        "frames": len(measurements.time_s),
+        "poses": frames,
+        "evaluations": solution.evaluations,
+        "cost_per_frame": dict(zip(Costs._fields, solution.costs.mean(axis=0).tolist(), strict=True)),
+        "sensors": sensors,
+        "warnings": misfits(solution, measurements),
+    }
 
 
 def misfits(solution: Solution, measurements: Measurements) -> list[str]:

@@ -138,3 +138,16 @@ def sync_folder(folder: Path) -> None:
             os.fsync(number)
         finally:
             os.close(number)
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder to write to, and those above it, where they do not exist.
+
+    Raises:
+        EdgeposeError: it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = error.strerror or error
+        raise EdgeposeError(f"cannot make the folder {folder}: {reason}; choose another folder") from None

@@ -141,3 +141,21 @@ def _split_options(text: str, possible: Sequence[str]) -> tuple[str, int, list[s
 
 def _last(options: Sequence[str], among: Sequence[str], default: str) -> str:
     return next((option for option in reversed(options) if option in among), default)
+
+
+def check_page(host: str, port: int) -> None:
+    """Check that a page can be served at an address of this machine; port 0 stands for any.
+
+    Raises:
+        DeviceError: the port is taken, or the address is not one of this machine.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        socket.create_server((host, port), family=family).close()
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        # Errors of name resolution have negative numbers.
+        flag = "--page-port" if isinstance(error, OSError) and (error.errno or -1) > 0 else "--host"
+        raise DeviceError(
+            f"cannot show poses at {host} port {port}: {reason}; choose another {flag}"
+        ) from error

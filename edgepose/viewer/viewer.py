@@ -20,17 +20,22 @@ from numpy.typing import NDArray
 from edgepose.errors import EdgeposeError
 from edgepose.pose import CONTACTS, PoseSequence, held_sensors
 from edgepose.skeleton import JOINTS, Body, forward_kinematics
+from edgepose.utils.sockets import check_page
 from edgepose.viewer.body_mesh import RADII, build, ground, radius
+from edgepose.viewer.buttons import add_buttons
 from edgepose.viewer.camera import FollowingCameras, place_first_camera
 from edgepose.viewer.path import FloorPath
+from edgepose.viewer.reference import Reference
 from edgepose.viewer.same_origin import same_origin_only
 from edgepose.viewer.stream import WINDOW_S, UdpPoseStream, plain, sensor_table
 
 Array = NDArray[np.float64]
 
 POSE = {"left": "#1F8FDB", "trunk": "#17588A", "right": "#082C47"}
-REFERENCE = {"left": "#B0B0B0", "trunk": "#808080", "right": "#585858"}
 """Colours; sides differ in lightness, which every eye sees. The lights of the scene brighten them."""
+
+REFERENCE = dict.fromkeys(POSE, "#B4236F")
+"""Colour of a reference: one, which no eye takes for that of the poses or for a contact."""
 
 CONTACT = "#E69F00"
 """Colour of the joints that rest on something."""
@@ -145,9 +150,9 @@ class Viewer:
             raise EdgeposeError(
                 "the viewer needs viser: install it with pip install 'edgepose[view]'"
             ) from error
-        _check_free(host, 0 if next_free else port)
+        check_page(host, 0 if next_free else port)
         # viser prints a greeting to standard output, which belongs to the caller.
-        with redirect_stdout(io.StringIO()), same_origin_only():
+        with redirect_stdout(io.StringIO()), same_origin_only(host):
             self._server: Any = viser.ViserServer(host=host, port=port, label="edgepose", verbose=False)
         self.port: int = self._server.get_port()  # viser takes the next free one
         self._body = body
@@ -173,8 +178,7 @@ class Viewer:
 
         Args:
             poses: at least one.
-            reference: also drawn, transparently, on the same clock, or from its start if the two have no time
-                in common.
+            reference: also drawn, on the same clock, or from its start if the two have no time in common.
             stopped: called for every picture.
         """
         times, status = poses.time_s - poses.time_s[0], poses.status
@@ -182,10 +186,11 @@ class Viewer:
         cameras = FollowingCameras(self._server)
         text = self._server.gui.add_markdown("")
         track = _Track(self.figure, self._path, poses, self._body)
-        second = None
+        compared = second = None
         if reference is not None:
-            figure = SkeletonView(self._server, "reference", self._body, REFERENCE, 0.4)
-            path = FloorPath(self._server, "reference-path", _rgb(REFERENCE["trunk"]))
+            compared = Reference(self._server, poses, reference, "reference")
+            figure = SkeletonView(self._server, "reference", self._body, REFERENCE, 0.5)
+            path = FloorPath(self._server, "reference/path", _rgb(REFERENCE["trunk"]))
             second = _Track(figure, path, reference, self._body)
         held = held_sensors(poses.held)
         window = max(1, round(WINDOW_S * poses.rate))
@@ -196,20 +201,29 @@ class Viewer:
             if i != shown:
                 with self._server.atomic():
                     cameras.follow(track.show(i))
-                    if second is not None:
-                        second.show(_nearest_reference(second.poses, poses, i))
+                    if compared is not None and second is not None:
+                        second.show(compared.nearest(i))
                 shown = i
             if now - self._updated_s >= TABLE_S:
                 self._updated_s = now
                 line.update_slider()
                 table = sensor_table(held[max(0, i + 1 - window) : i + 1], poses.rate)
+                error = "" if compared is None else f"{compared.text(i)}\n\n"
                 text.content = (
                     f"pose {i + 1} of {len(times)}, {poses.rate:g} poses/s\n\n"
-                    f"**{plain(status[i])}**\n\n{table}"
+                    f"**{plain(status[i])}**\n\n{error}{table}"
                 )
             time.sleep(max(0.0, FRAME_S - (time.monotonic() - now)))
 
     # --- poses as they come ---------------------------------------------------------------------------------
+
+    def add_buttons(self, press: Callable[[str], None]) -> None:
+        """Put buttons on the page that do what keys of the run do.
+
+        Args:
+            press: called with the key of a button that is pressed.
+        """
+        add_buttons(self._server, press)
 
     def follow(self, receiver: socket.socket, stopped: Callable[[], bool]) -> None:
         """Show poses that come as datagrams, always the newest one, until `stopped`.
@@ -219,8 +233,8 @@ class Viewer:
             stopped: called for every picture.
         """
         cameras = FollowingCameras(self._server)
-        text = self._server.gui.add_markdown("waiting for poses")
-        stream = UdpPoseStream()
+        stream = UdpPoseStream(time.monotonic())
+        text = self._server.gui.add_markdown(stream.text(time.monotonic()))
         receiver.setblocking(False)
         while not stopped():
             # Wake up when a pose comes; a fixed pace would skip some.
@@ -292,13 +306,6 @@ class _Track:
         return self._figure.show(self.poses.rotations[i], position, contacts)
 
 
-def _nearest_reference(reference: PoseSequence, poses: PoseSequence, i: int) -> int:
-    """Return the index of the reference pose nearest to pose i."""
-    common = reference.time_s[0] <= poses.time_s[-1] and poses.time_s[0] <= reference.time_s[-1]
-    start = 0.0 if common else poses.time_s[0] - reference.time_s[0]
-    return int(np.abs(reference.time_s - (poses.time_s[i] - start)).argmin())
-
-
 def _grounded_positions(poses: PoseSequence, body: Body) -> Array | None:
     """Return pelvis positions (T, 3), metres, on the ground, starting above the origin; None if unknown.
 
@@ -311,17 +318,3 @@ def _grounded_positions(poses: PoseSequence, body: Body) -> Array | None:
     some = slice(None, None, max(1, len(poses.frames) // 1000))
     lowest = ground(poses.rotations[some], body.offsets, poses.translation[some])
     return poses.translation - [poses.translation[0, 0], lowest, poses.translation[0, 2]]
-
-
-def _check_free(host: str, port: int) -> None:
-    """Raise EdgeposeError if no page can be served there; 0 stands for any port."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    try:
-        socket.create_server((host, port), family=family).close()
-    except (OSError, UnicodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        # Errors of name resolution have negative numbers.
-        flag = "--port" if isinstance(error, OSError) and (error.errno or -1) > 0 else "--host"
-        raise EdgeposeError(
-            f"cannot show poses at {host} port {port}: {reason}; choose another {flag}"
-        ) from error

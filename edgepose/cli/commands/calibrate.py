@@ -3,31 +3,30 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import re
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import click
-import numpy as np
 
-from edgepose import __version__, calibration
+from edgepose import calibration
 from edgepose.calibration import Calibration
+from edgepose.cli.calibration_job import CalibrationJob, calibration_of
 from edgepose.cli.calibration_session import (
     ROUTINE_S,
     CalibrationPlan,
     Measured,
-    finds_forward,
     measure_live,
     measure_recorded,
 )
-from edgepose.cli.calibration_verdict import judge, next_command, table
+from edgepose.cli.calibration_verdict import DAMAGED, judge, next_command, table, values
 from edgepose.cli.guide.guide import Guide, end_stage
 from edgepose.cli.guide.phone_page import PhonePage, address_in_network
 from edgepose.cli.options.gathered import gathered
+from edgepose.cli.options.inputs import recordings_or_source
+from edgepose.cli.options.json_result import json_option, show_json
 from edgepose.cli.options.outputs import address, check_files, overwrite_option
 from edgepose.cli.options.recording_time import RecordingTime, RecordingTimeType
 from edgepose.cli.options.source import filter_options, source_options
@@ -36,10 +35,9 @@ from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
 from edgepose.orientation.stage import OrientationStage
 from edgepose.placements import PLACEMENTS
-from edgepose.rotations import Array
 from edgepose.sinks.output_files import check_output
 from edgepose.skeleton import MAX_HEIGHT, MIN_HEIGHT
-from edgepose.sources.sensor_map import SensorMap, read_map
+from edgepose.sources.sensor_map import read_map
 
 PAGE_PORT = 8090
 """Port of the page without an address."""
@@ -143,14 +141,15 @@ def _plan_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @click.command()
+@recordings_or_source
 @source_options
 @filter_options
 @click.option(
     "--out",
-    type=click.Path(dir_okay=False),
     default="calib.json",
     show_default=True,
-    help="Calibration file to write, JSON; - is standard output.",
+    metavar="FILE",
+    help="Calibration file to write, JSON; - is standard output. A folder with recordings IN.",
 )
 @overwrite_option
 @click.option(
@@ -169,7 +168,16 @@ def _plan_options(command: Callable[..., Any]) -> Callable[..., Any]:
     f"and buttons; live sources only.  [default without a value: 127.0.0.1:{PAGE_PORT}]",
 )
 @_plan_options
+@click.option(
+    "--jobs",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="Number of processes for the recordings IN, each of which calibrates from one at a time.",
+)
+@json_option
 def calibrate(
+    inputs: tuple[Path, ...],
     source: SourceConfig,
     filter: str,
     no_mag: bool,
@@ -178,12 +186,17 @@ def calibrate(
     height_m: float | None,
     page: tuple[str, int] | None,
     plan: CalibrationPlan,
+    jobs: int,
+    as_json: bool,
 ) -> None:
     """Find out how the six sensors sit on their wearer.
 
     The wearer holds a pose for a few seconds, live (--port, --can, --listen, --connect) or in a recording
     (--file). The calibration contains the direction that the wearer faces and the orientation of each sensor
     on its segment; `edgepose run` needs it. Repeat it whenever a sensor was taken off or slipped.
+
+    IN are recordings to calibrate from, each by itself, instead of a source: files, patterns and folders.
+    --out then names a folder for the calibrations.
 
     \b
     Examples:
@@ -192,30 +205,43 @@ def calibrate(
       edgepose calibrate --port COM3 --page 192.168.1.5:8090
       edgepose calibrate --sensors rig.toml --pose t-pose
       edgepose calibrate --file walk.csv --from +2.5 --body-frame heading:0
+      edgepose calibrate takes/ --out calibrations --jobs 2
     """
     _check_use(source, plan, page)
-    inputs = {"--file": source.file, "--sensors": source.sensors, "--heading-reset": plan.side_by_side}
-    check_files([("--out", out)], inputs)
-    _check_writable(out, overwrite)
+    if as_json and out == "-":
+        raise click.UsageError("--out - and --json both write to standard output; name a file")
+    files = {"--file": source.file, "--sensors": source.sensors, "--heading-reset": plan.side_by_side}
+    if not inputs:
+        check_files([("--out", out)], files)
+        _check_writable(out, overwrite)
     sensor_map = None if source.sensors is None else read_map(source.sensors)
     mountings = (
         {} if sensor_map is None else {name: device.mounting for name, device in sensor_map.devices.items()}
     )
     if plan.heading_reset == "mounting":
         plan = dataclasses.replace(plan, mounting=_all_mountings(mountings))
-    job = _Job(source, plan, filter, not no_mag, height_m, sensor_map)
+    job = CalibrationJob(source, plan, filter, not no_mag, height_m, sensor_map)
+    if inputs:
+        from edgepose.cli.calibrate_recordings import calibrate_recordings
+
+        calibrate_recordings(inputs, job, out, overwrite, jobs, as_json)
+        return
     with ExitStack() as stack:
         phone = None if page is None else stack.enter_context(PhonePage(*page))
-        guide = stack.enter_context(Guide(err=out == "-", phone=phone))
+        guide = stack.enter_context(Guide(err=out == "-" or as_json, phone=phone))
         if phone is not None:
             _announce(phone, guide)
-        damaged = _repeated(job, guide, out, overwrite)
-    if damaged:
-        raise EdgeposeError("a part of the recording was left out, see the warnings above")
+        last = _repeated(job, guide, out, overwrite)
+    if as_json:
+        show_json("calibrate", {"planned": 1, "calibrations": [values(job.source, out, *last)]})
+    if last[0].damaged:
+        raise EdgeposeError(f"{DAMAGED} above")
 
 
-def _repeated(job: _Job, guide: Guide, out: str, overwrite: bool) -> bool:
-    """Calibrate, again as often as the wearer asks for it; return whether a part of a recording was left out.
+def _repeated(
+    job: CalibrationJob, guide: Guide, out: str, overwrite: bool
+) -> tuple[Measured, Calibration, list[str]]:
+    """Calibrate, again as often as the wearer asks for it; return what `_calibrated` returned last.
 
     Raises:
         EdgeposeError: the last calibration failed, or cannot be written.
@@ -240,26 +266,15 @@ def _repeated(job: _Job, guide: Guide, out: str, overwrite: bool) -> bool:
         guide(judgement.text)
         if out != "-" and not measured.damaged:
             guide("Next:")
-            terminal.show(f"  {next_command(job.source, out)}")  # in one line, to be copied
+            guide.command(next_command(job.source, out))
         if not guide.wants_repeat(end_stage(judgement.word, judgement.text, job.plan.first_pose)):
             if out == "-":  # once only, whatever the wearer repeats
                 click.echo(calibration.to_json(result), nl=False)
                 guide("Wrote stdout.")
-            return measured.damaged
+            return measured, result, warnings
 
 
-class _Job(NamedTuple):
-    """What to calibrate and how."""
-
-    source: SourceConfig
-    plan: CalibrationPlan
-    filter: str
-    magnetometer: bool
-    height_m: float | None
-    sensor_map: SensorMap | None
-
-
-def _calibrated(job: _Job, guide: Guide) -> tuple[Measured, Calibration, list[str]]:
+def _calibrated(job: CalibrationJob, guide: Guide) -> tuple[Measured, Calibration, list[str]]:
     """Measure once; return the measurements, the calibration, and warnings about it.
 
     Raises:
@@ -268,47 +283,7 @@ def _calibrated(job: _Job, guide: Guide) -> tuple[Measured, Calibration, list[st
     source, plan = job.source, job.plan
     orient = OrientationStage(job.filter, job.magnetometer)
     measured = (measure_live if source.live else measure_recorded)(source, plan, orient, guide)
-    reset, facing = _facing(plan, measured, guide)
-    measured = measured._replace(reset=reset)
-    result = calibration.calibrate(
-        measured.summary,
-        pose=plan.first_pose,
-        body_frame=facing,
-        created=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        heading_offset=None if reset is None else reset.offset,
-        metadata=_metadata(source, plan, measured),
-        filter=job.filter,
-        north=orient.north and (job.filter != "none" or reset is None),
-        height_m=job.height_m,
-    )
-    warnings = list(measured.warnings)
-    if measured.t_pose is not None:
-        result, differences = calibration.with_t_pose(result, measured.t_pose.orientation)
-        warnings += differences
-    if job.sensor_map is not None:
-        stated = {name: device.mounting for name, device in job.sensor_map.devices.items()}
-        warnings += calibration.mounting_warnings(result, stated, job.sensor_map.path)
-    return measured, result, warnings
-
-
-def _facing(
-    plan: CalibrationPlan, measured: Measured, guide: Guide
-) -> tuple[calibration.HeadingReset | None, str]:
-    """Return the heading reset and the body frame, both improved by the raised arms of a T-pose.
-
-    Raises:
-        EdgeposeError: the arms contradict each other, or the heading reset.
-    """
-    reset = measured.reset
-    if measured.t_pose is None:
-        return reset, plan.facing
-    arms = calibration.forward_of_raised_arms(measured.summary.orientation, measured.t_pose.orientation)
-    if reset is not None and finds_forward(plan.heading_reset):
-        return calibration.with_raised_arms(reset, arms), plan.facing
-    offset = np.zeros(len(PLACEMENTS)) if reset is None else reset.offset
-    angle_deg, error_deg = calibration.facing_deg(arms, offset)
-    guide(f"The raised arms show that the wearer faces {angle_deg:.1f} deg, to within {error_deg:.0f} deg.")
-    return reset, plan.body_frame or f"heading:{angle_deg:.2f}"
+    return calibration_of(job, orient, measured, guide)
 
 
 def _announce(phone: PhonePage, guide: Guide) -> None:
@@ -352,39 +327,6 @@ def _all_mountings(mountings: Mapping[str, str | None]) -> list[str]:
             "or the axis with which all of them face forward, such as mounting:z"
         )
     return known
-
-
-def _metadata(source: SourceConfig, plan: CalibrationPlan, measured: Measured) -> dict[str, Any]:
-    """Return the part of a calibration file that says how it was made."""
-    summary, reset = measured.summary, measured.reset
-    metadata: dict[str, Any] = {
-        "program": f"edgepose {__version__}",
-        "source": source.name,
-        "hold_s": plan.hold_s,
-    }
-    if measured.from_s is not None:
-        metadata["from_s"] = measured.from_s
-    if measured.devices:
-        metadata["devices"] = {
-            PLACEMENTS[index]: device._asdict() for index, device in sorted(measured.devices.items())
-        }
-    metadata["samples"] = dict(zip(PLACEMENTS, summary.samples, strict=True))
-    metadata["force_m_s2"] = _by_placement(np.linalg.norm(summary.force, axis=-1))
-    metadata["warnings"] = measured.warnings
-    if reset is not None:
-        metadata["heading_reset"] = {
-            "source": plan.heading_reset,
-            "error_deg": _by_placement(reset.error_deg),
-        }
-    return metadata
-
-
-def _by_placement(values: Array) -> dict[str, float | None]:
-    """Return the numbers (6,) rounded, by placement; None for NaN."""
-    return {
-        name: None if math.isnan(v) else round(float(v), 3)
-        for name, v in zip(PLACEMENTS, values, strict=True)
-    }
 
 
 def _check_writable(out: str, overwrite: bool) -> None:

@@ -3,29 +3,30 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import math
 import shutil
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
+from edgepose.cli.exit_codes import ATTENTION, DONE, FAILED
 from edgepose.cli.options.calibrated_run import CalibratedRun, calibration_options
+from edgepose.cli.options.json_result import json_option, show_json
 from edgepose.cli.options.source import source_options
 from edgepose.cli.sensor_table import State, page_lines, table_lines
 from edgepose.cli.terminal.live_page import Page, is_terminal
-from edgepose.cli.terminal.messages import say, show, warnings_to
+from edgepose.cli.terminal.messages import say, warnings_to
 from edgepose.cli.terminal.stop_signal import StopSignal
 from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
 from edgepose.utils.machine_lag import MachineLag
 
 if TYPE_CHECKING:
-    from edgepose.diagnostics.sensor_health import SensorHealth, SensorHealthMonitor
+    from edgepose.diagnostics.sensor_health import SensorHealthMonitor
     from edgepose.sources import Source
 
 _log = logging.getLogger(__name__)
@@ -46,7 +47,7 @@ DEFAULT_S = 10.0
     f"{DEFAULT_S:g} elsewhere; to the end of --file]",
 )
 @calibration_options
-@click.option("--json", "as_json", is_flag=True, help="Write the result as JSON.")
+@json_option
 @click.pass_context
 def check(
     ctx: click.Context,
@@ -62,8 +63,8 @@ def check(
     The sensors may lie on a table or be worn. Hold them still for some seconds: gravity, noise and bias only
     show at rest. Then turn each one to and fro: gyroscope and orientation can only be compared in motion.
 
-    The exit code is 0 if all six sensors are fine, and 1 if one of them, or a part of the file, is not, or if
-    the rig has changed since the calibration.
+    The exit code is 0 if all six sensors are fine, and 3 if one of them is not, or if the rig has changed
+    since the calibration. It is 1 if sensors or file could not be read to the end.
 
     \b
     Examples:
@@ -105,7 +106,7 @@ def check(
         say(f"warning: {opened.damage}")
         warnings.append(opened.damage)
     _show(source.name, state, warnings, error, as_json)
-    ctx.exit(1 if state.problems or opened.damage or changed else 0)
+    ctx.exit(ATTENTION if state.problems or changed else FAILED if opened.damage else DONE)
 
 
 def _show(name: str, state: State, warnings: list[str], error: EdgeposeError | None, as_json: bool) -> None:
@@ -117,7 +118,7 @@ def _show(name: str, state: State, warnings: list[str], error: EdgeposeError | N
     if error is not None and not as_json and not any(sensor.samples for sensor, _ in state.sensors):
         raise error  # a table of sensors that sent nothing would hide the reason
     if as_json:
-        show(_json(name, state, warnings))
+        _show_json(name, state, warnings)
     else:
         # Not with show, which would remove the colours; the cells contain no text from devices.
         width = shutil.get_terminal_size().columns if is_terminal() else None
@@ -193,7 +194,7 @@ def _listen(
     return state(), None
 
 
-def _json(name: str, state: State, warnings: list[str]) -> str:
+def _show_json(name: str, state: State, warnings: list[str]) -> None:
     document = {
         "source": name,
         "seconds": round(state.seconds, 3),
@@ -206,17 +207,9 @@ def _json(name: str, state: State, warnings: list[str]) -> str:
                 "finding": finding.name,
                 "problem": finding.problem,
                 "advice": finding.advice,
-                **_health_fields(sensor),
+                **dataclasses.asdict(sensor),
             }
             for sensor, finding in state.sensors
         ],
     }
-    return json.dumps(document, indent=2, allow_nan=False)
-
-
-def _health_fields(sensor: SensorHealth) -> dict[str, Any]:
-    """Return the fields of a sensor's health for JSON; None for unknown numbers."""
-    return {
-        key: (float(f"{value:.6g}") if math.isfinite(value) else None) if isinstance(value, float) else value
-        for key, value in dataclasses.asdict(sensor).items()
-    }
+    show_json("check", document)

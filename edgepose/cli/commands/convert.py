@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from edgepose.cli.many_files import Outcome, raise_failures, text_table, with_progress
 from edgepose.cli.options.body import leg_length_option
+from edgepose.cli.options.json_result import json_option, show_json
 from edgepose.cli.options.outputs import overwrite_option, rate_option
 from edgepose.cli.options.source import protocol_option, sensors_option
-from edgepose.cli.terminal.messages import has_terminal, printable, progress_bar, say, show
+from edgepose.cli.terminal.messages import show
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.bvh import UNITS
 from edgepose.formats.poses.registry import READERS as POSES
@@ -94,6 +96,7 @@ def _format(ctx: click.Context, param: click.Parameter, value: str) -> FileTarge
 )
 @click.option("--skip-existing", is_flag=True, help="Skip recordings whose output exists.")
 @overwrite_option
+@json_option
 def convert(
     inputs: tuple[Path, ...],
     to: FileTarget,
@@ -108,6 +111,7 @@ def convert(
     jobs: int,
     skip_existing: bool,
     overwrite: bool,
+    as_json: bool,
 ) -> None:
     """Convert recordings ({recordings}), raw captures of a port, logs of a CAN bus, and poses ({poses}).
 
@@ -145,15 +149,13 @@ def convert(
     _check_targets(todo, to.path, overwrite)
     try:
         flags = protocol, sensors, filter, height, overwrite, unit, leg_length, dict(to.options), rate
-        for result in _with_progress(convert_all(todo, Options(*flags), jobs), len(todo)):
+        results = convert_all(todo, Options(*flags), jobs)
+        for result in with_progress(results, len(todo), "Converting", _outcome):
             done[result.job] = result
     finally:
-        show(_table([done[job] for job in planned if job in done]))
+        _show([done[job] for job in planned if job in done], len(planned), as_json)
     failed = sum(result.problem is not None for result in done.values())
-    if failed:
-        raise EdgeposeError(
-            f"{failed} of {len(planned)} recordings not converted, or only in part; see the messages above"
-        )
+    raise_failures(failed, len(planned), "not converted, or only in part")
 
 
 convert.help = (convert.help or "").format(
@@ -171,32 +173,37 @@ def _check_targets(jobs: Sequence[Job], to: str, overwrite: bool) -> None:
             check_output(job.target, "the output", (f".{to}",), overwrite)
 
 
-def _with_progress(results: Iterable[Result], count: int) -> Iterator[Result]:
-    """Yield the results, and show a bar and problems on a terminal, a line per result elsewhere."""
-    from edgepose.convert import describe
-
-    with progress_bar(count, "Converting") as bar:
-        for number, result in enumerate(results, start=1):
-            yield result  # before its line, so that after Ctrl-C the table has every result that was shown
-            line = f"{result.job.source}: {describe(result)}"
-            if not has_terminal():
-                say(_one_line(f"{number} of {count}  {line}"))
-            elif result.problem is not None:
-                say(_one_line(line))
-            bar.update(1)
-
-
-def _table(results: Sequence[Result]) -> str:
+def _outcome(result: Result) -> Outcome:
     from edgepose.convert import outcome
 
-    width = max([len("file"), *(len(str(result.job.source)) for result in results)])
-    lines = [f"{'file':{width}}  {'samples':>9}  {'seconds':>9}  result"]
-    for result in results:
-        counts = f"{result.samples:9d}  {result.seconds:9.1f}" if result.samples else f"{'-':>9}  {'-':>9}"
-        lines.append(_one_line(f"{result.job.source!s:{width}}  {counts}  {outcome(result)}"))
-    return "\n".join(lines)
+    return Outcome(str(result.job.source), outcome(result), result.problem)
 
 
-def _one_line(text: str) -> str:
-    """Replace line breaks and tabs, which may be in file names."""
-    return printable(text).replace("\n", "?").replace("\t", "?")
+def _show(results: Sequence[Result], planned: int, as_json: bool) -> None:
+    """Show the results."""
+    from edgepose.convert import outcome, state
+
+    if as_json:
+        files = [
+            {
+                "source": result.job.source,
+                "target": result.job.target,
+                "result": state(result),
+                "samples": result.samples,
+                "seconds": result.seconds,
+                "sensors": result.sensors if result.samples else 0,
+                "problem": result.problem,
+            }
+            for result in results
+        ]
+        show_json("convert", {"planned": planned, "files": files})
+        return
+    rows = [
+        (
+            str(result.job.source),
+            *((str(result.samples), f"{result.seconds:.1f}") if result.samples else ("-", "-")),
+            outcome(result),
+        )
+        for result in results
+    ]
+    show(text_table(("file", "samples", "seconds", "result"), rows))

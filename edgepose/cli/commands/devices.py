@@ -5,10 +5,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from edgepose.cli.options.json_result import json_option, show_json
 from edgepose.cli.terminal.messages import say, show
 from edgepose.errors import EdgeposeError
 
@@ -34,7 +35,10 @@ if TYPE_CHECKING:
     metavar="HOST:PORT[,...]",
     help="Connect to sensors over TCP, and report what they send.",
 )
-def devices(names: tuple[str, ...], probe: bool, listen: str | None, connect: str | None) -> None:
+@json_option
+def devices(
+    names: tuple[str, ...], probe: bool, listen: str | None, connect: str | None, as_json: bool
+) -> None:
     """List the serial ports and CAN interfaces of this machine, or only the named ones.
 
     \b
@@ -44,53 +48,95 @@ def devices(names: tuple[str, ...], probe: bool, listen: str | None, connect: st
       edgepose devices --probe /dev/ttyUSB0 slcan:/dev/ttyACM0
       edgepose devices --listen 0.0.0.0:9000
     """
-    failed: list[str] = []
-    if listen is not None or connect is not None:
-        _show_network(listen, connect, failed)
-        if not names and not probe:
-            _check_failed(failed)
-            return
-    names = tuple(name for text in names for name in text.split(",") if name)  # as --port names several
+    lines = _Lines(as_json)
+    for flag, text, find in (("listen", listen, _probe_socket), ("connect", connect, _probe_connection)):
+        if text is not None:
+            lines.begin(flag, f"Network (edgepose run --{flag} ADDRESS):")
+            for name in text.split(","):
+                lines.add(name, "", find)
+    if names or probe or (listen is None and connect is None):
+        _show_local(lines, tuple(name for text in names for name in text.split(",") if name), probe)
+    if as_json:
+        show_json("devices", lines.found)
+    if names or listen or connect:
+        _check_failed(lines.failed)
+
+
+def _show_local(lines: _Lines, names: tuple[str, ...], probe: bool) -> None:
+    """Show the named ports and buses, or all."""
     ports = dict.fromkeys((name for name in names if not _is_bus(name)), "") if names else _ports()
     buses = [name for name in names if _is_bus(name)] if names else None
     if ports or not names:
-        show("Serial ports (edgepose run --port NAME):")
-        width = max(map(len, ports), default=0)
+        lines.begin("ports", "Serial ports (edgepose run --port NAME):", max(map(len, ports), default=0))
         for name, description in ports.items():
             absent = bool(names) and not probe and not Path(name).exists() and name not in _ports()
-            failed += [name] * absent
-            show(f"  {name.ljust(width)}  {'no such port' if absent else description}".rstrip())
-            if probe:
-                show(f"    {_probe(name, _probe_port, failed)}")
-        if not ports:
-            show(
-                "  none found; connect the sensors, and check that the driver is loaded and that you may "
-                "read the port (group dialout)"
-            )
+            if absent:
+                lines.add_missing(name, "no such port")
+            else:
+                lines.add(name, description, _probe_port if probe else None)
+        lines.end(
+            "none found; connect the sensors, and check that the driver is loaded and that you may read the "
+            "port (group dialout)"
+        )
     if buses is None:
         buses = _buses()
     if buses or not names:
-        show("CAN interfaces (edgepose run --can NAME):")
+        lines.begin("buses", "CAN interfaces (edgepose run --can NAME):")
         for name in buses:
-            show(f"  {name}")
-            if probe:
-                show(f"    {_probe(name, _probe_bus, failed)}")
-        if not buses:
-            show("  none found; adapters on a serial port are named slcan:PORT")
-    if names or listen or connect:
-        _check_failed(failed)
+            lines.add(name, "", _probe_bus if probe else None)
+        lines.end("none found; adapters on a serial port are named slcan:PORT")
 
 
-def _show_network(listen: str | None, connect: str | None, failed: list[str]) -> None:
-    """Show what is sent to addresses of this machine, and by devices over TCP."""
-    for flag, text, probe in (("listen", listen, _probe_socket), ("connect", connect, _probe_connection)):
-        if text is None:
-            continue
-        show(f"Network (edgepose run --{flag} ADDRESS):")
-        for name in text.split(","):
-            show(f"  {name}")
-            for line in _probe(name, probe, failed).splitlines():
-                show(f"    {line}")
+class _Lines:
+    """The lines found, shown as they are found, or kept for JSON.
+
+    Attributes:
+        found: values of the lines for scripts by kind; docs/reference/scripts.md describes them.
+        failed: names of the lines that cannot be listened to.
+    """
+
+    def __init__(self, as_json: bool) -> None:
+        """Start without lines."""
+        self.found: dict[str, list[dict[str, Any]]] = {"ports": [], "buses": [], "listen": [], "connect": []}
+        self.failed: list[str] = []
+        self._show: Callable[[str], None] = (lambda text: None) if as_json else show
+        self._kind, self._width = "ports", 0
+
+    def begin(self, kind: str, title: str, width: int = 0) -> None:
+        """Begin with the lines of a kind, whose names are up to `width` characters long."""
+        self._kind, self._width = kind, width
+        self._show(title)
+
+    def add(self, name: str, description: str, find: Callable[[str], list[Finding]] | None) -> None:
+        """Show a line, and what a probe finds on it."""
+        self._show(f"  {name.ljust(self._width)}  {description}".rstrip())
+        values: dict[str, Any] = {"name": name, "description": description, "problem": None, "findings": []}
+        self.found[self._kind].append(values)
+        if find is None:
+            return
+        if sys.stderr.isatty():
+            say(f"listening to {name} ...")
+        try:
+            findings = find(name)
+        except EdgeposeError as error:
+            values["problem"] = str(error)
+            self.failed.append(name)
+            self._show(f"    {error}")
+            return
+        values["findings"] = [finding.values() for finding in findings]
+        for text in [finding.text() for finding in findings] or ["nothing arrives"]:
+            self._show(f"    {text}")
+
+    def add_missing(self, name: str, problem: str) -> None:
+        """Show a line that does not exist."""
+        self._show(f"  {name.ljust(self._width)}  {problem}")
+        self.found[self._kind].append({"name": name, "description": "", "problem": problem, "findings": []})
+        self.failed.append(name)
+
+    def end(self, nothing: str) -> None:
+        """Show a message if there is no line of this kind."""
+        if not self.found[self._kind]:
+            self._show(f"  {nothing}")
 
 
 def _check_failed(failed: list[str]) -> None:
@@ -126,42 +172,63 @@ def _buses() -> list[str]:
     return [f"{config['interface']}:{config['channel']}" for config in found]
 
 
-def _probe(name: str, probe: Callable[[str], str], failed: list[str]) -> str:
-    """Return what was found on a line, or why it cannot be probed; then the line is added to `failed`."""
-    if sys.stderr.isatty():
-        say(f"listening to {name} ...")
-    try:
-        return probe(name)
-    except EdgeposeError as error:
-        failed.append(name)
-        return str(error)
+class Finding(NamedTuple):
+    """A finding of a probe: of a line, or of one sender of datagrams.
+
+    Attributes:
+        result: the finding.
+        unit: unit of the amount that has come, such as "bytes".
+        baud: speed of a port, bit/s; None for others.
+        sender: address of the sender; empty for a line.
+    """
+
+    result: ProbeResult
+    unit: str
+    baud: int | None = None
+    sender: str = ""
+
+    def values(self) -> dict[str, Any]:
+        """Return the finding for scripts."""
+        return {
+            "sender": self.sender or None,
+            "protocol": self.result.protocol,
+            "baud": self.baud if self.result.protocol else None,
+            "amount": self.result.amount,
+            "unit": self.unit,
+            "rates_hz": self.result.rates_hz,
+            "refused": self.result.refused,
+        }
+
+    def text(self) -> str:
+        """Return the finding for people."""
+        speed = "" if self.baud is None else f" at --baud {self.baud}"
+        text = _describe(self.result, self.unit, speed)
+        return f"{self.sender}: {text}" if self.sender else text
 
 
-def _probe_port(name: str) -> str:
+def _probe_port(name: str) -> list[Finding]:
     from edgepose.sources.probe import probe_port
 
-    finding, baud = probe_port(name)
-    return _describe(finding, "bytes", f" at --baud {baud}")
+    result, baud = probe_port(name)
+    return [Finding(result, "bytes", baud)]
 
 
-def _probe_bus(name: str) -> str:
+def _probe_bus(name: str) -> list[Finding]:
     from edgepose.sources.probe import probe_bus
 
-    return _describe(probe_bus(name), "frames", "")
+    return [Finding(probe_bus(name), "frames")]
 
 
-def _probe_socket(name: str) -> str:
+def _probe_socket(name: str) -> list[Finding]:
     from edgepose.sources.probe import probe_socket
 
-    senders = probe_socket(name)
-    lines = [f"{sender}: {_describe(finding, 'datagrams', '')}" for sender, finding in senders.items()]
-    return "\n".join(lines) or "nothing arrives"
+    return [Finding(result, "datagrams", None, sender) for sender, result in probe_socket(name).items()]
 
 
-def _probe_connection(name: str) -> str:
+def _probe_connection(name: str) -> list[Finding]:
     from edgepose.sources.probe import probe_connection
 
-    return _describe(probe_connection(name), "bytes", "")
+    return [Finding(probe_connection(name), "bytes")]
 
 
 def _describe(finding: ProbeResult, unit: str, speed: str) -> str:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import click
 
+from edgepose.cli.options.json_result import json_option, show_json
 from edgepose.cli.terminal.messages import show
 from edgepose.inference import archive
 
@@ -19,7 +21,8 @@ from edgepose.inference import archive
     is_flag=True,
     help="Add the archives' SHA-256 checksums to your own list, so that `run` loads them.",
 )
-def models(names: tuple[str, ...], trust: bool) -> None:
+@json_option
+def models(names: tuple[str, ...], trust: bool, as_json: bool) -> None:
     """List the shipped model archives, or show the cards of archives. No code in an archive is run.
 
     \b
@@ -30,11 +33,30 @@ def models(names: tuple[str, ...], trust: bool) -> None:
     """
     if trust and not names:
         raise click.UsageError("--trust needs the PATH of an archive")
+    paths = [archive.find_archive(name) for name in names]
+    if as_json:
+        infos = [archive.trust(path) if trust else archive.read_info(path) for path in paths or _bundled()]
+        show_json("models", {"models": [_values(info) for info in infos]})
+        return
     if not names:
         _list()
-    for name in names:
-        path = archive.find_archive(name)
+    for path in paths:
         _show(archive.trust(path) if trust else archive.read_info(path))
+
+
+def _bundled() -> list[Path]:
+    return list(archive.bundled_archives())
+
+
+def _values(info: archive.ArchiveInfo) -> dict[str, Any]:
+    return {
+        "name": info.path.stem,
+        "file": info.path,
+        "bytes": info.path.stat().st_size,
+        "sha256": info.sha256,
+        "trusted": info.trusted,
+        "metadata": info.metadata,
+    }
 
 
 _WIDTH = 80
@@ -43,7 +65,7 @@ _WIDTH = 80
 
 def _list() -> None:
     rows = [("name", "kind", "units", "frames", "size", "trained on")]
-    for path in archive.bundled_archives():
+    for path in _bundled():
         about = archive.read_info(path).metadata
         frames = (
             f"{about['past']} past, {about['future']} future"

@@ -3,34 +3,55 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from edgepose.cli.conflicts import check_all_files, check_all_live
 from edgepose.cli.options.gathered import usage_errors
+from edgepose.cli.options.json_result import check_standard_output, json_option, show_json
 from edgepose.cli.options.network import network_options
 from edgepose.cli.options.wearer import wearer_options
 from edgepose.cli.terminal.keys import Keys
-from edgepose.cli.terminal.messages import end_status, has_terminal, say, status
+from edgepose.cli.terminal.messages import end_status, has_terminal, printable, say, status, warnings_to
 from edgepose.cli.terminal.stop_signal import StopSignal
 from edgepose.pipeline.network import Network, NetworkConfig
 
 if TYPE_CHECKING:
     from edgepose.config import WearerConfig
-    from edgepose.pipeline.wearer_pipeline import RunSummary
+    from edgepose.pipeline.build import OpenWearer
+    from edgepose.pipeline.run_report import RunReport
+    from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
 
 BEHIND_S = 1.0
 """Delay of the poses from which on the user is warned, seconds."""
+
+MESSAGES = 1000
+"""Messages kept for --json, the newest ones: a run may last for weeks."""
 
 
 @wearer_options
 @click.command()
 @network_options
-def run(wearers: list[WearerConfig], settings: NetworkConfig) -> None:
+@click.option(
+    "--jobs",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="Number of processes for the recordings IN, each of which runs one at a time.",
+)
+@json_option
+def run(
+    wearers: list[WearerConfig], inputs: tuple[Path, ...], settings: NetworkConfig, jobs: int, as_json: bool
+) -> None:
     """Turn packets or a recording into poses until the source ends or Ctrl-C.
+
+    IN are recordings to run one after the other, without a source: files, patterns and folders. Outputs to
+    files then name folders, and --calibration a file for all or a folder with one for each.
 
     During a live run, press r or Enter on the terminal (or send a message to --control) and stand in the
     calibration pose once more to re-zero the headings. Press o to put the wearer back at the origin of the
@@ -48,29 +69,71 @@ def run(wearers: list[WearerConfig], settings: NetworkConfig) -> None:
       edgepose run --port COM3 --filter kalman --calibration calib.json --view
       edgepose run --file walk.csv --calibration calib.json --csv - | head
       edgepose run --rig anna.toml --rig ben.toml --model rnn
+      edgepose run takes/ --calibration calibrations --csv poses --jobs 2
     """
+    if as_json:
+        for wearer in wearers:
+            check_standard_output(wearer.outputs)
     with usage_errors():
         network = Network.read(settings, len(wearers))
+    if inputs:
+        from edgepose.cli.run_recordings import run_recordings
+
+        run_recordings(inputs, wearers[0], network, jobs, as_json)
+        return
     check_all_files(wearers, network.info.path)
     check_all_live(wearers)
 
-    from edgepose.pipeline.run_wearers import open_wearers, report_wearers, run_wearers
+    from edgepose.pipeline.run_wearers import raise_failures, report_wearers
+
+    messages: deque[str] = deque(maxlen=MESSAGES)
+    opened, pipelines = _run(wearers, network, messages)
+    heard = list(messages)
+    reports = report_wearers(opened, pipelines, network)
+    if as_json:
+        _show_json(network, reports, heard)
+    raise_failures(reports)
+
+
+def _run(
+    wearers: list[WearerConfig], network: Network, messages: deque[str]
+) -> tuple[list[OpenWearer], list[WearerPipeline]]:
+    """Run all wearers until their sources end or the user stops them.
+
+    Args:
+        wearers: one or several.
+        network: their network, not loaded yet.
+        messages: gets everything that is said to the user.
+    """
+    from edgepose.pipeline.run_wearers import open_wearers, run_wearers
 
     live = wearers[0].source.live
     with ExitStack() as stack:
+        stack.enter_context(warnings_to(messages.append, hidden=False))
         # Sources are opened before the model is loaded, so that a wrong port is reported at once.
         keys = Keys()
-        opened = open_wearers(stack, wearers, keys.pressed, say)
+        opened = open_wearers(stack, wearers, keys.pressed, lambda text: _say(text, messages))
         if live:
             stack.enter_context(keys)
-        engine, precision = network.load(wearers, say)
+        ready = network.load(all(wearer.no_place for wearer in wearers), say)
+        engine = ready.engine_for_all(wearers)
         stop = stack.enter_context(StopSignal())
-        for wearer in opened:
-            wearer.open_outputs(stack, network, lambda: stop.asked)
-        say(_headline(network, precision, wearers, keys.listening))
+        for each in opened:
+            each.open_outputs(stack, network, lambda: stop.asked)
+        say(_headline(network, ready.precision, wearers, keys.listening))
         pipelines = run_wearers(opened, engine, network, live, lambda: stop.asked, _progress(network))
     end_status()
-    report_wearers(wearers, opened, pipelines, network)
+    return opened, pipelines
+
+
+def _show_json(network: Network, reports: Sequence[RunReport], messages: list[str]) -> None:
+    runs = [report.values() for report in reports]
+    show_json("run", {**network.values(), "messages": messages, "planned": len(runs), "runs": runs})
+
+
+def _say(text: str, messages: deque[str]) -> None:
+    messages.append(printable(text))
+    say(text)
 
 
 def _headline(network: Network, precision: str, wearers: list[WearerConfig], has_keys: bool) -> str:

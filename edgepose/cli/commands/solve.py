@@ -13,12 +13,13 @@ import click
 
 from edgepose.cli.options.body import BodyFlags, body_options
 from edgepose.cli.options.gathered import gathered
+from edgepose.cli.options.json_result import check_standard_output, json_option, show_json
 from edgepose.cli.options.outputs import check_files, file_output_options
 from edgepose.cli.options.recording_time import RecordingTime, RecordingTimeType
 from edgepose.cli.terminal.messages import end_status, has_terminal, say, status
 from edgepose.config import OutputConfig
 from edgepose.errors import EdgeposeError
-from edgepose.sinks.registry import SINKS
+from edgepose.sinks.registry import SINKS, described
 
 if TYPE_CHECKING:
     from edgepose.calibration import Calibration
@@ -154,6 +155,7 @@ def _solver_options(command: Callable[..., Any]) -> Callable[..., Any]:
         help="Write a picture of costs and residuals over time.",
     )
 )
+@json_option
 def solve(
     recording: Path,
     calibration_path: Path,
@@ -161,6 +163,7 @@ def solve(
     solver: SolverFlags,
     outputs: OutputConfig,
     plot: Path | None,
+    as_json: bool,
 ) -> None:
     """Find the poses of a whole recording at once: Sparse Inertial Poser.
 
@@ -175,7 +178,7 @@ def solve(
       edgepose solve walk.npz --calibration calib.json --height 1.68 --npz out.npz
       edgepose solve walk.npz --calibration calib.json --method sop --csv - | head
     """
-    _check_outputs(outputs, plot, {"IN": recording, "--calibration": calibration_path})
+    _check_outputs(outputs, plot, {"IN": recording, "--calibration": calibration_path}, as_json)
 
     from edgepose.calibration import load_calibration
     from edgepose.sinks.group import SinkGroup
@@ -205,24 +208,25 @@ def solve(
         place = None if place is None else place[: len(solution.rotations)]
         path = pelvis_path(solution, settings.body.offsets, solver.rate, place)
         _write(sinks, solution, measurements, path)
-    _report(solution, measurements)
-    if plot is not None:
-        residuals.plot(plot, solution, measurements, outputs.overwrite)
-    if sinks.error is not None:
-        raise sinks.error
-    if interrupted:
+    about = {"source": recording, "calibration": calibration_path, "method": solver.method}
+    problem = sinks.error or (EdgeposeError(data.damage) if data.damage else None)
+    _show(solution, measurements, outputs, plot, {**about, "problem": problem} if as_json else None)
+    if interrupted and sinks.error is None:
         raise KeyboardInterrupt
-    if data.damage:
-        raise EdgeposeError(data.damage)
+    if problem is not None:
+        raise problem
 
 
-def _check_outputs(outputs: OutputConfig, plot: Path | None, inputs: Mapping[str, Path | None]) -> None:
+def _check_outputs(
+    outputs: OutputConfig, plot: Path | None, inputs: Mapping[str, Path | None], as_json: bool
+) -> None:
     """Make sure that there is an output for the poses, and that no file is lost.
 
     Args:
         outputs: files for the poses.
         plot: file for the picture.
         inputs: files to read, by flag.
+        as_json: the result goes to standard output.
 
     Raises:
         click.UsageError: no output for poses is given, or an output is also an input or another output.
@@ -233,6 +237,8 @@ def _check_outputs(outputs: OutputConfig, plot: Path | None, inputs: Mapping[str
         raise click.UsageError(f"give at least one output: {', '.join(flags[:-1])} or {flags[-1]}")
     check_files([*outputs.files, ("--plot", plot)], inputs)
     outputs.check()
+    if as_json:
+        check_standard_output(outputs)
     if plot is not None:
         from edgepose.analysis.figures import check_picture
 
@@ -322,15 +328,26 @@ def _settings(
     return Settings(solver.method, rig, points, weights, solver.evaluations, network)
 
 
-def _report(solution: Solution, measurements: Measurements) -> None:
-    """Say how well the poses explain the measurements."""
+def _show(
+    solution: Solution,
+    measurements: Measurements,
+    outputs: OutputConfig,
+    plot: Path | None,
+    about: Mapping[str, Any] | None,
+) -> None:
+    """Report how well the poses explain the measurements, with a picture and, given its head, as JSON."""
     from edgepose.sip import residuals
 
     say(residuals.table(solution, measurements))
     for line in residuals.misfits(solution, measurements):
         say(f"warning: {line}")
-    done, frames = len(solution.rotations), len(measurements.time_s)
-    say(f"{done} of {frames} poses, {solution.evaluations} cost evaluations")
+    count = f"{len(solution.rotations)} of {len(measurements.time_s)}"
+    say(f"{count} poses, {solution.evaluations} cost evaluations")
+    if plot is not None:
+        residuals.plot(plot, solution, measurements, outputs.overwrite)
+    if about is not None:
+        about = {**about, **residuals.values(solution, measurements)}
+        show_json("solve", {**about, "outputs": described(outputs.targets)})
 
 
 def _collect(solutions: Iterable[Solution]) -> tuple[list[Solution], bool]:

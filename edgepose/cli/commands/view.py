@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from edgepose.cli.options.body import leg_length_option
-from edgepose.cli.terminal.messages import say
+from edgepose.cli.terminal.messages import say, show
 from edgepose.cli.terminal.stop_signal import StopSignal
 from edgepose.errors import EdgeposeError
 from edgepose.utils.sockets import address_text, resolve
@@ -20,12 +20,18 @@ if TYPE_CHECKING:
     from edgepose.viewer.viewer import Viewer
 
 
+PAGE_PORT = 8080
+"""Port of the page without --page-port."""
+
+
 @click.command()
 @click.argument("poses", required=False, metavar="[POSES]")
 @click.option(
     "--udp", metavar="HOST:PORT", help="Show poses that `edgepose run --udp` sends here, as they arrive."
 )
-@click.option("--reference", metavar="FILE", help="File of poses to draw transparently over those of POSES.")
+@click.option(
+    "--reference", metavar="FILE", help="File of poses to compare those of POSES with, on one clock."
+)
 @click.option(
     "--host",
     default="127.0.0.1",
@@ -33,10 +39,13 @@ if TYPE_CHECKING:
     help="Address of the page; 0.0.0.0 makes it visible to other machines.",
 )
 @click.option(
-    "--port", type=click.IntRange(1, 65535), default=8080, show_default=True, help="TCP port of the page."
+    "--page-port",
+    type=click.IntRange(1, 65535),
+    help="TCP port of the page.  [default: 8080]",
 )
 @click.option("--height", type=float, default=1.75, show_default=True, help="Height of the figure, metres.")
 @leg_length_option
+@click.option("--buttons", is_flag=True, hidden=True, help="Write the keys of pressed buttons to stdout.")
 @click.option(
     "--with-parent", is_flag=True, hidden=True, help="Exit when the program that started this one exits."
 )
@@ -45,9 +54,10 @@ def view(
     udp: str | None,
     reference: str | None,
     host: str,
-    port: int,
+    page_port: int | None,
     height: float,
     leg_length: float | None,
+    buttons: bool,
     with_parent: bool,
 ) -> None:
     """Show poses as a 3-D figure in the browser until Ctrl-C: those of a file (CSV, BVH, or NPZ with the keys
@@ -77,20 +87,22 @@ def view(
         stop = stack.enter_context(StopSignal())
         if udp is not None:
             receiver = stack.enter_context(_listen(udp))
-            viewer = stack.enter_context(closing(_open(host, port, body, with_parent)))
+            viewer = stack.enter_context(closing(_open(host, page_port, body, with_parent)))
+            if buttons:
+                viewer.add_buttons(show)
             viewer.follow(receiver, lambda: stop.asked or (with_parent and os.getppid() != parent))
         else:
             sequence = read_poses(str(poses))
             reference_sequence = None if reference is None else read_poses(reference)
-            viewer = stack.enter_context(closing(_open(host, port, body)))
+            viewer = stack.enter_context(closing(_open(host, page_port, body)))
             viewer.play(sequence, reference_sequence, lambda: stop.asked)
 
 
-def _open(host: str, port: int, body: Body, for_run: bool = False) -> Viewer:
-    """Open the page; for `edgepose run`, which has no flag for its port, on the next one that is free."""
+def _open(host: str, port: int | None, body: Body, for_run: bool = False) -> Viewer:
+    """Open the page; for `edgepose run` without --page-port on the next port that is free."""
     from edgepose.viewer.viewer import Viewer
 
-    viewer = Viewer(host, port, body, next_free=for_run)
+    viewer = Viewer(host, port or PAGE_PORT, body, next_free=for_run and port is None)
     address = address_text({"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host), viewer.port)
     say(f"open http://{address} in a browser" + ("" if for_run else "; Ctrl-C ends the view"))
     return viewer

@@ -63,6 +63,13 @@ class Guide:
         else:
             terminal.show(terminal.wrapped(text, sys.stdout))
 
+    def command(self, text: str) -> None:
+        """Show a command, in one line, to be copied."""
+        if self._err:
+            terminal.say(f"  {text}")
+        else:
+            terminal.show(f"  {text}")
+
     def instruct(self, text: str) -> None:
         """Show a message that stages contain, too, where they are not shown as a page."""
         if not self._has_page:

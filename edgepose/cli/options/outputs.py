@@ -107,8 +107,13 @@ def output_options(command: Command) -> Command:
         metavar="NAME=TARGET",
         help="Write to an output that an installed package adds; repeatable.",
     )
+    page_port_option = click.option(
+        "--page-port",
+        type=click.IntRange(1, 65535),
+        help="TCP port of the page of --view.  [default: 8080, or the next one that is free]",
+    )
     flags = [
-        *_flags(SINKS, {"csv": [_rotations_option, std_option]}),
+        *_flags(SINKS, {"csv": [_rotations_option, std_option], "view": [page_port_option]}),
         *(rate_option, height_option, leg_length_option, overwrite_option, other_sinks_option),
     ]
     return gathered(command, flags, "outputs", OutputConfig)

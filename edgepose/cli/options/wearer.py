@@ -11,8 +11,9 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from edgepose.cli.conflicts import check_lines
+from edgepose.cli.conflicts import check_lines, check_pages
 from edgepose.cli.options.gathered import usage_errors
+from edgepose.cli.options.inputs import inputs_argument, with_first
 from edgepose.cli.options.outputs import address, output_options
 from edgepose.cli.options.source import calibrated_filter_options, source_options
 from edgepose.config import WearerConfig
@@ -56,7 +57,11 @@ _KEYS = {param.opts[0].removeprefix("--"): param for param in _flags.params}
 
 
 def wearer_options(command: click.Command) -> click.Command:
-    """Add a wearer's flags and --rig; the command gets them as `wearers: list[WearerConfig]`."""
+    """Add a wearer's flags, --rig and IN.
+
+    The command gets them as `wearers: list[WearerConfig]`, and IN as `inputs: tuple[Path, ...]`. With IN
+    there is one wearer, whose file is the first of them.
+    """
     rig_option = click.Option(
         ["--rig", "rig_files"],
         multiple=True,
@@ -70,19 +75,22 @@ def wearer_options(command: click.Command) -> click.Command:
     assert run is not None
 
     @functools.wraps(run)
-    def with_wearers(rig_files: tuple[Path, ...], **values: Any) -> Any:
+    def with_wearers(rig_files: tuple[Path, ...], inputs: tuple[Path, ...], **values: Any) -> Any:
         wearer_values = {str(param.name): values.pop(str(param.name)) for param in _flags.params}
+        if inputs and rig_files:
+            raise click.UsageError("give either recordings as IN or a source with --rig, not both")
+        wearer_values = with_first(inputs, wearer_values)
         if not rig_files:
             assert _flags.callback is not None
-            return run(wearers=[_flags.callback(**wearer_values)], **values)
+            return run(wearers=[_flags.callback(**wearer_values)], inputs=inputs, **values)
         ctx = click.get_current_context()
         for name, param in _KEYS.items():
             if ctx.get_parameter_source(str(param.name)) is ParameterSource.COMMANDLINE:
                 raise click.UsageError(f"--{name} belongs to a wearer: with --rig, put {name} into the file")
-        return run(wearers=read_rigs(rig_files), **values)
+        return run(wearers=read_rigs(rig_files), inputs=(), **values)
 
     command.callback = with_wearers
-    command.params = [*_flags.params, rig_option, *command.params]
+    command.params = [inputs_argument(), *_flags.params, rig_option, *command.params]
     return command
 
 
@@ -101,4 +109,5 @@ def read_rigs(paths: Sequence[Path]) -> list[WearerConfig]:
         )
     if len(wearers) > 1:
         check_lines(wearers)
+        check_pages(wearers)
     return wearers

@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
-from click.core import ParameterSource
 
+from edgepose.cli.options.json_result import json_option
 from edgepose.cli.options.outputs import overwrite_option
-from edgepose.cli.terminal.messages import say, show
+from edgepose.cli.terminal.messages import say
+from edgepose_export.cli.results import Results
 
 if TYPE_CHECKING:
     import torch
@@ -118,6 +119,7 @@ class EvaluatedModel(NamedTuple):
     help="Draw estimated and true paths, seen from above, with --place or --real.",
 )
 @overwrite_option
+@json_option
 def evaluate(
     names: tuple[str, ...],
     trust: bool,
@@ -136,6 +138,7 @@ def evaluate(
     place: bool,
     paths: Path | None,
     overwrite: bool,
+    as_json: bool,
 ) -> None:
     """Measure models against true poses. All frames count, including the first and last ones of a take.
 
@@ -150,20 +153,17 @@ def evaluate(
       edgepose evaluate --data recordings/ --part cmu-walk-run --heat-map window.png --every 10
       edgepose evaluate --data recordings/ --place --part cmu-walk-run --paths paths.png
     """
+    results = Results(as_json)
     if real:
-        _real(names, trust, data, paths, overwrite)
+        from edgepose_export.cli.evaluate_real import evaluate_real
+
+        evaluate_real(names, trust, data, paths, overwrite, results)
+        results.end()
         return
     if data is None:
         raise click.UsageError("give --data FOLDER, or --real")
     _check_combination(**click.get_current_context().params)
-    from edgepose.analysis.figures import check_picture
-    from edgepose_export.training.dataset import check_part
-
-    for part in set(parts) - {"published"}:
-        check_part(part)
-    for picture in (histogram, heat_map, reliability, paths):
-        if picture:
-            check_picture(picture, "drawing", overwrite)
+    _check_names(parts, (histogram, heat_map, reliability, paths), overwrite)
     models = [_model(name, trust, modes, past, future, table) for name in names]
     if len({model.name for model in models}) < len(models):  # files with the same name in several folders
         models = [model._replace(name=name) for model, name in zip(models, names, strict=True)]
@@ -171,13 +171,25 @@ def evaluate(
     if place:
         from edgepose_export.cli.evaluate_place import evaluate_place
 
-        evaluate_place(models, data, chosen, paths, overwrite)
+        evaluate_place(models, data, chosen, paths, overwrite, results)
     elif heat_map:
-        _heat_map(models[0], data, chosen, every, heat_map, overwrite)
+        _heat_map(models[0], data, chosen, every, heat_map, overwrite, results)
     else:
-        _tables(models, data, chosen, baselines, table, histogram, overwrite)
+        _tables(models, data, chosen, baselines, table, histogram, overwrite, results)
     if reliability:
-        _reliability(models, data, chosen, reliability, overwrite)
+        _reliability(models, data, chosen, reliability, overwrite, results)
+    results.end()
+
+
+def _check_names(parts: tuple[str, ...], pictures: tuple[Path | None, ...], overwrite: bool) -> None:
+    """Raise EdgeposeError if there is no such part, or a picture cannot be written."""
+    from edgepose.analysis.figures import check_picture
+    from edgepose_export.training.dataset import check_part
+
+    for part in set(parts) - {"published"}:
+        check_part(part)
+    for picture in filter(None, pictures):
+        check_picture(picture, "drawing", overwrite)
 
 
 def _check_combination(
@@ -205,37 +217,6 @@ def _check_combination(
         raise click.UsageError("--paths belongs to --place or --real")
     if heat_map and len(names) > 1:
         raise click.UsageError("--heat-map takes one --model")
-
-
-_REAL = {"names", "trust", "data", "real", "paths", "overwrite"}
-"""Parameters that apply to --real."""
-
-
-def _real(
-    names: tuple[str, ...], trust: bool, folder: Path | None, paths: Path | None, overwrite: bool
-) -> None:
-    """Measure models on real wearers."""
-    context = click.get_current_context()
-    for parameter in context.command.params:
-        name = parameter.name or ""
-        if name not in _REAL and context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
-            raise click.UsageError(f"--real runs models as `edgepose run` does: omit {parameter.opts[0]}")
-    from edgepose.analysis.figures import check_picture
-    from edgepose.inference.model import Model
-    from edgepose_export.cli.evaluate_place import evaluate_real_place
-    from edgepose_export.cli.progress import labelled
-    from edgepose_export.evaluation import real_wearers
-
-    real_wearers.check_folder(folder or real_wearers.FOLDER)
-    if paths:
-        check_picture(paths, "drawing", overwrite)
-    stems = [Path(name).stem for name in names]
-    rows = dict(zip(stems if len(set(stems)) == len(names) else names, names, strict=True))
-    models = {row: Model(name, trust=trust) for row, name in rows.items()}
-    for title, table in real_wearers.measure_models(models, folder, labelled("measuring")).items():
-        show(f"\n{real_wearers.format_table(title, table)}")
-    show(f"\n{real_wearers.LEGEND}")
-    evaluate_real_place(rows, trust, folder or real_wearers.FOLDER, paths, overwrite)
 
 
 def default_parts(data: Path) -> tuple[str, ...]:
@@ -294,6 +275,7 @@ def _tables(
     table: str | None,
     histogram: Path | None,
     overwrite: bool,
+    results: Results,
 ) -> None:
     from edgepose.analysis.metrics import format_table
     from edgepose_export.cli.progress import labelled
@@ -312,12 +294,14 @@ def _tables(
         methods |= evaluation.baseline_methods(trained)
     columns: dict[str, Columns] = evaluation.columns_of_parts(methods, data, parts, labelled("measuring"))
     tables = {part: evaluation.summarise(rows) for part, rows in columns.items()}
+    for part, summary in tables.items():
+        results.add("tables", kind="poses", title=part, rows=summary)
     if table:
-        show(format_paper_table(tables, TABLES[table].positions))
+        results.show(format_paper_table(tables, TABLES[table].positions))
     else:
         for part, rows in tables.items():
-            show(f"\n{part}\n{format_table(rows)}")
-        _places(models, data, parts)
+            results.show(f"\n{part}\n{format_table(rows)}")
+        _places(models, data, parts, results)
     if histogram:
         errors = {
             part: {name: row["sip_error_deg"] for name, row in rows.items()} for part, rows in columns.items()
@@ -326,7 +310,7 @@ def _tables(
         say(f"wrote {histogram}")
 
 
-def _places(models: list[EvaluatedModel], data: Path, parts: tuple[str, ...]) -> None:
+def _places(models: list[EvaluatedModel], data: Path, parts: tuple[str, ...], results: Results) -> None:
     """Show the accuracy of contacts and velocity, of models and takes that have them."""
     from edgepose_export.cli.progress import labelled
     from edgepose_export.evaluation.evaluate import takes_of
@@ -336,11 +320,18 @@ def _places(models: list[EvaluatedModel], data: Path, parts: tuple[str, ...]) ->
         for model in (model for model in models if "place" in model.metadata):
             takes = takes_of(data, part, labelled("measuring contacts"))
             if measures := accuracy(model.module, model.metadata, takes):
-                show(f"\n{part}, {model.name} streamed: {describe(measures)}")
+                results.show(f"\n{part}, {model.name} streamed: {describe(measures)}")
+                results.add("contacts", part=part, model=model.name, **measures)
 
 
 def _heat_map(
-    model: EvaluatedModel, data: Path, parts: tuple[str, ...], every: int, path: Path, overwrite: bool
+    model: EvaluatedModel,
+    data: Path,
+    parts: tuple[str, ...],
+    every: int,
+    path: Path,
+    overwrite: bool,
+    results: Results,
 ) -> None:
     from edgepose.inference.archive import is_windowed
 
@@ -357,30 +348,38 @@ def _heat_map(
         takes = takes_of(data, part, labelled(f"measuring {part}"))
         means, frames = window_errors(model.module, takes, HEAT_MAP_FRAMES, HEAT_MAP_FRAMES, every)
         maps[part] = means
-        show(f"\n{part}: SIP error, deg, {frames} frames; rows: future frames, columns: past frames")
+        axes = {"past": HEAT_MAP_FRAMES, "future": HEAT_MAP_FRAMES}
+        results.add("heat_maps", part=part, model=model.name, frames=frames, **axes, sip_error_deg=means)
+        results.show(f"\n{part}: SIP error, deg, {frames} frames; rows: future frames, columns: past frames")
         for future, row in zip(HEAT_MAP_FRAMES[::-1], means[::-1], strict=True):
-            show(f"{future:>6}  " + "  ".join(f"{mean:6.2f}" for mean in row))
-        show("        " + "  ".join(f"{past:>6}" for past in HEAT_MAP_FRAMES))
+            results.show(f"{future:>6}  " + "  ".join(f"{mean:6.2f}" for mean in row))
+        results.show("        " + "  ".join(f"{past:>6}" for past in HEAT_MAP_FRAMES))
     plots.heat_map(path, maps, HEAT_MAP_FRAMES, HEAT_MAP_FRAMES, overwrite)
     say(f"wrote {path}")
 
 
 def _reliability(
-    models: list[EvaluatedModel], data: Path, parts: tuple[str, ...], path: Path, overwrite: bool
+    models: list[EvaluatedModel],
+    data: Path,
+    parts: tuple[str, ...],
+    path: Path,
+    overwrite: bool,
+    results: Results,
 ) -> None:
     from edgepose_export.cli.progress import labelled
     from edgepose_export.evaluation import plots
     from edgepose_export.evaluation import uncertainty as rel
     from edgepose_export.evaluation.evaluate import takes_of
 
-    results: dict[str, dict[str, rel.Reliability]] = {}
+    curves: dict[str, dict[str, rel.Reliability]] = {}
     for part in parts:
         for model in models:
             for mode in model.modes:
                 name = _row_name(models, model, mode)
                 takes = takes_of(data, part, labelled("measuring deviations"))
                 pair = rel.errors_and_deviations(model.module, model.metadata, takes, mode)
-                result = results.setdefault(part, {})[name] = rel.reliability(*pair)
-                show(f"\n{part}: {name}\n{rel.describe(result)}")
-    plots.reliability_plot(path, results, overwrite)
+                result = curves.setdefault(part, {})[name] = rel.reliability(*pair)
+                results.add("reliability", part=part, row=name, **result._asdict())
+                results.show(f"\n{part}: {name}\n{rel.describe(result)}")
+    plots.reliability_plot(path, curves, overwrite)
     say(f"wrote {path}")

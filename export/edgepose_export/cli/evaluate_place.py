@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING
 
-from edgepose.cli.terminal.messages import say, show
+from edgepose.cli.terminal.messages import say
 from edgepose.errors import EdgeposeError
+from edgepose_export.cli.results import Results
 
 if TYPE_CHECKING:
     from edgepose_export.cli.evaluate import EvaluatedModel
@@ -23,6 +24,7 @@ def evaluate_place(
     parts: Sequence[str],
     picture: FilePath | None,
     overwrite: bool,
+    results: Results,
 ) -> None:
     """Show tables of the errors of paths, and draw paths of the first model.
 
@@ -51,19 +53,28 @@ def evaluate_place(
                 )
             errors = summarise(path.errors for path in paths)
             kinds = summarise({BOTH: path.kinds} for path in paths)
-            show(f"\n{format_table(f'{part}, {model.name}: errors of the path', errors)}")
+            results.add("tables", kind="place", title=f"{part}, {model.name}", rows=errors)
+            results.add("tables", kind="place by motion", title=f"{part}, {model.name}", rows=kinds)
+            results.show(f"\n{format_table(f'{part}, {model.name}: errors of the path', errors)}")
             if kinds:
-                show(f"\n{format_table(f'{part}, {model.name}: after 2 s, cm, by kind of motion', kinds)}")
+                results.show(
+                    f"\n{format_table(f'{part}, {model.name}: after 2 s, cm, by kind of motion', kinds)}"
+                )
             if model is able[0]:
                 drawn[part] = sorted(paths, key=_width, reverse=True)[:SHOWN]
-    show(f"\n{LEGEND}")
+    results.show(f"\n{LEGEND}")
     if picture:
         path_plot(picture, drawn, BOTH, overwrite)
         say(f"wrote {picture}")
 
 
 def evaluate_real_place(
-    names: Mapping[str, str], trust: bool, folder: FilePath, picture: FilePath | None, overwrite: bool
+    names: Mapping[str, str],
+    trust: bool,
+    folder: FilePath,
+    picture: FilePath | None,
+    overwrite: bool,
+    results: Results,
 ) -> None:
     """Show and draw the paths of the real wearers.
 
@@ -73,6 +84,7 @@ def evaluate_real_place(
         folder: of the recordings.
         picture: to write; None for none.
         overwrite: whether an existing picture may be replaced.
+        results: what was measured so far.
     """
     from edgepose.inference import archive
     from edgepose_export.evaluation import plots
@@ -85,9 +97,11 @@ def evaluate_real_place(
         return
     walkers = {name: real.walker_row(walker) for name, (walker, _) in paths.items()}
     sitters = {name: real.sitter_row(sitter) for name, (_, sitter) in paths.items()}
-    show(f"\n{real.format_table('walker: out and back', walkers)}")
-    show(f"\n{real.format_table('sitter: height of the pelvis', sitters)}")
-    show(f"\n{real.LEGEND}")
+    results.add("tables", kind="real place", title="walker", rows=walkers)
+    results.add("tables", kind="real place", title="sitter", rows=sitters)
+    results.show(f"\n{real.format_table('walker: out and back', walkers)}")
+    results.show(f"\n{real.format_table('sitter: height of the pelvis', sitters)}")
+    results.show(f"\n{real.LEGEND}")
     if picture:
         plots.real_path_plot(picture, paths, overwrite)
         say(f"wrote {picture}")

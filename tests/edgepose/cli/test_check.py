@@ -78,7 +78,7 @@ def test_a_recording_without_a_sensor_and_with_one_in_g(command, tmp_path):
     sensors["pelvis"] = sensors["pelvis"]._replace(acc=sensors["pelvis"].acc / 9.81)
     write_npz(tmp_path / "walk.npz", recording._replace(sensors=sensors))
     result = command("check", "--file", tmp_path / "walk.npz")
-    assert result.returncode == 1
+    assert result.returncode == 3
     assert result.stderr == ""
     found = rows(result.stdout)
     assert found["head"][-2:] == ["no", "packets"]
@@ -133,7 +133,7 @@ def test_with_a_calibration(command, wearer):
 def test_a_live_rig_with_faults(command):
     with rig("--loss", 0.2, "--kill", "pelvis@0..") as port:
         result = command("check", "--port", port, "--seconds", 3, "--json")
-    assert result.returncode == 1
+    assert result.returncode == 3
     assert "Traceback" not in result.stderr
     found = {sensor["placement"]: sensor for sensor in json.loads(result.stdout)["sensors"]}
     assert found.pop("pelvis")["finding"] == "no packets"
@@ -154,7 +154,7 @@ def test_a_clock_that_drifts(command):
 def test_a_port_on_which_nothing_comes(command):
     with silent_port() as port:
         result = command("check", "--port", port, "--protocol", "native", "--seconds", 0.5)
-    assert result.returncode == 1
+    assert result.returncode == 3
     assert result.stderr == ""
     assert [cells[-2:] for cells in rows(result.stdout).values()] == [["no", "packets"]] * 6
 
@@ -281,7 +281,7 @@ def test_warnings_are_on_the_page_and_stay(tmp_path):
         silent_port() as port,
         Terminal(["--port", port, "--protocol", "native", "--seconds", 5.6]) as terminal,
     ):
-        assert terminal.rest() == 1
+        assert terminal.rest() == 3
     page, _, after = terminal.text.partition("\033[?1049l")
     assert f"{port}: no data for 5 s" in plain(page).replace("\n  ", " ")
     assert f"warning: {port}: no data for 5 s" in after
@@ -317,7 +317,7 @@ def test_equal_findings_are_said_once_and_the_same_everywhere(command, tmp_path)
     words = ("check", "--file", tmp_path / "biased.npz")
     code, screen = on_a_terminal([sys.executable, "-m", "edgepose", *words])
     piped = command(*words)
-    assert code == piped.returncode == 1
+    assert code == piped.returncode == 3
     (line,) = [line for line in piped.stdout.splitlines() if "deg/s at rest" in line]
     names = ", ".join(name for name in PLACEMENTS if name != "head")
     assert re.fullmatch(rf"{names}: its rate is 10\.\d to 19\.\d deg/s at rest: keep it still .*", line)

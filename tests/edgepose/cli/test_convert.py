@@ -456,7 +456,7 @@ def test_no_place_to_write_and_no_standard_input(command, tmp_path):
     result = command("convert", REAL, "--to", "csv", "--out", tmp_path / "a.csv" / "b")
     assert result.returncode == 1
     folder = re.escape(str(tmp_path / "a.csv" / "b"))
-    assert re.search(rf"failed: cannot make the folder {folder}: .*; choose another --out\n", result.stderr)
+    assert re.search(rf"failed: cannot make the folder {folder}: .*; choose another folder\n", result.stderr)
     words = [sys.executable, "-m", "edgepose", "convert", "-", "--to", "csv", "--out", str(tmp_path / "o")]
     closed = ["sh", "-c", 'exec "$@" <&-', "sh", *words]
     result = processes.run(closed, text=True, capture_output=True, check=False)

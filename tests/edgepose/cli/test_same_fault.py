@@ -69,7 +69,7 @@ class Fault(NamedTuple):
 
     change: Callable[[Tick, int], Tick]
     says: str
-    codes: tuple[int | None, int, int] = (1, 1, 0)
+    codes: tuple[int | None, int, int] = (3, 1, 0)
     protocol: str = "native"
 
 
@@ -86,7 +86,7 @@ FAULTS = {
     "data in g": Fault(
         of_head(lambda s, k: s._replace(acc=tuple(a / 9.81 for a in s.acc))),
         r"head: it reads [01](\.\d+)? at rest, which is in g: send m/s², 9.81 at rest",
-        codes=(1, 0, 0),
+        codes=(3, 0, 0),
     ),
     "no gravity": Fault(
         of_head(lambda s, k: s._replace(acc=(0.01 * (k % 3), 0.0, 0.0))),
@@ -96,7 +96,7 @@ FAULTS = {
     "a restarted device": Fault(
         of_head(lambda s, k: s._replace(time_us=s.time_us % 1_000_000)),
         r"head: its clock restarted( \d+ times)?; its heading may differ after that",
-        codes=(1, 0, 0),
+        codes=(3, 0, 0),
     ),
     "no common north": Fault(
         of_all(lambda s: s),

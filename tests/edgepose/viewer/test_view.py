@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import http.client
 import json
 import os
 import re
@@ -27,8 +28,9 @@ from websockets.sync.client import connect
 
 from edgepose.cli import cli
 from edgepose.config import OutputConfig
-from edgepose.errors import EdgeposeError
+from edgepose.errors import ConfigError, EdgeposeError
 from edgepose.formats.poses.registry import read_poses
+from edgepose.pipeline.remote_control import Requests
 from edgepose.pose import CONTACTS, PoseFrame, held_sensors, parse_status
 from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.csv import CsvSink
@@ -129,16 +131,22 @@ def take(stream: UdpPoseStream, receiver: socket.socket, now: float) -> PoseFram
 
 def test_only_the_newest_pose_is_shown_and_losses_are_counted(line):
     sink, receiver = line
-    stream = UdpPoseStream()
+    stream = UdpPoseStream(0.0)
     assert stream.take(receiver, 0.0) is None
     assert stream.text(0.0) == "waiting for poses"
+    assert stream.text(7.2) == "waiting for poses for 7 s: do the sensors send?"
     for i in (0, 1, 2, 5, 4, 5):
         sink.write(standing(i, "held head" if i == 5 else "ok"))
     assert take(stream, receiver, 1.0).index == 5
     assert stream.text(1.0).startswith("4 poses/s, 4 poses, 2 lost\n\n**held head**\n\n| sensor")
-    assert stream.text(9.5).startswith("4 poses/s, 4 poses, 2 lost\n\n**nothing for 8 s**") is False
+    assert (
+        stream.text(9.5).startswith("4 poses/s, 4 poses, 2 lost\n\n**nothing for 8 s: do the sensors send?**")
+        is False
+    )
     stream.take(receiver, 9.5)
-    assert stream.text(9.5).startswith("0 poses/s, 4 poses, 2 lost\n\n**nothing for 8 s**")
+    assert stream.text(9.5).startswith(
+        "0 poses/s, 4 poses, 2 lost\n\n**nothing for 8 s: do the sensors send?**"
+    )
     sink.write(standing(5))  # once more, late
     assert take(stream, receiver, 10.0) is None
     for i in (900, 0):  # then another run
@@ -146,9 +154,30 @@ def test_only_the_newest_pose_is_shown_and_losses_are_counted(line):
     assert take(stream, receiver, 10.0).index == 0
 
 
+def test_what_stands_still_and_how_late_it_is(line):
+    """Noise of the sensors is no motion; poses of a recording are not late."""
+    sink, receiver = line
+    stream = UdpPoseStream(0.0)
+    noise = Rotation.from_rotvec(np.radians(0.1) * np.ones(3)).as_matrix()
+    for second in range(9):
+        pose = standing(second)._replace(time_s=time.time() - 0.25)
+        rotations = standing(40 if second == 8 else 0).rotations.copy()
+        sink.write(pose._replace(rotations=rotations @ noise if second % 2 else rotations))
+        take(stream, receiver, float(second))
+        still = 3 <= second < 8
+        assert (f"**ok, nothing has moved for {second} s**" in stream.text(second)) is still
+        assert ("**ok**" in stream.text(second)) is not still
+    late = int(re.search(r"(\d+) ms late", stream.text(8.0))[1])
+    assert 250 <= late < 5000
+    sink.write(standing(9))
+    stream = UdpPoseStream(0.0)
+    take(stream, receiver, 1.0)
+    assert "late" not in stream.text(1.0)
+
+
 def test_what_is_no_pose_is_counted_and_left_out(line):
     sink, receiver = line
-    stream = UdpPoseStream()
+    stream = UdpPoseStream(0.0)
     whole = json.loads(encode_json(standing()))
     bad = [
         b"",
@@ -224,17 +253,22 @@ def colours(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @needs_browser
 def test_poses_of_a_file_in_the_browser(browser, tmp_path):
+    twist = Rotation.from_euler("x", 30, degrees=True).as_matrix()
     for name in ("poses", "truth"):
         with CsvSink(tmp_path / f"{name}.csv") as sink:
             for i in range(600):
-                sink.write(standing(i, "held head" if 200 <= i < 400 else "ok"))
+                pose = standing(i, "held head" if 200 <= i < 400 else "ok")
+                pose.rotations[19] = twist if name == "truth" else pose.rotations[19]  # the right elbow
+                sink.write(pose)
     port = free_port()
-    words = ("view", tmp_path / "poses.csv", "--reference", tmp_path / "truth.csv", "--port", port)
+    words = ("view", tmp_path / "poses.csv", "--reference", tmp_path / "truth.csv", "--page-port", port)
     with started(*words) as process:
         assert f"open http://127.0.0.1:{port} in a browser" in process.stderr.readline()
         browser.call("Page.navigate", url=f"http://127.0.0.1:{port}")
         until(lambda: "of 600, 60 poses/s" in browser.text(), "the text beside the figure")
         assert "right lower leg" in browser.text()
+        # 30 degrees at one of 15 joints; hand and wrist, which it moves, are none of them.
+        assert "error 2.0°, most at right elbow: 30°; mean of the file 2.0°" in browser.text()
 
         def number() -> int:
             return int(re.search(r"pose (\d+) of 600", browser.text())[1])
@@ -276,7 +310,7 @@ def walking(folder: Path) -> Path:
 @needs_browser
 def test_the_camera_follows_a_walk(browser, tmp_path):
     port = free_port()
-    with started("view", walking(tmp_path), "--port", port) as process:
+    with started("view", walking(tmp_path), "--page-port", port) as process:
         process.stderr.readline()
         browser.call("Page.navigate", url=f"http://127.0.0.1:{port}")
         until(lambda: re.search(r"pose [3-5]\d\d of 600", browser.text()), "the second half of the walk")
@@ -348,14 +382,14 @@ def test_poses_of_a_bvh_file(tmp_path):
         for i in range(60):
             sink.write(standing(i))
     port = free_port()
-    with started("view", tmp_path / "poses.bvh", "--port", port) as process:
+    with started("view", tmp_path / "poses.bvh", "--page-port", port) as process:
         assert f"open http://127.0.0.1:{port} in a browser" in process.stderr.readline()
 
 
 @needs_browser
 def test_poses_as_they_come_in_the_browser(browser):
     page, line = free_port(), free_port(socket.SOCK_DGRAM)
-    with started("view", "--udp", f"127.0.0.1:{line}", "--port", page) as process:
+    with started("view", "--udp", f"127.0.0.1:{line}", "--page-port", page) as process:
         process.stderr.readline()
         browser.call("Page.navigate", url=f"http://127.0.0.1:{page}")
         until(lambda: "waiting for poses" in browser.text(), "the page")
@@ -501,10 +535,11 @@ def test_a_port_that_is_taken(command, tmp_path):
         sink.write(standing())
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-        result = command("view", tmp_path / "poses.csv", "--port", port)
+        result = command("view", tmp_path / "poses.csv", "--page-port", port)
     assert result.returncode == 1
     assert re.fullmatch(
-        rf"edgepose: cannot show poses at 127\.0\.0\.1 port {port}: .*choose another --port\n", result.stderr
+        rf"edgepose: cannot show poses at 127\.0\.0\.1 port {port}: .*choose another --page-port\n",
+        result.stderr,
     )
 
 
@@ -549,6 +584,69 @@ def test_pages_of_others_cannot_read_the_view(origin, status):
                 f"ws://{address}", origin=origin, subprotocols=[f"viser-v{viser.__version__}"]
             ) as line:
                 assert line.recv(timeout=60)
+
+
+def test_a_name_that_was_bent_to_this_machine_sees_nothing():
+    with contextlib.closing(Viewer("127.0.0.1", free_port(), default_body())) as viewer:
+        for name, status in (("evil.example", 403), ("localhost", 200), (socket.gethostname(), 200)):
+            line = http.client.HTTPConnection("127.0.0.1", viewer.port, timeout=60)
+            with contextlib.closing(line):
+                line.request("GET", "/", headers={"Host": f"{name}:{viewer.port}"})
+                assert line.getresponse().status == status
+
+
+def test_the_page_of_a_run_is_where_it_is_wanted_or_nowhere(caplog):
+    port = free_port()
+    with contextlib.ExitStack() as stack:
+        open_outputs(stack, OutputConfig(view=True, page_port=port), wearer="anna")
+        until(lambda: f"anna: open http://127.0.0.1:{port} in a browser" in caplog.messages, "the page")
+    with socket.create_server(("127.0.0.1", 0)) as taken, contextlib.ExitStack() as stack:
+        port = taken.getsockname()[1]
+        with pytest.raises(EdgeposeError, match=rf"port {port}: Address already in use.*another --page-port"):
+            open_outputs(stack, OutputConfig(view=True, page_port=port))
+    with pytest.raises(ConfigError, match=r"--page-port 8081: give a port .* for the page of --view"):
+        OutputConfig(csv="a.csv", page_port=8081)
+
+
+def test_two_wearers_want_one_port(command, wearer, tmp_path):
+    for name, line in (("anna", "a"), ("ben", "b")):
+        text = f'port = "/dev/{line}"\ncalibration = "{wearer.calibration}"\nview = true\npage-port = 8081\n'
+        (tmp_path / f"{name}.toml").write_text(text)
+    result = command("run", "--rig", "anna.toml", "--rig", "ben.toml", cwd=tmp_path)
+    assert result.returncode == 1
+    assert "anna.toml, ben.toml: both have page-port 8081; give each its own" in result.stderr
+
+
+def test_a_button_is_a_key_for_its_wearer():
+    with contextlib.ExitStack() as stack:
+        requests = Requests(stack, None, lambda: [])
+        for key in ("r", "o", "x", ""):
+            requests.press(key)
+        assert requests.poll("rezero") == [3.0]  # the wearer has to leave the keyboard
+        assert requests.poll("origin") == [0.0]
+        assert requests.poll("rezero") == []
+
+
+@needs_browser
+def test_buttons_press_the_keys_of_the_run(browser):
+    port, keys = free_port(), []
+    with contextlib.ExitStack() as stack:
+        open_outputs(stack, OutputConfig(view=True, page_port=port), press=keys.append)
+        until(lambda: not port_is_free(port), "the page")
+        browser.call("Page.navigate", url=f"http://127.0.0.1:{port}")
+        until(lambda: "waiting for poses" in browser.text(), "the text")
+        for label, key in (("re-zero headings", "r"), ("back to the origin", "o")):
+            button = f"[...document.querySelectorAll('button')].find(b => b.innerText == '{label}')"
+            until(lambda button=button: browser.run(f"{button} !== undefined"), "the button")
+            browser.run(f"{button}.click()")
+            until(lambda key=key: keys[-1:] == [key], "the key")
+        until(lambda: "headings are re-zeroed in 3 s" in browser.text(), "the explanation")
+
+
+def port_is_free(port: int) -> bool:
+    with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=5):
+        return False
+    return True
 
 
 def test_two_wearers_have_a_page_each(caplog):

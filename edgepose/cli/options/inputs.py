@@ -1,0 +1,45 @@
+"""The argument IN: recordings to work on one after the other, instead of a source."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+
+_SOURCES = ("file", "port", "can", "listen", "connect")
+
+
+def inputs_argument() -> click.Argument:
+    """Return the argument, which the command gets as `inputs: tuple[Path, ...]`."""
+    return click.Argument(
+        ["inputs"], nargs=-1, metavar="[IN]...", type=click.Path(path_type=Path, allow_dash=True)
+    )
+
+
+def with_first(inputs: tuple[Path, ...], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of the flags of a source, which is the first input if there are inputs.
+
+    Raises:
+        click.UsageError: inputs and a source are given.
+    """
+    if not inputs:
+        return dict(values)
+    if flags := [name for name in _SOURCES if values[name] is not None]:
+        raise click.UsageError(f"give either recordings as IN or a source with --{flags[0]}, not both")
+    return {**values, "file": inputs[0]}
+
+
+def recordings_or_source(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the argument to a command with `source_options`, whose source is then the first of the inputs."""
+
+    @functools.wraps(command)
+    def with_inputs(inputs: tuple[Path, ...], **values: Any) -> Any:
+        return command(inputs=inputs, **with_first(inputs, values))
+
+    argument = inputs_argument()
+    return click.argument(
+        str(argument.name), nargs=argument.nargs, metavar=argument.metavar, type=argument.type
+    )(with_inputs)
