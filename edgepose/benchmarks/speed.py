@@ -14,7 +14,6 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
-from math import cos, sin
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -22,7 +21,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from edgepose.calibration import GRAVITY, Calibration, apply_calibration
+from edgepose.benchmarks.simulated import SENSOR_HZ, calibration, packet
+from edgepose.calibration import apply_calibration
 from edgepose.calibration.rezero import HeadingRezero
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuFrame, ImuSample
@@ -41,14 +41,11 @@ from edgepose.sinks.udp import UdpSink, encode_binary, encode_json
 from edgepose.skeleton import default_body
 from edgepose.sources import Batch
 from firmware_protocols.registry import PROTOCOLS, Decoder
-from firmware_protocols.sample import Sample
 
 RATE = 60.0
 BUDGET_US = 1e6 / RATE
 
-_SENSOR_HZ = 100
 _SECONDS = 10
-_PACED_S = 5
 _ROUNDS = 7
 _FRAMES = {"stream": 100, "window": 20}
 """Frames per round; results are medians over rounds."""
@@ -67,22 +64,11 @@ Result = TypeVar("Result")
 
 
 def _chunks() -> list[bytes]:
-    """Simulate the bytes of six sensors on one line, one chunk per 1/60 s."""
-    encode = PROTOCOLS["native"].encode
+    """Return the bytes of six sensors on one line, one chunk per 1/60 s."""
     chunks = [b""] * (int(RATE) * _SECONDS + 1)
-    for seq in range(_SENSOR_HZ * _SECONDS):
-        time_s = seq / _SENSOR_HZ
-        half = 0.3 * sin(2.0 * time_s)
-        turn = (cos(half), 0.6 * sin(half), 0.0, 0.8 * sin(half))
-        for sensor in range(len(PLACEMENTS)):
-            force, rate, field = (
-                (0.1 * sensor, 0.2, GRAVITY),
-                (0.36 * cos(2.0 * time_s), 0.0, 0.0),
-                (20.0, 0.0, -40.0),
-            )
-            chunks[int(time_s * RATE)] += encode(
-                Sample(sensor, 1_000_000 + int(1e6 * time_s), turn, force, rate, field), seq
-            )
+    for number in range(SENSOR_HZ * _SECONDS):
+        time_s = number / SENSOR_HZ
+        chunks[int(time_s * RATE)] += b"".join(packet(i, number, time_s) for i in range(len(PLACEMENTS)))
     return chunks
 
 
@@ -91,14 +77,6 @@ def _decode(decoder: Decoder, chunk: bytes) -> list[ImuSample]:
         ImuSample(sensor, 1e-6 * (time_us or 0), quat, acc, gyr, mag)
         for sensor, time_us, quat, acc, gyr, mag, _ in decoder.feed(chunk)
     ]
-
-
-def _calibration() -> Calibration:
-    """Return the calibration of sensors aligned with their bones in the T-pose."""
-    none = np.tile([1.0, 0.0, 0.0, 0.0], (len(PLACEMENTS), 1))
-    up = np.array([0.5, -0.5, -0.5, -0.5])  # T's Y is I's Z
-    zero = np.zeros(len(PLACEMENTS))
-    return Calibration(up, zero, none, zero, "t-pose", "heading:0", "", {})
 
 
 # --- steps --------------------------------------------------------------------------------------------------
@@ -120,7 +98,7 @@ def step_costs(engine: Engine, folder: Path) -> dict[str, float]:
         folder: for the CSV output.
     """
     decoder, clock = PROTOCOLS["native"].decoder(), FrameSynchronizer(RATE)
-    headings, orienter = HeadingRezero(_calibration()), OrientationEstimator("kalman")
+    headings, orienter = HeadingRezero(calibration()), OrientationEstimator("kalman")
     place = PlaceStage(default_body())
 
     def to_frames(samples: list[ImuSample]) -> list[ImuFrame]:
@@ -128,9 +106,9 @@ def step_costs(engine: Engine, folder: Path) -> dict[str, float]:
         return clock.frames(samples[-1].time_s)
 
     def calibrated(frame: ImuFrame) -> tuple[ImuFrame, Any, Any]:
-        calibration = headings.calibration_for(frame)
-        assert calibration is not None, "without hold_first there is always one"
-        return frame, *apply_calibration(calibration, frame.orientation, frame.force)
+        found = headings.calibration_for(frame)
+        assert found is not None, "without hold_first there is always one"
+        return frame, *apply_calibration(found, frame.orientation, frame.force)
 
     costs = {}
     samples, costs["decode"] = _timed(lambda chunk: _decode(decoder, chunk), _chunks())
@@ -166,16 +144,12 @@ class Latency(NamedTuple):
     per_s: float
 
 
-def whole_walk(engine: Engine, paced: bool) -> Latency:
-    """Run packets through all steps to datagrams, at full speed or at 60 frames a second."""
+def whole_walk(engine: Engine) -> Latency:
+    """Run packets through all steps to datagrams at full speed."""
     decoder = PROTOCOLS["native"].decoder()
-    chunks = _chunks()[: int(RATE) * _PACED_S] if paced else _chunks()
 
     def source() -> Iterator[Batch]:
-        started = time.perf_counter()
-        for k, chunk in enumerate(chunks):
-            if paced:
-                time.sleep(max(0.0, started + k / RATE - time.perf_counter()))
+        for chunk in _chunks():
             arrived = time.perf_counter()
             samples = _decode(decoder, chunk)
             now_s = samples[-1].time_s if samples else 0.0
@@ -187,7 +161,7 @@ def whole_walk(engine: Engine, paced: bool) -> Latency:
             summary = run(
                 WearerPipeline(
                     FrameSynchronizer(RATE),
-                    HeadingRezero(_calibration()),
+                    HeadingRezero(calibration()),
                     [sink],
                     place=PlaceStage(default_body()),
                 ),

@@ -25,24 +25,35 @@ if TYPE_CHECKING:
 )
 @click.option("--trust", is_flag=True, help="Load models even if their checksums are unknown.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
+@click.option(
+    "--against",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Compare with what --json printed before.",
+)
 @click.pass_context
-def bench(ctx: click.Context, models: tuple[str, ...], trust: bool, as_json: bool) -> None:
+def bench(
+    ctx: click.Context, models: tuple[str, ...], trust: bool, as_json: bool, against: Path | None
+) -> None:
     """Measure the accuracy and speed of parts of the program.
 
     Without a command, measure on one core of this machine the speed of every step from packets to poses, and
     of the models in all modes and precisions and in numpy, compared with a torch.nn.LSTM of the same size.
+    The processor time of a live run at 60 Hz is what users pay: it is more than the sum of the steps, which
+    run at full speed.
 
     \b
     Examples:
       edgepose bench
-      edgepose bench --model my-birnn.pt --trust --json
+      edgepose bench --model my-birnn.pt --trust --json > before.json
+      edgepose bench --model my-birnn.pt --trust --against before.json
       edgepose bench orientation --data broad/data_mat
     """
     if ctx.invoked_subcommand is None:
-        _speed(models, trust, as_json)
+        _speed(models, trust, as_json, against)
 
 
-def _speed(models: tuple[str, ...], trust: bool, as_json: bool) -> None:
+def _speed(models: tuple[str, ...], trust: bool, as_json: bool, against: Path | None) -> None:
     from edgepose.inference import archive
 
     infos = [archive.read_info(archive.find_archive(name)) for name in models]
@@ -52,7 +63,11 @@ def _speed(models: tuple[str, ...], trust: bool, as_json: bool) -> None:
 
     from tempfile import TemporaryDirectory
 
+    from edgepose.cli.speed_tables import compared, ratio_table, read_report, speed_tables
+
+    before = None if against is None else read_report(against)
     from edgepose.benchmarks import speed
+    from edgepose.benchmarks.live_run import live_cost
     from edgepose.benchmarks.start_up import starts
 
     report: dict[str, Any] = {"machine": speed.machine(), "models": []}
@@ -62,61 +77,32 @@ def _speed(models: tuple[str, ...], trust: bool, as_json: bool) -> None:
         with TemporaryDirectory() as folder:
             engine = speed.load_engine(info, trust, "auto")
             steps = speed.step_costs(engine, Path(folder))
-        throughputs = {
-            name: speed.whole_walk(speed.load_engine(info, trust, "auto"), paced)._asdict()
-            for name, paced in (("full_speed", False), ("paced", True))
-        }
+        full_speed = speed.whole_walk(speed.load_engine(info, trust, "auto"))
+        live = live_cost(info.path)
         rows = [row._asdict() for row in speed.model_speeds(info, trust)]
         report["models"].append(
-            {"name": info.path.stem, "start": started, "steps_us": steps, **throughputs, "ways": rows}
+            {
+                "name": info.path.stem,
+                "start": started,
+                "steps_us": steps,
+                "full_speed": full_speed._asdict(),
+                "live": None if live is None else live._asdict(),
+                "ways": rows,
+            }
         )
-    show(json.dumps(report, indent=1) if as_json else _speed_tables(report, speed.BUDGET_US))
-
-
-def _speed_tables(report: dict[str, Any], budget_us: float) -> str:
-    """Return the speeds as Markdown tables."""
-    about = report["machine"]
-    lines = [f"{about['processor']}, one core; Python {about['python']}, torch {about['torch']}"]
-    models = report["models"]
-    names = [model["name"] for model in models]
-    lines += ["", *_header(["us a frame", *names])]
-    for step in models[0]["steps_us"]:
-        lines.append(_row([step, *(f"{model['steps_us'][step]:.0f}" for model in models)]))
-    lines += ["", *_header(["packets to UDP, all steps", "frames a second", "p50 ms", "p99 ms", "max ms"])]
-    for model in models:
-        for key, label in (("full_speed", "at full speed"), ("paced", "at 60 Hz")):
-            throughput = model[key]
-            times = (f"{throughput[name]:.2f}" for name in ("p50_ms", "p99_ms", "max_ms"))
-            lines.append(_row([f"{model['name']}, {label}", f"{throughput['per_s']:.0f}", *times]))
-    header = ["model", "way", "weights", "us", "p50", "p99", "max", "frames a second", "of 1/60 s", "times"]
-    lines += ["", *_header(header)]
-    for row in (row for model in models for row in model["ways"]):
-        name = "torch.nn.LSTM, defaults" if row["mode"] == "reference" else row["mode"]
-        times = (f"{row[key]:.0f}" for key in ("us", "p50_us", "p99_us", "max_us"))
-        share = f"{100 * row['us'] / budget_us:.1f} %"
-        speed = f"{1e6 / row['us']:.0f}"
-        lines.append(
-            _row([row["model"], name, row["precision"], *times, speed, share, f"{row['times']:.1f}"])
-        )
-    lines += ["", *_header(["a fresh process", "imports s", "model s", "memory MB"])]
-    for name, runtime, start in ((m["name"], *item) for m in models for item in m["start"].items()):
-        memory = "-" if start["memory_mb"] is None else f"{start['memory_mb']:.0f}"
-        imports, load = (f"{start[key]:.2f}" for key in ("imports_s", "load_s"))
-        lines.append(_row([f"{name}, {runtime}", imports, load, memory]))
-    return "\n".join(lines)
+    if before is not None:
+        report["against"] = compared(before, report)
+    if as_json:
+        show(json.dumps(report, indent=1))
+        return
+    show(speed_tables(report, speed.BUDGET_US))
+    if before is not None:
+        show(f"\n{ratio_table(report['against'])}")
 
 
 def _known(value: Any) -> Any:
     """Return a value for JSON, which has no NaN: other packages' filters compute it from some data."""
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _row(cells: list[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
-
-
-def _header(cells: list[str]) -> list[str]:
-    return [_row(cells), "|" + "---|" * len(cells)]
 
 
 @bench.command(short_help="Orientation filters on BROAD.")
