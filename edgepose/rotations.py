@@ -158,11 +158,14 @@ _BY_ENTRY = _four_outer(np.eye(9).reshape(9, 3, 3)).reshape(9, 16) - _ONES
 def matrix_to_quat(r: ArrayLike) -> Array:
     """Unit quaternions (..., 4), w >= 0, of rotations (..., 3, 3); stable everywhere (Shepperd 1978)."""
     r = np.asarray(r, float)
-    rows = (r.reshape(*r.shape[:-2], 9) @ _BY_ENTRY + _ONES).reshape(*r.shape[:-2], 4, 4)
+    outer = r.reshape(-1, 9) @ _BY_ENTRY
+    outer += _ONES
     # The row with the largest diagonal has the least rounding error.
-    best = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
-    q = _unit(np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :])
-    return np.where(q[..., :1] < 0, -q, q)
+    best = outer[:, ::5].argmax(1)
+    q: Array = outer.reshape(-1, 4, 4)[np.arange(len(best)), best]
+    # Of norm 1, and with a first number that is not negative.
+    q /= np.where(q[:, :1] < 0, -1.0, 1.0) * np.sqrt(np.einsum("ij,ij->i", q, q))[:, None]
+    return q.reshape(*r.shape[:-2], 4)
 
 
 def rotvec_to_quat(v: ArrayLike) -> Array:

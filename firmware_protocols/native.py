@@ -108,14 +108,17 @@ class NativeReceiver(Receiver):
     def _take(self, message: Packet | Info) -> list[Sample]:
         """Return the sample of an intact message, if it is new and not empty."""
         samples: list[Sample] = []
-        self._count_good()
+        if not self._in_sync:
+            self._count_good()
         if isinstance(message, Info):
             self.infos[message.sensor_id] = message
             self.counters.skipped += 1
-        elif self._sequence.is_new(message.sensor_id, message.seq, message.t_us):
-            if message.battery is not None:
-                self.batteries[message.sensor_id] = message.battery
-            self._emit(Sample(message.sensor_id, message.t_us, *message[3:8]), samples)
+            return samples
+        sensor, seq, t_us, quat, acc, gyr, mag, temperature, battery = message
+        if self._sequence.is_new(sensor, seq, t_us):
+            if battery is not None:
+                self.batteries[sensor] = battery
+            self._emit(Sample(sensor, t_us, quat, acc, gyr, mag, temperature), samples)
         return samples
 
 
@@ -141,17 +144,18 @@ class NativeDecoder(NativeReceiver):
         samples: list[Sample] = []
         for frame in frames:
             # An empty frame is legal: senders may begin with a 00 to end any noise.
-            message = self._message(frame) if frame else None
+            if not frame:
+                continue
+            try:
+                message: Packet | Info | None = _open_frame(frame)
+            except ValueError:
+                message = self._recovered(frame)
             if message is not None:
                 samples += self._take(message)
         return samples
 
-    def _message(self, frame: bytes) -> Packet | Info | None:
-        if len(frame) <= MAX_FRAME:
-            try:
-                return _open_frame(frame)
-            except ValueError:
-                pass
+    def _recovered(self, frame: bytes) -> Packet | Info | None:
+        """Return the message at the end of a bad frame; None if there is none."""
         self._count_bad()
         # A good packet may follow noise, or a packet whose 00 is lost. Its first body byte is known, so there
         # are few offsets to try.
@@ -171,10 +175,13 @@ def _open_frame(frame: bytes) -> Packet | Info:
     Raises:
         ValueError: the frame is invalid.
     """
+    if len(frame) > MAX_FRAME:
+        raise ValueError("too long")
     body = cobs_decode(frame)
-    if crc_hqx(body[:-2], 0xFFFF) != int.from_bytes(body[-2:], "little"):
+    content = body[:-2]
+    if crc_hqx(content, 0xFFFF) != int.from_bytes(body[-2:], "little"):
         raise ValueError("wrong checksum")
-    return decode_body(body[:-2])
+    return decode_body(content)
 
 
 def _encoder() -> Encode:

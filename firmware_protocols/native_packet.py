@@ -245,8 +245,9 @@ def _decode_packet(body: bytes) -> Packet:
     battery: tuple[int, int] | None = None
     i = 5  # after the header
     if mask & _QUAT:
-        quat = _unit(v[i] / QUAT_SCALE, v[i + 1] / QUAT_SCALE, v[i + 2] / QUAT_SCALE, v[i + 3] / QUAT_SCALE)
-        i += 4
+        w, x, y, z = v[5:9]
+        quat = unit_quaternion(w / QUAT_SCALE, x / QUAT_SCALE, y / QUAT_SCALE, z / QUAT_SCALE)
+        i = 9
     if mask & _ACC:
         acc = (v[i] / ACC_SCALE, v[i + 1] / ACC_SCALE, v[i + 2] / ACC_SCALE)
         i += 3
@@ -263,7 +264,7 @@ def _decode_packet(body: bytes) -> Packet:
         if not plausible(v[i:]):
             raise ValueError(f"NaN, infinity, or more than {LARGEST:.0f}")
         if mask & _QUAT_F:
-            quat = _unit(v[i], v[i + 1], v[i + 2], v[i + 3])
+            quat = unit_quaternion(v[i], v[i + 1], v[i + 2], v[i + 3])
             i += 4
         if mask & _ACC_F:
             acc = v[i : i + 3]
@@ -278,14 +279,9 @@ def _decode_packet(body: bytes) -> Packet:
         battery = v[i:]
         if v[i] > 100:
             raise ValueError("battery above 100 percent")
-    return Packet(v[1], v[3], v[4], quat, acc, gyr, mag, temperature, battery)
-
-
-def _unit(w: float, x: float, y: float, z: float) -> Quaternion:
-    quat = unit_quaternion(w, x, y, z)
-    if quat is None:
+    if quat is None and mask & (_QUAT | _QUAT_F):
         raise ValueError("quaternion is not of unit length")
-    return quat
+    return Packet(v[1], v[3], v[4], quat, acc, gyr, mag, temperature, battery)
 
 
 def _decode_info(body: bytes) -> Info:

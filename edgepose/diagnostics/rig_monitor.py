@@ -18,8 +18,14 @@ _EVERY_S = 2.0
 class RigMonitor:
     """Checks samples like `edgepose check`, and reports each fault once, in the same words."""
 
-    def __init__(self) -> None:
-        """Start the watch with the first samples."""
+    def __init__(self, phase: float = 0.0) -> None:
+        """Start the watch with the first samples.
+
+        Args:
+            phase: from 0 to 1, makes several rigs of one process take turns: a judgement takes as long as a
+                frame lasts.
+        """
+        self._first_s = _EVERY_S * (1.0 + phase)
         self._health: SensorHealthMonitor | None = SensorHealthMonitor()
         self._start_s = self._next_s = math.nan
         self._now_s = math.nan
@@ -37,7 +43,7 @@ class RigMonitor:
         self._health.add(samples)
         self._now_s = now_s
         if math.isnan(self._start_s):
-            self._start_s, self._next_s = now_s, now_s + _EVERY_S
+            self._start_s, self._next_s = now_s, now_s + self._first_s
         if now_s < self._next_s:
             return []
         self._next_s = now_s + _EVERY_S

@@ -16,6 +16,7 @@ class TorchRuntime:
     def __init__(self, module: torch.jit.ScriptModule, place: bool) -> None:
         """Wrap a module; `place` needs an archive that has it (`archive.has_place`)."""
         self._module, self._ending = module, "_place" if place else ""
+        self._stream = getattr(module, "stream" + self._ending)  # looked up once: a module is slow at it
         # Whether each tensor of a state has a row per wearer; the others are the same for all.
         self._has_rows: list[bool] = []
 
@@ -36,8 +37,11 @@ class TorchRuntime:
         self, orientation: Array, acceleration: Array, state: list[torch.Tensor]
     ) -> tuple[Results, list[torch.Tensor]]:
         """See `Runtime.stream`."""
-        *results, state = self._call("stream", orientation, acceleration, state)
-        return Results(*(tensor.numpy() for tensor in results)), state
+        with torch.inference_mode():
+            *results, state = self._stream(
+                torch.from_numpy(orientation), torch.from_numpy(acceleration), state
+            )
+        return Results(*[tensor.numpy() for tensor in results]), state
 
     def stream_many(
         self, orientation: Array, acceleration: Array, state: list[torch.Tensor]

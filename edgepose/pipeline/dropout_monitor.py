@@ -15,18 +15,27 @@ QUIET_S = 30.0
 
 
 class DropoutMonitor:
-    """Watches the frames of a run for sensors that are held."""
+    """Watches the frames of a run for sensors that are held.
+
+    Attributes:
+        any_held: whether a sensor was held in the last frame.
+    """
 
     def __init__(self) -> None:
         """Start with all sensors live."""
         self._since_s: list[float | None] = [None] * len(PLACEMENTS)
         self._reported_s = [-inf] * len(PLACEMENTS)
         self._is_reported = [False] * len(PLACEMENTS)
+        self.any_held = False
 
     def update(self, frame: ImuFrame) -> list[str]:
         """Return one message per sensor that dropped out or came back."""
-        lines = []
-        for i, (name, held) in enumerate(zip(PLACEMENTS, frame.held.tolist(), strict=True)):
+        lines: list[str] = []
+        now_held = frame.held.tolist()
+        before, self.any_held = self.any_held, True in now_held
+        if not before and not self.any_held:
+            return lines
+        for i, (name, held) in enumerate(zip(PLACEMENTS, now_held, strict=True)):
             since_s = self._since_s[i]
             if not held:
                 if self._is_reported[i] and since_s is not None:

@@ -163,9 +163,10 @@ def key_requests(count: int, pressed: Callable[[], str]) -> list[Callable[[], li
     pending: list[list[Request]] = [[] for _ in range(count)]
 
     def by_key(wearer: int) -> list[Request]:
-        new = [KEYS[key] for key in pressed() if key in KEYS]
-        for queue in pending:
-            queue += new
+        if keys := pressed():
+            new = [KEYS[key] for key in keys if key in KEYS]
+            for queue in pending:
+                queue += new
         requests, pending[wearer] = pending[wearer], []
         return requests
 

@@ -73,7 +73,7 @@ class Ground:
             points: the points of `BodyPoints`.
             parts: indices of those that can rest on the ground.
         """
-        return max(self._skin[i] - points[i][1] for i in parts)
+        return max([self._skin[i] - points[i][1] for i in parts])
 
     def correct(
         self,

@@ -78,12 +78,11 @@ class PlaceTracker:
             rotations: (24, 3, 3) local rotations, joint 0 relative to T.
             place: (10,) the network's contacts and velocity, see `EngineOutput.place`; None without them.
         """
-        with np.errstate(all="ignore"):  # numbers that are not finite, or too large, are found below
-            points = self._points.positions(rotations)
+        points = self._points.positions(rotations)
         numbers: list[float] | None = None if place is None else place.tolist()
         if numbers is not None and not math.isfinite(sum(numbers)):
             place = numbers = None
-        if math.isfinite(sum(map(sum, points))) and math.isfinite(time_s):
+        if math.isfinite(sum([x + y + z for x, y, z in points])) and math.isfinite(time_s):
             self._follow(time_s, points, rotations[0], numbers)
         contacts = None if place is None else np.asarray(place[: len(CONTACTS)], np.float32)
         return Place(np.array(self._position), contacts)

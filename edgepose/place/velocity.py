@@ -37,11 +37,12 @@ def shares(probabilities: Sequence[float]) -> list[float]:
 
     A toe counts for as much as the heel has lifted before it.
     """
-    left, right, left_toe, right_toe, pelvis, *wrists = (
-        min(max((p - _UNSURE) / (_SURE - _UNSURE), 0.0), 1.0) for p in probabilities
-    )
-    toes = [max(left_toe - left, 0.0), max(right_toe - right, 0.0)]
-    return [left, right, *toes, pelvis, *(_WRIST * wrist for wrist in wrists)]
+    left, right, left_toe, right_toe, pelvis, left_wrist, right_wrist = [
+        0.0 if p <= _UNSURE else 1.0 if p >= _SURE else (p - _UNSURE) / (_SURE - _UNSURE)
+        for p in probabilities
+    ]
+    left_toe, right_toe = max(left_toe - left, 0.0), max(right_toe - right, 0.0)
+    return [left, right, left_toe, right_toe, pelvis, _WRIST * left_wrist, _WRIST * right_wrist]
 
 
 class PelvisVelocity:

@@ -66,7 +66,7 @@ def encode_binary(pose: PoseFrame, newest: int = 2) -> bytes:
         newest: highest version that the receiver reads.
     """
     flags = _FILLING_WINDOW if pose.warming_up else 0
-    held = sum(1 << i for i, name in enumerate(PLACEMENTS) if name in pose.held)
+    held = sum(1 << PLACEMENTS.index(name) for name in pose.held if name in PLACEMENTS)
     place = b""
     if pose.translation is not None and newest > 1:
         flags |= 0 if pose.contacts is None else _CONTACTS

@@ -65,6 +65,7 @@ class DeviceClock:
         self._least_late = 0.0
         # Per second since the last reset: its start, and the least arrival minus device time in it.
         self._fastest: deque[tuple[float, float]] = deque(maxlen=_DRIFT_BLOCKS)
+        self._least_delay_s, self._block_end_s = inf, -inf  # of the last of them
 
     def host_time(self, t_us: int, arrival_s: float) -> float:
         """Return the host time of a measurement, seconds; always later than the previous call's result.
@@ -78,34 +79,39 @@ class DeviceClock:
             self._restart(t_us, arrival_s)
             self._result = arrival_s
             return arrival_s
-        device_s = unwrap(t_us, self._device_s + arrival_s - self._arrival_s, self._wrap_us)
+        # Written out, without min, max and further calls: there are ten packets in a frame.
+        device_s = time_s = unwrap(t_us, self._device_s + arrival_s - self._arrival_s, self._wrap_us)
         step = device_s - self._device_s
         late = arrival_s - device_s - self._offset
         if step < -_BACK_S or late < -_AHEAD_S:
             self.resets += 1
             self._restart(t_us, arrival_s)
+            time_s = self._device_s
         elif step > 0:
             if arrival_s - self._arrival_s > _LATE_FOR_S:
                 # One late packet after a pause proves nothing; a second of late packets does.
                 self._window_s, self._least_late = arrival_s, inf
             self._device_s, self._arrival_s = device_s, arrival_s
-            self._add_delay(arrival_s, arrival_s - device_s)
-            # Negative if this packet came faster than any before.
-            rise = min(FOLLOWED_PPM * 1e-6 * step, late)
+            if arrival_s - device_s < self._least_delay_s or arrival_s >= self._block_end_s:
+                self._add_delay(arrival_s, arrival_s - device_s)
+            rise = FOLLOWED_PPM * 1e-6 * step
+            if late < rise:
+                rise = late  # negative if this packet came faster than any before
             self._offset += rise
-            self._least_late = min(self._least_late, late - rise)
+            if late - rise < self._least_late:
+                self._least_late = late - rise
             if arrival_s - self._window_s > _LATE_FOR_S:
                 if self._least_late > _LATE_S:
                     self.resets += 1
                     self._offset += self._least_late
-                    self._fastest.clear()
+                    self._clear_delays()
                 self._window_s, self._least_late = arrival_s, inf
+        else:
+            time_s = unwrap(t_us, self._device_s, self._wrap_us)
         # Not the arrival: a packet can be measured long before it comes.
-        self._result = max(self._result + STEP_S, self._time(t_us))
+        result, soonest_s = time_s + self._offset, self._result + STEP_S
+        self._result = result if result > soonest_s else soonest_s
         return self._result
-
-    def _time(self, t_us: int) -> float:
-        return unwrap(t_us, self._device_s, self._wrap_us) + self._offset
 
     def drift_ppm(self) -> tuple[float, float]:
         """Return the device clock's loss against the host's and its standard error, parts per million.
@@ -123,15 +129,19 @@ class DeviceClock:
         return 1e6 * slope, 1e6 * error
 
     def _add_delay(self, arrival_s: float, delay_s: float) -> None:
-        if self._fastest and arrival_s - self._fastest[-1][0] < _DRIFT_S:
-            start_s, least_s = self._fastest[-1]
-            if delay_s < least_s:
-                self._fastest[-1] = (start_s, delay_s)
+        self._least_delay_s = delay_s
+        if arrival_s < self._block_end_s:
+            self._fastest[-1] = (self._fastest[-1][0], delay_s)
         else:
+            self._block_end_s = arrival_s + _DRIFT_S
             self._fastest.append((arrival_s, delay_s))
 
-    def _restart(self, t_us: int, arrival_s: float) -> None:
+    def _clear_delays(self) -> None:
         self._fastest.clear()
+        self._block_end_s = -inf
+
+    def _restart(self, t_us: int, arrival_s: float) -> None:
+        self._clear_delays()
         self._device_s = t_us * 1e-6
         self._arrival_s = self._window_s = arrival_s
         self._offset = arrival_s - self._device_s

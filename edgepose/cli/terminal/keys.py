@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import select
 import sys
+import time
 from types import TracebackType
 from typing import Any
 
@@ -14,12 +15,17 @@ except ImportError:  # Windows
     termios = None  # type: ignore[assignment]
 
 
+EVERY_S = 0.05
+"""Time between two looks at the terminal, seconds: each takes several system calls."""
+
+
 class Keys:
     """Reads single keys from standard input while it is entered; none if that is not a terminal."""
 
     def __init__(self) -> None:
         """Create the reader; `__enter__` changes the terminal's mode."""
         self._before: list[Any] | None = None
+        self._next_s = 0.0
 
     def __enter__(self) -> Keys:
         """Deliver keys at once and without echo; Ctrl-C still interrupts."""
@@ -44,9 +50,12 @@ class Keys:
         return self._before is not None
 
     def pressed(self) -> str:
-        """Return the keys pressed since the last call."""
+        """Return the keys pressed since the last call; none within `EVERY_S` of a look at the terminal."""
+        if self._before is None or (now_s := time.monotonic()) < self._next_s:
+            return ""
+        self._next_s = now_s + EVERY_S
         # The terminal stops a background program that reads from it.
-        if self._before is None or not _in_foreground() or not select.select([0], [], [], 0.0)[0]:
+        if not _in_foreground() or not select.select([0], [], [], 0.0)[0]:
             return ""
         try:
             return os.read(0, 256).decode(errors="ignore")

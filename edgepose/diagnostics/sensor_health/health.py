@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 
 from edgepose.calibration.checks import GRAVITY_TILT_LIMIT_DEG
 from edgepose.calibration.sensor_to_segment import Calibration
-from edgepose.diagnostics.sensor_health.columns import joined_rows, row_of
+from edgepose.diagnostics.sensor_health.columns import TIME, joined_rows, row_of
 from edgepose.diagnostics.sensor_health.comparison import RigComparison, compare_values
 from edgepose.diagnostics.sensor_health.report import SensorHealth
 from edgepose.diagnostics.sensor_health.sensor import Sensor
@@ -40,7 +40,8 @@ class SensorHealthMonitor:
         for sample in samples:
             pending = self._sensors[sample.sensor].pending
             row = row_of(sample, arrival_s)
-            joined = joined_rows(pending[-1], row) if pending else None
+            same_time = pending and pending[-1][TIME] == sample.time_s
+            joined = joined_rows(pending[-1], row) if same_time else None
             if joined is None:
                 pending.append(row)
             else:
@@ -60,6 +61,7 @@ class SensorHealthMonitor:
             lag_ms: delay with which this machine reads packets, see `SensorHealth`.
         """
         self._fold()
+        self._next_fold_s = now_s + 2.0 * _FOLD_S  # the next report comes before
         result = []
         rig, values = self._comparison.result(), compare_values(self._sensors)
         for i, (name, sensor) in enumerate(zip(PLACEMENTS, self._sensors, strict=True)):
