@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from datetime import datetime
 from functools import partial
+from math import inf
 from typing import TYPE_CHECKING
 
 import edgepose
@@ -69,11 +70,14 @@ class OpenWearer:
             EdgeposeError: the source cannot be opened, or the filter or control address is not available.
         """
         self.notify = _with_name(config.name, notify)
+        self._clock: FrameSynchronizer | None = None
         self._config, self._calibration = config, calibration
         with prefix_errors(config.name):
             sensors = config.source.sensors
             self._sensor_map = None if sensors is None else read_map(sensors)
-            self.source = stack.enter_context(open_source(**config.source.arguments(), blocking=blocking))
+            self.source = stack.enter_context(
+                open_source(**config.source.arguments(), blocking=blocking, wanted=self._next_ready_s)
+            )
             self._requests = Requests(stack, config.control, by_key)
             self._orient = OrientationStage(calibration.filter, magnetometer=calibration.north)
         self._sinks: list[Sink] = []
@@ -109,7 +113,12 @@ class OpenWearer:
             )
 
     def pipeline(
-        self, rate: float, future: int, several: bool, on_pose: Callable[[RunSummary], None]
+        self,
+        rate: float,
+        future: int,
+        several: bool,
+        on_pose: Callable[[RunSummary], None],
+        phase: float = 0.0,
     ) -> WearerPipeline:
         """Build the pipeline from samples to outputs.
 
@@ -118,6 +127,7 @@ class OpenWearer:
             future: the network's look-ahead, frames.
             several: align the ticks of live wearers, so that their poses can be compared and batched.
             on_pose: called after each pose.
+            phase: see `RigMonitor`.
         """
         source, outputs = self._config.source, self._config.outputs
         headings = HeadingRezero(
@@ -129,20 +139,24 @@ class OpenWearer:
         place = None
         if not self._config.no_place:
             place = PlaceStage(outputs.body, partial(self._requests.poll, "origin"), self.notify)
+        self._clock = FrameSynchronizer(rate, grid=several and source.file is None)
         return WearerPipeline(
-            FrameSynchronizer(rate, grid=several and source.file is None),
+            self._clock,
             headings,
             self._sinks,
             self._orient,
             self.notify if source.live else lambda text: None,
             on_pose,
             MisfitDetector(self._calibration, self._differences),
-            RigMonitor(),
+            RigMonitor(phase),
             self.notify,
             future / rate if source.live else None,
             place,
             None if outputs.rate is None else PoseResampler(outputs.rate, rate),
         )
+
+    def _next_ready_s(self) -> float:
+        return -inf if self._clock is None else self._clock.next_ready_s()
 
     def _rezero_requests(self) -> list[float]:
         if self._config.no_place and self._requests.poll("origin"):

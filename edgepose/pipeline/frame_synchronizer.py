@@ -192,6 +192,21 @@ class FrameSynchronizer:
             result += self._until(now_s)
         return result
 
+    def next_ready_s(self) -> float:
+        """Return a time before which no frame will be ready, seconds: each sensor sends once a period.
+
+        Sensors that send nothing, or whose period is unknown, are left out.
+        """
+        if self._t0 is None:
+            return -inf
+        tick_s = self._t0 + self._tick / self._rate
+        result = tick_s
+        for sensor in self._sensors:
+            missing_s = tick_s - sensor.newest_s
+            if 0.0 < missing_s <= STALE_S and sensor.intervals:
+                result = max(result, sensor.newest_s + ceil(missing_s / sensor.period_s) * sensor.period_s)
+        return result
+
     def flush(self) -> list[ImuFrame]:
         """Return the frames up to the newest sample, at the end of the samples.
 
@@ -304,7 +319,7 @@ def _mean_force(entries: list[_Entry], start_s: float, end_s: float) -> Vector3:
     t0 = start_s
     left = entries[0]
     for right in entries:
-        t1 = min(max(right.time_s, start_s), end_s)
+        t1 = right.time_s if right.time_s < end_s else end_s
         if t1 > t0:
             span = right.time_s - left.time_s
             # Force in the middle of [t0, t1]; constant before the first entry, where left is right.

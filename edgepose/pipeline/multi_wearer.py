@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import count
 from math import ceil
 from typing import NamedTuple
 
@@ -22,6 +23,10 @@ from edgepose.sources import Source
 
 POLL_S = 0.004
 """Time between two polls of live sources, seconds; a quarter of a frame."""
+
+
+READ_TURNS = 4
+"""Turns after which a wearer is polled even if no frame can be ready: device clocks need arrivals."""
 
 
 class _Waiting(NamedTuple):
@@ -51,6 +56,10 @@ class Wearer:
         self.ended = False
         self._source, self._batches, self._notify = source, source.__iter__(), notify
         self._output_failed = False
+
+    def is_due(self, turn: int) -> bool:
+        """Return whether to poll in a turn: a frame can be ready, or it is time to read what has come."""
+        return turn % READ_TURNS == 0 or time.perf_counter() >= self.pipeline.next_input_s()
 
     def poll(self) -> None:
         """Process the next batch."""
@@ -126,12 +135,14 @@ def run_together(
     closings: list[Future[None]] = []
     due_s = time.monotonic()
     with ThreadPoolExecutor() as executor:
-        while running:
+        for turn in count():
+            if not running:
+                break
             if stopped():
                 for wearer in running.values():
                     wearer.end()
-            for wearer in running.values():
-                if not wearer.ended:
+            for i, wearer in running.items():
+                if not wearer.ended and (not poll_s or wearer.is_due(turn + i)):
                     wearer.poll()
             frames = {i: wearer.waiting.popleft() for i, wearer in running.items() if wearer.waiting}
             _step(engine, frames, running)

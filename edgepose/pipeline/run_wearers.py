@@ -16,6 +16,7 @@ from edgepose.pipeline.remote_control import key_requests
 from edgepose.pipeline.run import run as run_alone
 from edgepose.pipeline.run_report import RunReport
 from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
+from edgepose.utils.freed_memory import keep_freed_memory
 
 
 def open_wearers(
@@ -61,10 +62,14 @@ def run_wearers(
     """
     several = isinstance(engine, MultiWearerEngine)
     on_pose = _ignore if several else on_progress
-    pipelines = [wearer.pipeline(network.rate_hz, network.future, several, on_pose) for wearer in opened]
+    pipelines = [
+        wearer.pipeline(network.rate_hz, network.future, several, on_pose, i / len(opened))
+        for i, wearer in enumerate(opened)
+    ]
     # All objects alive now stay alive; a full collection that visits them would delay a frame by 0.1 s.
     gc.collect()
     gc.freeze()
+    keep_freed_memory()
     if isinstance(engine, MultiWearerEngine):
         wearers = [
             Wearer(wearer.source, pipeline, wearer.notify)

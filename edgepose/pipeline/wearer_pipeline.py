@@ -6,6 +6,7 @@ import time
 from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,7 +83,7 @@ def pose_frame(output: EngineOutput) -> PoseFrame:
     """
     check_finite(output)
     frame: ImuFrame = output.frame
-    held = frozenset(name for name, held in zip(PLACEMENTS, frame.held.tolist(), strict=True) if held)
+    held = frozenset(compress(PLACEMENTS, frame.held.tolist()))
     return PoseFrame(frame.index, frame.time_s, output.rotations, output.std, None, held, output.warming_up)
 
 
@@ -141,17 +142,22 @@ class WearerPipeline:
         self._bones: NDArray[np.float64] | None = None  # those of the previous frame
 
     def process(self, batch: Batch) -> Iterator[EngineInput]:
-        """Return the network inputs of the frames that are ready after a batch."""
+        """Yield the network inputs of the frames that are ready after a batch."""
         self.summary.backlog_s = batch.backlog_s
         self.arrived = time.perf_counter() - batch.backlog_s
         arrival_s = batch.now_s + batch.ahead_s
         self._source_s = arrival_s - self.arrived
+        if batch.samples:
+            self.clock.push(self._orient(batch.samples), arrival_s)
+        yield from self._engine_inputs(self.clock.frames(batch.now_s))
+        # Poses do not wait for this: every two seconds it takes as long as several of them.
         if self._rig is not None:
             for line in self._rig.add(batch.samples, batch.now_s):
                 self._warn(line)
-        if batch.samples:
-            self.clock.push(self._orient(batch.samples), arrival_s)
-        return self._engine_inputs(self.clock.frames(batch.now_s))
+
+    def next_input_s(self) -> float:
+        """Return a time on the clock of `arrived` before which no frame will be ready."""
+        return self.clock.next_ready_s() - self._source_s
 
     def flush(self) -> Iterator[EngineInput]:
         """Yield the network inputs of the last frames."""
@@ -173,7 +179,7 @@ class WearerPipeline:
                 summary.way_m = self._place.way_m
             self._writer.write(pose, age_s)
             summary.warming_up += output.warming_up
-            if frame.held.any():
+            if pose.held:
                 summary.held += 1
                 for i in np.flatnonzero(frame.held):
                     summary.held_by_sensor[i] += 1
@@ -206,6 +212,7 @@ class WearerPipeline:
                 if self._misfits is not None:
                     for line in self._misfits.update(frame, bones):
                         self._warn(line)
-                bones, acceleration = extrapolate_dropouts(bones, acceleration, frame.held, self._bones)
+                if self._dropouts.any_held:
+                    bones, acceleration = extrapolate_dropouts(bones, acceleration, frame.held, self._bones)
                 self._bones = bones
                 yield EngineInput(frame, bones.astype(np.float32), acceleration.astype(np.float32))

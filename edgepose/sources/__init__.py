@@ -11,8 +11,9 @@ line is disconnected. Files keep their own times.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
+from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -134,6 +135,7 @@ def open_source(
     blocking: bool = True,
     listen: str | None = None,
     connect: str | None = None,
+    wanted: Callable[[], float] = lambda: -inf,
 ) -> Source:
     """Return the source that the options describe; nothing is opened before it is entered.
 
@@ -155,6 +157,8 @@ def open_source(
             nothing has come, for callers that read several sources.
         listen: addresses of this machine to receive datagrams on, HOST:PORT, separated by commas.
         connect: devices to connect to over TCP, HOST:PORT, separated by commas.
+        wanted: returns the time on the source's clock before which a caller has no use for more samples of
+            live lines, seconds: those that come until then are delivered together.
 
     Raises:
         EdgeposeError: no input or more than one; an unknown protocol or kind of file; an invalid map.
@@ -173,4 +177,4 @@ def open_source(
     from edgepose.sources.live import LiveSource
 
     specs = line_specs(port, baud, can, bitrate, fd, protocol, sensor_map, listen, connect)
-    return LiveSource(specs, lenient, blocking)
+    return LiveSource(specs, lenient, blocking, wanted)

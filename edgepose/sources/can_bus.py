@@ -64,9 +64,11 @@ class CanBus:
 
     Attributes:
         waiting: see `Transport.waiting`; None, because not all of python-can's interfaces can be polled.
+        file: see `Transport.file`; None for the same reason.
     """
 
     waiting = None
+    file = None
 
     def __init__(self, name: str, bitrate: int, fd: bool) -> None:
         """Open the bus.

@@ -12,6 +12,7 @@ from queue import SimpleQueue
 from typing import Any, NamedTuple, Protocol
 
 from edgepose.errors import DeviceError, EdgeposeError
+from edgepose.sources import POLL_S
 from edgepose.sources.clock_sync import DeviceClock, HostClocks
 from edgepose.sources.line_decoder import Clock, LineDecoder, PlacementById
 from edgepose.sources.protocol_detection import Chunk
@@ -60,6 +61,10 @@ class Transport(Protocol):
         It returns all data that was available unless it says that more may be waiting.
         """
 
+    @property
+    def file(self) -> int | None:
+        """Number of the file that is readable while data are `waiting`; None if there is none to wait for."""
+
 
 class LineSpec(NamedTuple):
     """One line to read from.
@@ -106,12 +111,13 @@ class Arrival(NamedTuple):
 class LineReader:
     """Reads one line, and reopens it after a disconnect.
 
-    In blocking mode a thread reads the line all the time. Otherwise, if the transport can be polled, the
-    thread only empties the line at the start and reopens it after a disconnect.
+    A thread reads the line all the time, unless it is to be polled and the transport can be: then the thread
+    only empties the line at the start and reopens it after a disconnect.
 
     Attributes:
         spec: the line's name, protocols and advice.
         transport: the open port or bus; None while it is disconnected.
+        file: number of the file that is readable when `poll` would return data; None while the thread reads.
         clocks: clocks of the line's devices that send a time, by placement.
         decoder: turns the line's data into samples.
         clock_resets: resets of each device's clock at the last check, by placement.
@@ -127,7 +133,7 @@ class LineReader:
         placement_owner: dict[int, str],
         queue: SimpleQueue[Arrival],
         now: Callable[[], float],
-        blocking: bool,
+        polled: bool,
     ) -> None:
         """Prepare to read; `start` begins.
 
@@ -137,10 +143,11 @@ class LineReader:
             placement_owner: see `LineDecoder`.
             queue: gets an `Arrival` from the thread after each read.
             now: the source's clock, seconds.
-            blocking: see `edgepose.sources.open_source`.
+            polled: read by calls of `poll`, if the transport allows it.
         """
         self.spec = spec
         self.transport: Transport | None = transport
+        self.file: int | None = None
         self.clocks: dict[int, DeviceClock] = {}
         self.decoder: LineDecoder | SenderDecoders
         if spec.senders is None:
@@ -157,7 +164,8 @@ class LineReader:
         self.refused_reported = False
         self._queue = queue
         self._now = now
-        self._blocking = blocking
+        self._polled = polled
+        self._polled_s = -inf
         self._poll: Callable[[], tuple[Chunk, bool]] | None = None  # None while the thread reads
         self._full_reads = 0  # in a row
         self._stop = threading.Event()
@@ -173,22 +181,35 @@ class LineReader:
         """Start the thread that empties the line and then reads it."""
         self._thread.start()
 
-    def poll(self) -> Arrival | None:
-        """Return the data waiting on the line; None while the thread reads."""
+    def poll(self, now_s: float, has_data: bool = True) -> Arrival | None:
+        """Return the data waiting on the line; None while the thread reads.
+
+        Args:
+            now_s: the present on the source's clock, seconds.
+            has_data: false if the line's `file` is not readable.
+        """
         if self._poll is None:
             return None
+        # Hosts of trackers have something to send even if nothing comes.
+        if not has_data and now_s - self._polled_s < POLL_S:
+            return Arrival(self, now_s, b"", now_s)
+        self._polled_s = now_s
         try:
             chunk, more = self._poll()
         except LineDisconnectedError:
-            self._poll = None
+            self._poll = self.file = None
             self._thread = self._thread_from(self._reopen)
             self._thread.start()
             return None
+        except Exception as error:  # raised again by the source
+            self._poll = self.file = None
+            return Arrival(self, now_s, _reading_error(self.spec, error), -inf)
         return self._arrival(chunk, more)
 
     def _arrival(self, chunk: Chunk, more: bool) -> Arrival:
-        self._full_reads = self._full_reads + 1 if more else 0
+        # After the read: a packet that seems to come before it was sent would set its sensor's clock wrong.
         now_s = self._now()
+        self._full_reads = self._full_reads + 1 if more else 0
         return Arrival(self, now_s, chunk, -inf if 0 < self._full_reads <= FULL_READS else now_s)
 
     def _run(self, first: Callable[[], None]) -> None:
@@ -196,8 +217,8 @@ class LineReader:
             first()
             while not self._stop.is_set():
                 assert self.transport is not None
-                if not self._blocking and self.transport.waiting is not None:
-                    self._poll = self.transport.waiting
+                if self._polled and self.transport.waiting is not None:
+                    self._poll, self.file = self.transport.waiting, self.transport.file
                     return
                 if self._queue.qsize() > self.spec.most_waiting:
                     self._stop.wait(_FULL_S)

@@ -4,37 +4,70 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from functools import cache
 from math import inf
 from queue import Empty, SimpleQueue
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any
 
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.sources import POLL_S, Batch, Batches, Device, SourceCounters, sum_counters
 from edgepose.sources.clock_sync import DeviceClock
 from edgepose.sources.line_checks import check_start, warn_about_clock_resets, warn_about_refused
+from edgepose.sources.line_polling import LinePoller
 from edgepose.sources.line_reader import Arrival, LineReader, LineSpec
 
 _log = logging.getLogger(__name__)
+
+_LEAST_REST_S = 0.001
+"""Shortest time for which packets are gathered, seconds; for less it does not pay."""
+
+_STEP = 0.618
+"""Fraction by which the reading between two batches moves: its multiples fill the time from 0 to 1 evenly."""
+
+_AT_ONCE_S = 0.0002
+"""Data that a shorter wait finds may have come before it, seconds."""
 
 UNREAD_S = 1.0
 """Longest time for which a line that reports nothing delays the frames, seconds: its driver may be stuck."""
 
 
-class _Arrivals(NamedTuple):
-    """Data for one batch.
+class _Gathered:
+    """Data for one batch, decoded as they come.
 
     Attributes:
         arrivals: the data, in order of arrival.
+        samples: the samples in them, up to the first error.
+        raw: the undecoded data and their times, see `Batch`.
+        error: the first error.
         since_s: the earliest time at which data may have come that was only seen now.
     """
 
-    arrivals: list[Arrival]
-    since_s: float
+    def __init__(self, arrivals: Iterable[Arrival] = (), since_s: float = inf) -> None:
+        """Decode arrivals."""
+        self.arrivals: list[Arrival] = []
+        self.samples: list[ImuSample] = []
+        self.raw: list[tuple[float, Any]] = []
+        self.error: BaseException | None = None
+        self.since_s = since_s
+        self.add(arrivals)
+
+    def add(self, arrivals: Iterable[Arrival]) -> None:
+        """Decode more arrivals; after an error they are dropped."""
+        self.arrivals += arrivals
+        for line, arrival_s, chunk, _ in arrivals:
+            if self.error is not None or not chunk:
+                continue
+            if isinstance(chunk, BaseException):
+                self.error = chunk
+                continue
+            self.raw += [(arrival_s, piece) for piece in ([chunk] if isinstance(chunk, bytes) else chunk)]
+            try:
+                self.samples += line.decoder.feed(chunk, arrival_s)
+            except Exception as error:
+                self.error = error
 
 
 class _ReadTime:
@@ -73,6 +106,7 @@ class LiveSource:
         specs: Sequence[LineSpec],
         lenient: bool = False,
         blocking: bool = True,
+        wanted: Callable[[], float] = lambda: -inf,
     ) -> None:
         """Store the settings; `__enter__` opens the lines.
 
@@ -80,11 +114,15 @@ class LiveSource:
             specs: lines to read from.
             lenient: warn about a line without usable data instead of raising, and go on with the others.
             blocking: see `open_source`.
+            wanted: see `open_source`.
         """
-        self._blocking = blocking
+        self._blocking, self._wanted = blocking, wanted
         self._lenient = lenient
         self._specs = specs
         self._lines: list[LineReader] = []
+        self._batches = self._poll_lines
+        self._all_started = False  # usable data have come over all lines
+        self._all_timed = False  # all devices send times
         self._queue: SimpleQueue[Arrival] = SimpleQueue()
         self._open = ExitStack()
 
@@ -123,14 +161,21 @@ class LiveSource:
         """
         placement_owner: dict[int, str] = {}
         with ExitStack() as stack:
+            transports = []
             for spec in self._specs:
-                transport = spec.open()
-                stack.callback(transport.close)
-                line = LineReader(spec, transport, placement_owner, self._queue, unix_now, self._blocking)
-                self._lines.append(line)
+                transports.append(spec.open())
+                stack.callback(transports[-1].close)
             stack.pop_all()
-        for line in self._lines:
+        if self._blocking and all(transport.file is not None for transport in transports):
+            self._batches = self._gather
+        elif self._blocking:
+            self._batches = self._wait_for_data
+        polled = self._batches != self._wait_for_data
+        for spec, transport in zip(self._specs, transports, strict=True):
+            line = LineReader(spec, transport, placement_owner, self._queue, unix_now, polled)
+            self._lines.append(line)
             self._open.callback(line.close)
+        self._poller = LinePoller(self._lines, self._queue, unix_now)
         return self
 
     def __exit__(
@@ -150,18 +195,20 @@ class LiveSource:
         for line in self._lines:
             line.start()
         try:
-            for arrivals, since_s in self._wait_for_data() if self._blocking else self._poll_lines():
-                samples, raw, error = _decode_arrivals(arrivals)
-                arrival_s = max(now_s, *(arrival.time_s for arrival in arrivals)) if arrivals else unix_now()
-                now_s = read.update(arrivals, arrival_s)
-                if raw or error is None:
-                    yield Batch(now_s, samples, raw, unix_now() - min(arrival_s, since_s), arrival_s - now_s)
-                if error is not None:
-                    raise error
-                for line in self._lines:
-                    self._check_start(line, now_s, start_s)
+            for data in self._batches():
+                times_s = [arrival.time_s for arrival in data.arrivals]
+                arrival_s = max(now_s, *times_s) if times_s else unix_now()
+                now_s = read.update(data.arrivals, arrival_s)
+                if data.raw or data.error is None:
+                    backlog_s = unix_now() - min(arrival_s, data.since_s)
+                    yield Batch(now_s, data.samples, data.raw, backlog_s, arrival_s - now_s)
+                if data.error is not None:
+                    raise data.error
+                if not self._all_started:
+                    self._all_started = all([self._has_started(line, now_s, start_s) for line in self._lines])
                 if now_s - checked_s > 1.0:
                     checked_s = now_s
+                    self._all_timed = len(self.clocks) == len(self.devices)
                     for line in self._lines:
                         warn_about_clock_resets(line)
                         if line.decoder.counters.packets:
@@ -170,62 +217,69 @@ class LiveSource:
             for line in self._lines:
                 line.stop()
 
-    def _wait_for_data(self) -> Iterator[_Arrivals]:
-        """Yield each arrival by itself, or an empty batch after POLL_S without any."""
+    def _wait_for_data(self) -> Iterator[_Gathered]:
+        """Yield what threads have read by the time that is `wanted`, or an empty batch after POLL_S."""
         while True:
+            rest_s = min(self._wanted() - unix_now(), POLL_S)
+            if rest_s > _LEAST_REST_S:
+                time.sleep(rest_s)
             try:
                 arrivals = [self._queue.get(timeout=POLL_S)]
             except Empty:
                 arrivals = []
-            yield _Arrivals(arrivals, inf)
+            yield _Gathered(arrivals + [self._queue.get() for _ in range(self._queue.qsize())])
 
-    def _poll_lines(self) -> Iterator[_Arrivals]:
+    def _gather(self) -> Iterator[_Gathered]:
+        """Yield what has come by the time that is `wanted`, or what there is after POLL_S.
+
+        Until then this thread sleeps, because waking up costs more than most of the work on a packet. In
+        between it reads once, each time at another instant: so, again and again, packets of each sensor are
+        read as soon as they come, which is what its clock is estimated from. Packets without a time are read
+        at once.
+        """
+        share = 0.0
+        with self._poller as poller:
+            while True:
+                data = _Gathered()
+                now_s = unix_now()
+                last_s = now_s + POLL_S
+                wanted_s = min(self._wanted(), last_s) if self._all_timed else -inf
+                if wanted_s > now_s + _LEAST_REST_S:
+                    share = (share + _STEP) % 1.0
+                    time.sleep(share * (wanted_s - now_s))
+                    data.add(poller.poll())
+                    time.sleep(max(0.0, wanted_s - unix_now()))
+                seen_s, asked_s = poller.polled_s, unix_now()
+                data.add(poller.poll(poller.wait(max(0.0, last_s - asked_s)) or None))
+                if poller.polled_s - asked_s < _AT_ONCE_S:
+                    # What came before it was wanted has not been late for any frame.
+                    data.since_s = min(max(seen_s, wanted_s), asked_s)
+                yield data
+
+    def _poll_lines(self) -> Iterator[_Gathered]:
         """Yield everything that has come since the last batch, without waiting."""
         since_s = unix_now()
         while True:
             poll_s = unix_now()
-            arrivals = [self._queue.get() for _ in range(self._queue.qsize())]
-            polled = [line.poll() for line in self._lines]
-            yield _Arrivals(arrivals + [arrival for arrival in polled if arrival is not None], since_s)
+            yield _Gathered(self._poller.poll(), since_s)
             since_s = poll_s
 
-    def _check_start(self, line: LineReader, now_s: float, start_s: float) -> None:
-        if line.start_checked:
-            return
-        try:
-            check_start(line, now_s, start_s)
-        except EdgeposeError as error:
-            if not self._lenient:
-                raise
-            line.start_checked = True
-            _log.warning("%s", error)
+    def _has_started(self, line: LineReader, now_s: float, start_s: float) -> bool:
+        if not line.start_checked:
+            try:
+                check_start(line, now_s, start_s)
+            except EdgeposeError as error:
+                if not self._lenient:
+                    raise
+                line.start_checked = True
+                _log.warning("%s", error)
+        return line.start_checked
 
 
-def _decode_arrivals(
-    arrivals: Iterable[Arrival],
-) -> tuple[list[ImuSample], list[tuple[float, Any]], BaseException | None]:
-    """Return the samples and the raw data of arrivals up to the first error, and that error."""
-    samples: list[ImuSample] = []
-    raw: list[tuple[float, Any]] = []
-    for line, arrival_s, chunk, _ in arrivals:
-        if isinstance(chunk, BaseException):
-            return samples, raw, chunk
-        if not chunk:
-            continue
-        raw += [(arrival_s, piece) for piece in ([chunk] if isinstance(chunk, bytes) else chunk)]
-        try:
-            samples += line.decoder.feed(chunk, arrival_s)
-        except Exception as error:
-            return samples, raw, error
-    return samples, raw, None
+_UNIX_S = time.time() - time.monotonic()
+"""Unix time at 0 of the monotonic clock; one value for all sources, because wearers share their ticks."""
 
 
 def unix_now() -> float:
     """Return the Unix time, seconds, on the clock of live sources, which never jumps."""
-    return _unix_s() + time.monotonic()
-
-
-@cache
-def _unix_s() -> float:
-    """Unix time at 0 of the monotonic clock; one value for all sources, because wearers share their ticks."""
-    return time.time() - time.monotonic()
+    return _UNIX_S + time.monotonic()

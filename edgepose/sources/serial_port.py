@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import time
 from collections.abc import Callable, Sequence
 from itertools import cycle
@@ -18,6 +19,8 @@ try:
     from termios import error as _TerminalError  # not an OSError, and pyserial does not catch it
 except ImportError:  # missing on Windows
     _TerminalError = OSError  # type: ignore[assignment, misc]
+
+_HAS_FILES = os.name == "posix"
 
 _ANSWER_S = 0.02
 """Longest time until a device starts to answer, seconds."""
@@ -85,15 +88,35 @@ class SerialPort:
         """See `Transport.waiting`; None for request-response devices, whose answers have to be waited for."""
         return self._read_waiting if self._requests is None else None
 
+    @property
+    def file(self) -> int | None:
+        """See `Transport.file`; None on Windows, whose ports are no files to wait for."""
+        return self._serial.fileno() if _HAS_FILES and self._requests is None else None
+
     def _read_waiting(self) -> tuple[bytes, bool]:
         data = b""
         try:
-            while len(data) < _MOST and (count := self._serial.in_waiting):
-                data += self._serial.read(count)
+            while len(data) < _MOST:
+                chunk = self._read_now()
+                data += chunk
+                if len(chunk) < _FULL:
+                    break
+            if not data:
+                _ = self._serial.in_waiting  # raises if the port has gone, which has no data either
+        except BlockingIOError:
+            pass
         except (OSError, _TerminalError):
             if not data:  # otherwise the next poll raises
                 raise LineDisconnectedError from None
         return data, len(data) >= _FULL
+
+    def _read_now(self) -> bytes:
+        """Return data without waiting for any."""
+        if _HAS_FILES:  # with a third of the system calls of pyserial
+            return os.read(self._serial.fd, _MOST)
+        count = self._serial.in_waiting
+        data: bytes = self._serial.read(count) if count else b""
+        return data
 
     def close(self) -> None:
         """See `Transport.close`."""

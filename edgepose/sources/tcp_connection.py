@@ -55,6 +55,11 @@ class TcpConnection:
         """See `Transport.waiting`."""
         return self._receive
 
+    @property
+    def file(self) -> int:
+        """See `Transport.file`."""
+        return self._socket.fileno()
+
     def _receive(self) -> tuple[bytes, bool]:
         try:
             data = self._socket.recv(_MOST)

@@ -64,6 +64,11 @@ class UdpSocket:
         """See `Transport.waiting`."""
         return lambda: self._receive(_MOST_POLLED)
 
+    @property
+    def file(self) -> int:
+        """See `Transport.file`."""
+        return self._socket.fileno()
+
     def _receive(self, most: int) -> tuple[list[Datagram], bool]:
         datagrams: list[Datagram] = []
         more = True

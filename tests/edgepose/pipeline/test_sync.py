@@ -176,6 +176,17 @@ def test_latency_is_one_period():
     assert all(f.ready_s == now for f, now in zip(frames, when, strict=True))
 
 
+def test_the_time_of_the_next_frame_is_known_before():
+    """Of regular sensors, exactly the sample that comes at that time completes it."""
+    clock = FrameSynchronizer()
+    for arrival_s, sample in sorted(at_once(rig(offsets=np.arange(6) * 0.0015))):
+        next_s = clock.next_ready_s()
+        clock.push([sample], arrival_s)
+        made = bool(clock.frames(arrival_s))
+        if arrival_s > 0.1:
+            assert made == (arrival_s > next_s - 1e-6)
+
+
 def test_no_drift_and_no_missing_index_in_ten_minutes():
     clock = FrameSynchronizer(60.0)
     count = 0

@@ -5,6 +5,7 @@ import select
 import time
 from collections import Counter
 from itertools import pairwise
+from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from edgepose.formats.recordings.raw_capture import times_header, times_path, ti
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.placements import PLACEMENTS
-from edgepose.sources import open_source
+from edgepose.sources import POLL_S, open_source
 from edgepose.sources.protocol_detection import protocol_named
 from firmware_protocols import mip
 from firmware_protocols.native import encode, encode_info
@@ -106,6 +107,33 @@ def test_silent_port_still_gives_batches(port):
         times = [next(batches) for _ in range(5)]
     assert all(batch.samples == [] for batch in times)
     assert all(b[0] > a[0] for a, b in pairwise(times))
+
+
+def test_packets_gather_until_they_are_wanted_and_are_kept_for_a_busy_caller(port):
+    """Whoever wants nothing for long gets few batches; what comes while they are busy is not lost."""
+    times = []
+    with open_source(port=port.name, wanted=lambda: inf) as source:
+        batches = iter(source)
+        start_s = next(batches).now_s
+        with Device(port, chunks(1000)):
+            while len(times) < 5:
+                if (now_s := next(batches).now_s) > start_s + 1.2:  # the devices are known to send times
+                    times.append(now_s)
+        assert all(b - a > 0.9 * POLL_S for a, b in pairwise(times))
+        while next(batches).samples:
+            pass
+        # More than the system's buffers hold; nobody iterates meanwhile.
+        before, data = source.counters.packets, b"".join(chunks(200, start_us=5_000_000))
+        os.set_blocking(port.master, False)
+        end_s = time.monotonic() + 20.0
+        while data and time.monotonic() < end_s:
+            with contextlib.suppress(BlockingIOError):
+                data = data[os.write(port.master, data) :]
+        while next(batches).samples:
+            pass
+    assert not data
+    assert source.counters.packets == before + 1200
+    assert source.counters.bad <= 1
 
 
 def test_a_source_that_does_not_wait(port, caplog):
