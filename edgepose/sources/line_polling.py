@@ -18,6 +18,10 @@ The system's buffer for a serial port holds 4 kB, which six sensors fill in a te
 """
 
 
+LOOK_S = 0.005
+"""Time between two looks at lines that cannot be waited for yet, seconds."""
+
+
 class LinePoller:
     """Polls lines, and waits for data on any of them.
 
@@ -62,7 +66,7 @@ class LinePoller:
         """Wait for data up to a time, seconds; return the files that are readable."""
         files = self.files
         if not files:  # as long as all lines are being emptied or reopened
-            time.sleep(seconds)
+            time.sleep(min(seconds, LOOK_S))
         return select.select(files, (), (), seconds)[0] if files else ()
 
     def poll(self, readable: Sequence[int] | None = None) -> list[Arrival]:
