@@ -90,7 +90,7 @@ tests="tests/firmware_protocols tests/edgepose/sources/test_clock.py tests/edgep
   tests/edgepose/inference/test_engine.py tests/edgepose/inference/test_numpy_network.py"
 # Of what tests need, only what these do: vendors' own decoders exist for x86-64 only.
 status=0
-inside "$1" "cd edgepose; .venv/bin/pip install --quiet hypothesis pytest
+inside "$1" "cd edgepose; .venv/bin/pip install --quiet cantools cobs hypothesis pytest
   PYTHONPATH=\$PWD:\$PWD/export .venv/bin/python -m pytest -q -p no:cacheprovider --continue-on-collection-errors $(tr -d '\n' <<< "$tests")" > "$log" 2>&1 || status=1
 echo "$1: tests: $(tail -n 1 "$log"); the rest is in $log"
 exit $status

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -135,7 +134,7 @@ def open_source(
     blocking: bool = True,
     listen: str | None = None,
     connect: str | None = None,
-    wanted: Callable[[], float] = lambda: -inf,
+    wanted: Callable[[], float] | None = None,
 ) -> Source:
     """Return the source that the options describe; nothing is opened before it is entered.
 
@@ -158,7 +157,8 @@ def open_source(
         listen: addresses of this machine to receive datagrams on, HOST:PORT, separated by commas.
         connect: devices to connect to over TCP, HOST:PORT, separated by commas.
         wanted: returns the time on the source's clock before which a caller has no use for more samples of
-            live lines, seconds: those that come until then are delivered together.
+            live lines, seconds: those that come until then are delivered together. By default a thread reads
+            each line, and all samples are delivered as they come.
 
     Raises:
         EdgeposeError: no input or more than one; an unknown protocol or kind of file; an invalid map.

@@ -106,7 +106,7 @@ class LiveSource:
         specs: Sequence[LineSpec],
         lenient: bool = False,
         blocking: bool = True,
-        wanted: Callable[[], float] = lambda: -inf,
+        wanted: Callable[[], float] | None = None,
     ) -> None:
         """Store the settings; `__enter__` opens the lines.
 
@@ -116,7 +116,8 @@ class LiveSource:
             blocking: see `open_source`.
             wanted: see `open_source`.
         """
-        self._blocking, self._wanted = blocking, wanted
+        self._blocking, self._wanted = blocking, wanted or (lambda: -inf)
+        self._gathers = blocking and wanted is not None
         self._lenient = lenient
         self._specs = specs
         self._lines: list[LineReader] = []
@@ -166,7 +167,7 @@ class LiveSource:
                 transports.append(spec.open())
                 stack.callback(transports[-1].close)
             stack.pop_all()
-        if self._blocking and all(transport.file is not None for transport in transports):
+        if self._gathers and all(transport.file is not None for transport in transports):
             self._batches = self._gather
         elif self._blocking:
             self._batches = self._wait_for_data
