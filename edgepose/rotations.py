@@ -126,13 +126,17 @@ def quat_about_z(angle: ArrayLike) -> Array:
 
 def quat_to_matrix(q: ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
-    w, x, y, z = np.moveaxis(np.asarray(q, float), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    c = np.moveaxis(np.asarray(q, float), -1, 0)
+    w, x, y, z = c
+    x2, y2, z2 = x + x, y + y, z + z
+    wx, wy, wz = w * x2, w * y2, w * z2
+    xx, xy, xz = x * x2, x * y2, x * z2
+    yy, yz, zz = y * y2, y * z2, z * z2
+    result = np.empty((*c.shape[1:], 3, 3))
+    result[..., 0, 0], result[..., 0, 1], result[..., 0, 2] = 1.0 - (yy + zz), xy - wz, xz + wy
+    result[..., 1, 0], result[..., 1, 1], result[..., 1, 2] = xy + wz, 1.0 - (xx + zz), yz - wx
+    result[..., 2, 0], result[..., 2, 1], result[..., 2, 2] = xz - wy, yz + wx, 1.0 - (xx + yy)
+    return result
 
 
 def _four_outer(r: Array) -> Array:

@@ -3,28 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
-from typing import NamedTuple, Protocol
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from edgepose.imu import ImuSample, Vector3
 from edgepose.orientation.arrays import NO_FIELD
 from edgepose.orientation.filter import OrientationFilter
+from edgepose.orientation.sample_loop import FilterState, SensorFilter
 from edgepose.orientation.settings import FilterSettings
-from edgepose.orientation.types import Event, OrientationResult
+from edgepose.orientation.types import Event
 from edgepose.orientation.vqf_filter import VqfFilter
-
-
-class SensorFilter(Protocol):
-    """Orients one sensor's samples."""
-
-    def update(
-        self, time_s: ArrayLike, gyr: ArrayLike, acc: ArrayLike, mag: ArrayLike | None = None
-    ) -> OrientationResult:
-        """See `OrientationFilter.update`."""
-
 
 KINDS: dict[str, type[OrientationFilter] | type[VqfFilter]] = {"kalman": OrientationFilter, "vqf": VqfFilter}
 """Filters by their names on the command line."""
@@ -67,7 +57,6 @@ class OrientationEstimator:
         self._spare: list[SensorFilter] = [self._class(settings)]
         self._magnetometer = magnetometer
         self._filters: dict[int, SensorFilter] = {}
-        self._last: dict[int, OrientationResult] = {}
         self._events: defaultdict[int, Counter[int]] = defaultdict(Counter)
         self._fields: dict[int, Vector3] = {}  # from samples without rate and force
 
@@ -77,54 +66,41 @@ class OrientationEstimator:
         It replaces the device's own orientation, which samples without a rate keep. A field in a sample
         without a rate counts for the sensor's next one.
         """
-        indices: defaultdict[int, list[int]] = defaultdict(list)
-        fields: list[Vector3 | None] = [sample.mag for sample in samples]
-        for index, sample in enumerate(samples):
-            if sample.gyr is None or sample.acc is None:
-                if sample.mag is not None:
-                    self._fields[sample.sensor] = sample.mag
-                continue
-            waiting = self._fields.pop(sample.sensor, None)
-            fields[index] = sample.mag or waiting
-            indices[sample.sensor].append(index)
         result = list(samples)
-        for sensor, rows in indices.items():
-            quats = self._orient_sensor(
-                sensor, [samples[index] for index in rows], [fields[index] for index in rows]
-            )
-            for index, (w, x, y, z) in zip(rows, quats, strict=True):
-                result[index] = samples[index]._replace(quat=(w, x, y, z))
+        for index, sample in enumerate(samples):
+            sensor, time_s, _, acc, gyr, mag, *_ = sample
+            if gyr is None or acc is None:
+                if mag is not None:
+                    self._fields[sensor] = mag
+                continue
+            if self._fields:
+                mag = mag or self._fields.get(sensor)
+                self._fields.pop(sensor, None)
+            if not self._magnetometer:
+                mag = None
+            filter = self._filters.get(sensor) or self._new_filter(sensor)
+            quat, events = filter.take(time_s, gyr, acc, NO_FIELD if mag is None else mag)
+            if events:
+                self._events[sensor][events] += 1
+            result[index] = sample._replace(quat=quat)
         return result
 
-    def _orient_sensor(
-        self, sensor: int, samples: Sequence[ImuSample], fields: Sequence[Vector3 | None]
-    ) -> list[list[float]]:
-        filter = self._filters.get(sensor)
-        if filter is None:
-            filter = self._filters[sensor] = self._spare.pop() if self._spare else self._class(self._settings)
-        with_field = self._magnetometer and any(field is not None for field in fields)
-        oriented = filter.update(
-            [sample.time_s for sample in samples],
-            np.array([sample.gyr for sample in samples], float),
-            np.array([sample.acc for sample in samples], float),
-            [NO_FIELD if field is None else field for field in fields] if with_field else None,
-        )
-        self._last[sensor] = oriented
-        self._events[sensor].update(flag for flag in oriented.flagged.tolist() if flag)
-        quats: list[list[float]] = oriented.quat.tolist()
-        return quats
+    def _new_filter(self, sensor: int) -> SensorFilter:
+        filter = self._spare.pop() if self._spare else self._class(self._settings)
+        self._filters[sensor] = filter
+        return filter
 
     def status(self) -> dict[int, SensorStatus]:
         """Return the state of each sensor that has been oriented."""
         return {
-            sensor: SensorStatus(
-                bool(last.rest[-1]),
-                bool(last.disturbed[-1]),
-                tuple(np.rad2deg(last.bias[-1]).tolist()),
-                _by_event(self._events[sensor].items()),
-            )
-            for sensor, last in sorted(self._last.items())
+            sensor: _status(filter.state, self._events[sensor].items())
+            for sensor, filter in sorted(self._filters.items())
         }
+
+
+def _status(state: FilterState, events: Iterable[tuple[int, int]]) -> SensorStatus:
+    x, y, z = np.rad2deg(state.bias).tolist()
+    return SensorStatus(bool(state.rest), bool(state.disturbed), (x, y, z), _by_event(events))
 
 
 def _by_event(counts: Iterable[tuple[int, int]]) -> dict[Event, int]:

@@ -7,8 +7,9 @@ acceleration; the rate at rest; the heading of an undisturbed magnetic field.
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Sequence
-from math import atan2, hypot, inf, pi
+from math import atan2, hypot, inf, pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -16,16 +17,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from edgepose import rotations as rot
 from edgepose.orientation import error_model as model
-from edgepose.orientation.arrays import NO_FIELD, columns
+from edgepose.orientation.arrays import NO_FIELD
 from edgepose.orientation.magnetic_reference import MagneticReference
 from edgepose.orientation.rest import RestDetector
 from edgepose.orientation.sample_checks import MagnetometerMonitor, SampleChecker
+from edgepose.orientation.sample_loop import FilterState, Quat, orient_arrays
 from edgepose.orientation.settings import FilterSettings
 from edgepose.orientation.types import Event, OrientationResult
 
 Array = NDArray[np.float64]
 
 _UP = np.array([0.0, 0.0, 1.0])
+_EYE3 = np.eye(3)
+_NO_ERROR = np.zeros(model.SIZE)
+_NO_ERROR.flags.writeable = False
+_ROW = 10  # numbers of a sample in a block: dt, gyr, acc, mag
+_DIAGONAL = slice(model.BIAS.start * (model.SIZE + 1), model.BIAS.stop * (model.SIZE + 1), model.SIZE + 1)
 _LEAST_FORCE = 1.0  # m/s^2; less has no direction
 _GAP, _SATURATED, _MAG_LOST, _RESTART = (
     int(e) for e in (Event.GAP, Event.SATURATED, Event.MAG_LOST, Event.RESTART)
@@ -37,10 +44,10 @@ class Step(NamedTuple):
 
     Attributes:
         row: the sample after which it was made, counted from the filter's first.
-        matrix: (15, 15) propagation of errors since the step before; None where the filter restarted.
-        predicted: (15, 15) covariance before the correction.
-        error: (15,) the error that was found and corrected.
-        covariance: (15, 15) covariance after the correction.
+        matrix: (21, 21) propagation of errors since the step before; None where the filter restarted.
+        predicted: (21, 21) covariance before the correction.
+        error: (21,) the error that was found and corrected.
+        covariance: (21, 21) covariance after the correction.
         bias: (3,) gyroscope bias after the correction, rad/s.
         turned: angle by which the step rotated the inertial frame about Z (at the first field after a time
             without), rad; all errors from here on are in the rotated frame.
@@ -63,6 +70,7 @@ class OrientationFilter:
     that integrate or average send; for others the orientation is late by half an interval.
 
     Attributes:
+        state: as of the last correction.
         on_step: called after each correction, if set.
     """
 
@@ -74,30 +82,32 @@ class OrientationFilter:
         self.on_step: Callable[[Step], None] | None = None
         self._settings = settings or FilterSettings()
         self._kalman = KalmanFilter(dim_x=model.SIZE, dim_z=3)
-        self._kalman.x = np.zeros(model.SIZE)
+        self._kalman.x = _NO_ERROR
+        self._noise_density = model.noise_density(self._settings)
         self._checker = SampleChecker(self._settings)
         self._rest = RestDetector(self._settings)
         self._magnetometer = MagnetometerMonitor(self._settings)
         self._reference = MagneticReference(self._settings)
         self._row = self._last = 0  # numbers of the next sample and of the last good one
         self._started = False
-        self._quat: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
+        self._quat: Quat = (1.0, 0.0, 0.0, 0.0)
         self._rate: Sequence[float] = (0.0, 0.0, 0.0)  # of the last good sample
         self._velocity = np.zeros(3)
         self._bias = np.zeros(3)
-        self._bias_sigma = np.full(3, self._settings.bias_start)
         self._acc_bias = np.zeros(3)
-        self._scale = np.zeros(3)
-        # Scale and bias as floats: the loop over samples has no arrays in it.
-        self._correction = (1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
+        self._sensitivity = np.zeros((3, 3))
+        # Sensitivity and bias as floats: the loop over samples has no arrays in it.
+        self._correction: tuple[float, ...] = (*_EYE3.ravel().tolist(), 0.0, 0.0, 0.0)
         self._has_heading = False
         self._field_age_s = 0.0  # of the last one that was used or rejected
+        self.state = FilterState(self._bias, np.full(3, self._settings.bias_start), False, False)
         self._begin_block()
 
     def _begin_block(self) -> None:
-        self._block: list[tuple[float, ...]] = []  # dt, gyr, acc, mag
-        self._quats = [self._quat]
+        self._block = array("d")
+        self._quats = array("d", self._quat)
         self._block_s = 0.0
+        self._fields = 0  # measured in the block
         self._lost_angle = self._lost_speed = 0.0
 
     def update(
@@ -114,67 +124,68 @@ class OrientationFilter:
         Raises:
             ValueError: the shapes do not match.
         """
-        times, rates, forces, fields = columns(time_s, gyr, acc, mag)
-        quats, flags, state_index = [], [], []
-        states = [self._state()]  # changes only with corrections
-        for sample in zip(times, rates, forces, fields, strict=True):
-            events, corrected = self._take(*sample)
-            if corrected:
-                states.append(self._state())
-            quats.append(self._quat)
-            flags.append(events)
-            state_index.append(len(states) - 1)
-        bias, sigma, rest, disturbed = (np.array(column)[state_index] for column in zip(*states, strict=True))
-        return OrientationResult(
-            np.array(quats).reshape(-1, 4), bias, sigma, rest, disturbed, np.array(flags, np.uint8)
-        )
+        return orient_arrays(self, time_s, gyr, acc, mag)
 
-    def _state(self) -> tuple[Array, Array, bool, bool]:
-        """Return the bias, its sigma, whether the sensor is at rest, and whether the field is disturbed."""
-        return (
-            self._bias,
-            self._bias_sigma,
-            self._rest.rest,
-            self._reference.disturbed and not self._magnetometer.lost,
-        )
-
-    def _take(
+    def take(
         self, time_s: float, gyr: Sequence[float], acc: Sequence[float], mag: Sequence[float]
-    ) -> tuple[int, bool]:
-        """Take a sample; return its events, and whether corrections were made."""
-        s = self._settings
+    ) -> tuple[Quat, int]:
+        """Return the orientation of the next sample, and its events as bits of `Event`.
+
+        Args:
+            time_s: time of the measurement, s.
+            gyr: (3,) rate, rad/s.
+            acc: (3,) specific force, m/s^2.
+            mag: (3,) magnetic field; NaN where it was not measured.
+        """
         events, dt = self._checker.check(time_s, gyr, acc)
-        corrected = False
         if dt == inf:
-            corrected = True
             events |= _RESTART if self._started else 0
             self._restart(acc, mag)
         elif dt > 0.0:
-            rate = gyr
-            if events & _GAP:
-                rate = [0.5 * (a + b) for a, b in zip(gyr, self._rate, strict=True)]
-                self._lost_angle = min(self._lost_angle + s.gap_turn * dt * dt, pi)
-                self._lost_speed += s.gap_acc * dt
-            if events & _SATURATED:
-                self._lost_angle = min(self._lost_angle + s.lost_share * hypot(*gyr) * dt, pi)
-                self._lost_speed += s.lost_share * hypot(*acc) * dt
-            kx, ky, kz, bx, by, bz = self._correction
-            x, y, z = rate
-            self._quat = rot.integrate_rotvec(
-                self._quat, (kx * x - bx) * dt, (ky * y - by) * dt, (kz * z - bz) * dt
-            )
-            self._quats.append(self._quat)
-            if not self._magnetometer.check(dt, mag):
-                mag = NO_FIELD
-            self._block.append((dt, *rate, *acc, *mag))
-            self._block_s += dt
-            if self._block_s >= s.block_s:
-                self._correct(self._row)
-                corrected = True
+            self._integrate(events, dt, gyr, acc, mag)
         if dt > 0.0:
             self._rate, self._last = gyr, self._row
         self._row += 1
-        return events | (_MAG_LOST if self._magnetometer.lost else 0), corrected
+        return self._quat, events | _MAG_LOST if self._magnetometer.lost else events
+
+    def _integrate(
+        self, events: int, dt: float, gyr: Sequence[float], acc: Sequence[float], mag: Sequence[float]
+    ) -> None:
+        """Integrate the sample's rate, and correct the errors at the end of a block."""
+        rate = gyr
+        if events:
+            rate = self._uncertain(events, dt, gyr, acc)
+        x, y, z = rate
+        xx, xy, xz, yx, yy, yz, zx, zy, zz, bx, by, bz = self._correction
+        self._quat = quat = rot.integrate_rotvec(
+            self._quat,
+            (xx * x + xy * y + xz * z - bx) * dt,
+            (yx * x + yy * y + yz * z - by) * dt,
+            (zx * x + zy * y + zz * z - bz) * dt,
+        )
+        self._quats.extend(quat)
+        if self._magnetometer.check(dt, mag):
+            self._fields += 1
+        else:
+            mag = NO_FIELD
+        self._block.extend((dt, x, y, z, *acc, *mag))
+        self._block_s += dt
+        if self._block_s >= self._settings.block_s:
+            self._correct(self._row)
+
+    def _uncertain(
+        self, events: int, dt: float, gyr: Sequence[float], acc: Sequence[float]
+    ) -> Sequence[float]:
+        """Add what a sample with events may have missed; return its rate, in a gap the mean rate."""
+        s = self._settings
+        if events & _SATURATED:
+            self._lost_angle = min(self._lost_angle + s.lost_share * hypot(*gyr) * dt, pi)
+            self._lost_speed += s.lost_share * hypot(*acc) * dt
+        if not events & _GAP:
+            return gyr
+        self._lost_angle = min(self._lost_angle + s.gap_turn * dt * dt, pi)
+        self._lost_speed += s.gap_acc * dt
+        return [0.5 * (a + b) for a, b in zip(gyr, self._rate, strict=True)]
 
     # --- start and restart ----------------------------------------------------------------------------------
 
@@ -188,7 +199,7 @@ class OrientationFilter:
         if self._started:
             before = self._kalman.P
             heading = min(before[model.HEADING, model.HEADING] + s.heading_start**2, pi**2)
-            for part in (model.BIAS, model.ACC_BIAS, model.SCALE):
+            for part in (model.BIAS, model.ACC_BIAS, model.SENSITIVITY):
                 covariance[part, part] = before[part, part]
             covariance[model.HEADING, model.HEADING] = heading
         self._kalman.P = covariance
@@ -197,80 +208,86 @@ class OrientationFilter:
         self._started = True
         if self._magnetometer.check(0.0, mag) and not self._has_heading:
             self._find_north(rot.quat_rotate(self._quat, mag), self._row)
-            return
-        self._record_step(self._row, None, covariance, np.zeros(model.SIZE))
-        self._begin_block()
+        else:
+            self._record_step(self._row, None, covariance, _NO_ERROR)
+            self._begin_block()
+        self._publish()
 
     def _find_north(self, field: Array, row: int) -> None:
         """Rotate the inertial frame's Y axis to the direction of the first field."""
         angle = atan2(field[0], field[1])
         rotation = rot.quat_about_z(angle)
-        self._quat = tuple(rot.quat_multiply(rotation, self._quat).tolist())
+        self._quat = _as_quat(rot.quat_multiply(rotation, self._quat))
         self._velocity = rot.quat_rotate(rotation, self._velocity)
-        frame = np.eye(model.SIZE)
+        frame = model.IDENTITY.copy()
         frame[model.TURN, model.TURN] = frame[model.VEL, model.VEL] = rot.quat_to_matrix(rotation)
         frame[model.HEADING] = 0.0
         covariance = frame @ self._kalman.P @ frame.T
         covariance[model.HEADING, model.HEADING] = self._settings.heading_start**2
         self._kalman.P = covariance
         self._has_heading = True
-        self._record_step(row, None, covariance, np.zeros(model.SIZE), angle)
+        self._record_step(row, None, covariance, _NO_ERROR, angle)
         self._begin_block()
 
     # --- corrections ----------------------------------------------------------------------------------------
 
     def _correct(self, row: int) -> None:
         """Close the block: estimate the errors at its end and correct them."""
-        kalman, s = self._kalman, self._settings
-        block = np.array(self._block)
-        dt, gyr, acc, mag = block[:, 0], block[:, 1:4], block[:, 4:7], block[:, 7:10]
-        quats = np.array(self._quats)
+        kalman = self._kalman
+        block = np.array(self._block).reshape(-1, _ROW)
+        gyr, mag = block[:, 1:4], block[:, 7:10]
+        quats = np.array(self._quats).reshape(-1, 4)
         quats[:-1] += quats[1:]  # midpoints, except for the last row, which stays the end of the block
-        quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+        quats /= np.sqrt(np.einsum("ni,ni->n", quats, quats))[:, None]
         rotations = rot.quat_to_matrix(quats)
         rotation, last = rotations[:-1], rotations[-1]
-        transition = model.transition(dt, rotation, gyr, acc - self._acc_bias)
-        rate = float(np.linalg.norm(gyr - self._bias, axis=1).mean())
-        noise = model.process_noise(s, self._block_s, rate, self._lost_angle, self._lost_speed)
+        transition = model.transition(block[:, 0], rotation, gyr, block[:, 4:7] - self._acc_bias)
+        noise = model.process_noise(self._noise_density, self._block_s, self._lost_angle, self._lost_speed)
         self._velocity = self._velocity + transition.velocity
-        self._rest.update(self._block_s, gyr, acc, self._bias, float(self._bias_sigma.max()))
+        self._rest.update(self._block_s, block[:, 1:7], self._bias, float(self.state.bias_sigma.max()))
         kalman.predict(F=transition.matrix, Q=noise)
-        field = self._mean_field(rotation, mag)
+        field = self._mean_field(rotation, mag) if self._fields else None
         self._field_age_s += self._block_s
-        states, errors, variances = self._measure(field, rate)
+        states, errors, variances = self._measure(field, gyr)
         kalman.dim_z = len(states)  # filterpy 1.4.5 compares it with the measurement
-        kalman.update(np.array(errors), R=np.diag(variances), H=np.eye(model.SIZE)[states])
+        kalman.update(np.array(errors), R=np.diag(variances), H=model.IDENTITY[states])
         kalman.P = 0.5 * (kalman.P + kalman.P.T)
         self._correct_state(kalman.x, last)
         self._record_step(row, transition.matrix, kalman.P_prior, kalman.x)
-        kalman.x = np.zeros(model.SIZE)
+        kalman.x = _NO_ERROR
         self._begin_block()
         if field is not None and not self._has_heading:
             self._find_north(field, row)
+        self._publish()
 
-    def _mean_field(self, rotation: Array, mag: Array) -> Array | None:
-        """Return the mean field (3,) of a block in the inertial frame; None if there is none."""
+    def _mean_field(self, rotation: Array, mag: Array) -> Array:
+        """Return the mean (3,) of the fields of a block in the inertial frame."""
         measured = ~np.isnan(mag[:, 0])
-        if not measured.any():
-            return None
-        field: Array = np.einsum("nij,nj->i", rotation[measured], mag[measured]) / measured.sum()
+        field: Array = np.einsum("nij,nj->i", rotation[measured], mag[measured]) / self._fields
         return field
 
-    def _measure(self, field: Array | None, rate: float) -> tuple[list[int], list[float], list[float]]:
-        """Return the indices of the measured errors, their values and their variances."""
+    def _measure(self, field: Array | None, gyr: Array) -> tuple[list[int], list[float], list[float]]:
+        """Return the indices of the measured errors, their values and their variances.
+
+        Args:
+            field: (3,) mean field of the block in the inertial frame, if there was one.
+            gyr: (N, 3) measured rates of the block, rad/s.
+        """
         s, rest = self._settings, self._rest
         per_block = max(1.0, s.block_s / self._block_s)
         states, errors = [6, 7, 8], (-self._velocity).tolist()
         if rest.rest:
             variances = [s.rest_vel**2 * per_block] * 3
             states += [3, 4, 5]
-            errors += (rest.rate * (1.0 - self._scale) - self._bias).tolist()
+            errors += (rest.rate - self._sensitivity @ rest.rate - self._bias).tolist()
             variances += [(s.rest_rate**2 + rest.rate_sigma**2) * per_block] * 3
         else:
             variances = [s.vel**2 * max(1.0, s.vel_time / self._block_s)] * 3
         if field is not None and self._has_heading:
             tilt_var = 0.5 * float(self._kalman.P[0, 0] + self._kalman.P[1, 1])
             # A longer time without readings is a dropout, which tells nothing about the field.
+            rates = gyr - self._bias
+            rate = float(np.sqrt(np.einsum("ni,ni->n", rates, rates)).mean())
             age_s = min(self._field_age_s, s.mag_lost_s)
             heading = self._reference.heading(field.tolist(), age_s, rate, tilt_var)
             self._field_age_s = 0.0
@@ -281,16 +298,20 @@ class OrientationFilter:
         return states, errors, variances
 
     def _correct_state(self, error: Array, rotation: Array) -> None:
-        """Add the errors (15,) to the state, at an orientation (3, 3)."""
-        quat = rot.integrate_rotvec(self._quat, *(error[model.TURN] @ rotation).tolist())
-        size = hypot(*quat)
-        self._quat = (quat[0] / size, quat[1] / size, quat[2] / size, quat[3] / size)
+        """Add the errors (21,) to the state, at an orientation (3, 3)."""
+        w, x, y, z = rot.integrate_rotvec(self._quat, *(error[model.TURN] @ rotation).tolist())
+        size = sqrt(w * w + x * x + y * y + z * z)
+        self._quat = (w / size, x / size, y / size, z / size)
         self._bias = self._bias + error[model.BIAS]
         self._velocity = self._velocity + error[model.VEL]
         self._acc_bias = self._acc_bias + error[model.ACC_BIAS]
-        self._scale = self._scale + error[model.SCALE]
-        self._bias_sigma = np.sqrt(np.diag(self._kalman.P)[model.BIAS])
-        self._correction = (*(1.0 - self._scale).tolist(), *self._bias.tolist())
+        self._sensitivity = self._sensitivity + error[model.SENSITIVITY].reshape(3, 3)
+        self._correction = (*(_EYE3 - self._sensitivity).ravel().tolist(), *self._bias.tolist())
+
+    def _publish(self) -> None:
+        sigma = np.sqrt(self._kalman.P.ravel()[_DIAGONAL])
+        disturbed = self._reference.disturbed and not self._magnetometer.lost
+        self.state = FilterState(self._bias, sigma, self._rest.rest, disturbed)
 
     def _record_step(
         self, row: int, matrix: Array | None, predicted: Array, error: Array, turned: float = 0.0
@@ -299,7 +320,7 @@ class OrientationFilter:
             self.on_step(Step(row, matrix, predicted, error, self._kalman.P, self._bias, turned))
 
 
-def _levelled(quat: tuple[float, ...], acc: Sequence[float]) -> tuple[float, ...]:
+def _levelled(quat: Quat, acc: Sequence[float]) -> Quat:
     """Return an orientation (4,) after the shortest rotation that makes a force point up."""
     force = rot.quat_rotate(quat, acc)
     if np.linalg.norm(force) < _LEAST_FORCE:
@@ -308,4 +329,9 @@ def _levelled(quat: tuple[float, ...], acc: Sequence[float]) -> tuple[float, ...
         rotation = rot.matrix_to_quat(rot.minimal_rotation(force, _UP))
     except ValueError:  # upside down: every rotation by 180 degrees is a shortest one
         rotation = np.array([0.0, 1.0, 0.0, 0.0])
-    return tuple(rot.quat_multiply(rotation, quat).tolist())
+    return _as_quat(rot.quat_multiply(rotation, quat))
+
+
+def _as_quat(quat: Array) -> Quat:
+    w, x, y, z = quat.tolist()
+    return w, x, y, z

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import exp, sqrt
+from math import exp, hypot, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,24 +41,22 @@ class RestDetector:
         self._mean = None
         self._still_s = 0.0
 
-    def update(self, duration_s: float, gyr: Array, acc: Array, bias: Array, bias_sigma: float) -> None:
-        """Take a block of measured rates (N, 3) and forces (N, 3), the current bias (3,) and its sigma."""
+    def update(self, duration_s: float, measured: Array, bias: Array, bias_sigma: float) -> None:
+        """Take a block of measured rates and forces (N, 6), the current bias (3,) and its sigma."""
         s = self._settings
-        measured = np.hstack([gyr, acc])
-        mean = measured.mean(axis=0)
+        mean = measured.sum(axis=0) / len(measured)
         if self._mean is None:
             self._mean = mean
-        change = (measured - self._mean) ** 2
+        change = measured - self._mean
+        change *= change
+        gyr_change, acc_change = change.reshape(-1, 2, 3).sum(axis=2).max(axis=0).tolist()
         self.rate = mean[:3]
-        sway = float(((mean - self._mean)[:3] ** 2).sum()) / 3.0
+        x, y, z = (mean - self._mean)[:3].tolist()
+        sway = (x * x + y * y + z * z) / 3.0
         self._mean = self._mean + (1.0 - exp(-duration_s / _MEAN_S)) * (mean - self._mean)
-        excess = float(np.linalg.norm(self.rate - bias))
+        excess = hypot(*(self.rate - bias).tolist())
         largest = s.rest_bias + 3.0 * bias_sigma if self._rested else s.rest_bias_first
-        still = (
-            change[:, :3].sum(axis=1).max() < s.rest_gyr**2
-            and change[:, 3:].sum(axis=1).max() < s.rest_acc**2
-            and excess < largest
-        )
+        still = gyr_change < s.rest_gyr**2 and acc_change < s.rest_acc**2 and excess < largest
         self._still_s = self._still_s + duration_s if still else 0.0
         self._sway = sway if not still else self._sway + min(1.0, duration_s / _SWAY_S) * (sway - self._sway)
         # The rates of swaying are correlated for about as long as they are averaged.

@@ -13,12 +13,13 @@ class FilterSettings:
     Attributes:
         block_s: time between corrections, s. Orientations are integrated at every sample.
         gyr_noise: growth of the orientation error, rad / sqrt(s).
-        gyr_noise_per_rate: additional growth for each rad/s of rotation, 1 / sqrt(s).
         vel_noise: growth of the velocity error, m/s / sqrt(s).
         bias_start: initial gyroscope bias, one sigma, rad/s.
-        bias_walk: random walk of that bias, rad/s / sqrt(s).
-        scale_start: relative error of the gyroscope's scale, one sigma, per axis.
-        scale_walk: random walk of that error, 1 / sqrt(s).
+        bias_walk: random walk of that bias, rad/s / sqrt(s). Forces and vibration move it by some 0.05 deg/s
+            between rest and motion.
+        sensitivity_start: relative error of the gyroscope's scale, per axis, and its sensitivity to rotation
+            about each other axis, one sigma. Data sheets allow one or two percent of both.
+        sensitivity_walk: random walk of each of these, 1 / sqrt(s).
         acc_bias_start: initial accelerometer bias, one sigma per axis, m/s^2.
         acc_bias_walk: random walk of that bias, m/s^2 / sqrt(s).
         tilt_start: error of the tilt taken from the first sample's force, one sigma, rad.
@@ -55,13 +56,12 @@ class FilterSettings:
     """
 
     block_s: float = 0.14
-    gyr_noise: float = radians(0.2)
-    gyr_noise_per_rate: float = 0.01
+    gyr_noise: float = radians(0.05)
     vel_noise: float = 0.03
     bias_start: float = radians(3.0)
-    bias_walk: float = radians(0.002)
-    scale_start: float = 0.005
-    scale_walk: float = 2e-5
+    bias_walk: float = radians(0.01)
+    sensitivity_start: float = 0.01
+    sensitivity_walk: float = 2e-5
     acc_bias_start: float = 0.1
     acc_bias_walk: float = 1e-3
     tilt_start: float = radians(10.0)

@@ -56,7 +56,7 @@ def smooth(
 
 
 def _errors_left(steps: list[Step]) -> tuple[Array, Array]:
-    """Return the errors (K, 15) that each step left, and the bias's sigma (K, 3) without them."""
+    """Return the errors (K, 21) that each step left, and the bias's sigma (K, 3) without them."""
     left = np.zeros((len(steps), model.SIZE))
     covariance = steps[-1].covariance
     sigma = np.empty((len(steps), 3))

@@ -12,16 +12,14 @@ from math import inf
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from edgepose import rotations as rot
 from edgepose.errors import EdgeposeError
-from edgepose.orientation.arrays import columns
 from edgepose.orientation.sample_checks import MagnetometerMonitor, SampleChecker
+from edgepose.orientation.sample_loop import FilterState, Quat, orient_arrays
 from edgepose.orientation.settings import FilterSettings
 from edgepose.orientation.types import Event, OrientationResult
-
-Array = NDArray[np.float64]
 
 _PERIOD_SAMPLES = 20  # over which the sampling time is measured
 _FIRST_PERIOD_S = 0.01
@@ -54,7 +52,7 @@ class VqfFilter:
         self._first_samples: list[_Timed] | None = []
         self._started = False
         self._heading = 0.0  # of VQF's frame without a magnetometer in that of the first sample
-        self._quat = np.array([1.0, 0.0, 0.0, 0.0])
+        self._quat: Quat = (1.0, 0.0, 0.0, 0.0)
 
     def update(
         self, time_s: ArrayLike, gyr: ArrayLike, acc: ArrayLike, mag: ArrayLike | None = None
@@ -64,21 +62,12 @@ class VqfFilter:
         Raises:
             ValueError: the shapes do not match.
         """
-        rows = [self._take(*sample) for sample in zip(*columns(time_s, gyr, acc, mag), strict=True)]
-        count = len(rows)
-        quat, bias, sigma, rest, disturbed, flags = zip(*rows, strict=True) if rows else ((),) * 6
-        return OrientationResult(
-            np.array(quat).reshape(count, 4),
-            np.array(bias).reshape(count, 3),
-            np.repeat(np.array(sigma, float)[:, None], 3, axis=1),
-            np.array(rest, bool),
-            np.array(disturbed, bool),
-            np.array(flags, np.uint8),
-        )
+        return orient_arrays(self, time_s, gyr, acc, mag)
 
-    def _take(
+    def take(
         self, time_s: float, gyr: Sequence[float], acc: Sequence[float], mag: Sequence[float]
-    ) -> tuple[Array, Array, float, bool, bool, int]:
+    ) -> tuple[Quat, int]:
+        """Return the orientation of the next sample and its events; see `OrientationFilter.take`."""
         events, dt = self._checker.check(time_s, gyr, acc)
         if dt > 0.0:
             is_field = self._magnetometer.check(0.0 if dt == inf else dt, mag)
@@ -90,14 +79,24 @@ class VqfFilter:
             self._feed(sample)
             self._measure_period(sample)
             if self._magnetometer.seen:
-                self._quat = self._vqf.getQuat9D()
+                quat = self._vqf.getQuat9D()
             else:
-                self._quat = rot.quat_multiply(rot.quat_about_z(self._heading), self._vqf.getQuat6D())
+                quat = rot.quat_multiply(rot.quat_about_z(self._heading), self._vqf.getQuat6D())
+            w, x, y, z = quat.tolist()
+            self._quat = (w, x, y, z)
+        return self._quat, events | _MAG_LOST if self._magnetometer.lost else events
+
+    @property
+    def state(self) -> FilterState:
+        """The state after the last sample."""
         bias, sigma = self._vqf.getBiasEstimate()
         has_field = self._magnetometer.seen and not self._magnetometer.lost
-        disturbed = has_field and self._vqf.getMagDistDetected()
-        events |= _MAG_LOST if self._magnetometer.lost else 0
-        return self._quat, bias, sigma, self._vqf.getRestDetected(), disturbed, events
+        return FilterState(
+            bias,
+            np.full(3, sigma),
+            self._vqf.getRestDetected(),
+            has_field and self._vqf.getMagDistDetected(),
+        )
 
     def _restart(self) -> None:
         """Start a new VQF, which takes the tilt from the next force but keeps the bias and the heading."""
