@@ -29,8 +29,21 @@ HEADING = 2
 SIZE = 21
 
 IDENTITY = np.eye(SIZE)
+DIAGONAL = slice(None, None, SIZE + 1)
+"""Diagonal of a raveled covariance."""
 
 _WIDTHS = (3, 3, 3, 3, 9)
+
+
+_ROTATION = np.zeros((3, 3, 4, 4))
+"""Rotation matrix of a quaternion times its norm squared, as sums of products of its components."""
+for _i in range(3):
+    _j, _k = (_i + 1) % 3, (_i + 2) % 3
+    _w, _x, _y, _z = 0, _i + 1, _j + 1, _k + 1
+    _ROTATION[_i, _i, [_w, _x, _y, _z], [_w, _x, _y, _z]] = 1.0, 1.0, -1.0, -1.0
+    _ROTATION[_i, _j, [_x, _w], [_y, _z]] = 2.0, -2.0
+    _ROTATION[_i, _k, [_x, _w], [_z, _y]] = 2.0, 2.0
+_FROM_PRODUCTS = _ROTATION.reshape(9, 16)
 
 
 class Transition(NamedTuple):
@@ -39,33 +52,41 @@ class Transition(NamedTuple):
     Attributes:
         matrix: (21, 21) maps the error before the block to the error after it.
         velocity: (3,) change of velocity, m/s.
+        field: (3,) sum of the fields, inertial frame.
     """
 
     matrix: Array
     velocity: Array
+    field: Array
 
 
-def transition(dt: Array, rotation: Array, gyr: Array, force: Array) -> Transition:
-    """Propagate errors and velocity over a block.
+def transition(dt: Array, quat: Array, gyr: Array, force: Array, field: Array) -> Transition:
+    """Propagate errors and velocity over a block, and sum its fields.
 
     Args:
         dt: (N,) duration of each sample, s.
-        rotation: (N, 3, 3) sensor to inertial, in the middle of each sample.
+        quat: (N, 4) sensor to inertial, in the middle of each sample; of any length but 0.
         gyr: (N, 3) rates as measured, rad/s.
         force: (N, 3) specific force without the known bias, sensor frame, m/s^2.
+        field: (N, 3) magnetic fields, sensor frame; 0 where not measured.
     """
-    # One product sums the rotations, weighted with the time and with each component of the rate.
-    weights = np.empty((len(dt), 4))
-    weights[:, 0] = 1.0
-    weights[:, 1:] = gyr
-    sums = rotation.reshape(-1, 9).T @ (weights * dt[:, None])
-    bias, sensitivity = sums[:, 0].reshape(3, 3), sums[:, 1:].reshape(3, 9)
-    pushes = np.einsum("nij,nj->ni", rotation, force * dt[:, None])
-    push = pushes.sum(axis=0)
-    # Each force is weighted with the share of the block before it, in which a bias has rotated it.
     passed = np.cumsum(dt)
-    duration = passed[-1]
-    late_push = _cross((passed - 0.5 * dt) @ pushes / duration)
+    duration = float(passed[-1])
+    weights = np.empty((len(dt), 13))
+    weights[:, 0] = 1.0
+    weights[:, 1:4] = gyr
+    weights[:, 4:7] = force
+    # Each force is weighted with the share of the block before it, in which a bias has rotated it.
+    weights[:, 7:10] = force * ((passed - 0.5 * dt) / duration)[:, None]
+    weights[:, :10] *= dt[:, None]
+    weights[:, 10:] = field
+    weights /= np.einsum("ni,ni->n", quat, quat)[:, None]
+    # Matrices are linear in the products of a quaternion's components, so that these are summed, weighted.
+    products = (quat[:, :, None] * quat[:, None, :]).reshape(-1, 16)
+    sums = _FROM_PRODUCTS @ (products.T @ weights)
+    bias, sensitivity = sums[:, 0].reshape(3, 3), sums[:, 1:4].reshape(3, 9)
+    push, late_push, total_field = np.einsum("ijkj->ki", sums[:, 4:].reshape(3, 3, 3, 3))
+    late_push = _cross(late_push)
     matrix = IDENTITY.copy()
     matrix[TURN, BIAS] = matrix[VEL, ACC_BIAS] = -bias
     matrix[TURN, SENSITIVITY] = -sensitivity
@@ -73,7 +94,7 @@ def transition(dt: Array, rotation: Array, gyr: Array, force: Array) -> Transiti
     matrix[VEL, BIAS] = late_push @ bias
     matrix[VEL, SENSITIVITY] = late_push @ sensitivity
     push[2] -= STANDARD_G * duration
-    return Transition(matrix, push)
+    return Transition(matrix, push, total_field)
 
 
 def _cross(v: Array) -> Array:
@@ -107,7 +128,9 @@ def process_noise(density: Array, duration_s: float, lost_angle: float, lost_spe
     if lost_angle or lost_speed:
         variance[TURN] += lost_angle**2
         variance[VEL] += lost_speed**2
-    return np.diag(variance)
+    noise = np.zeros((SIZE, SIZE))
+    noise.reshape(-1)[DIAGONAL] = variance
+    return noise
 
 
 def start_covariance(settings: FilterSettings, heading: float) -> Array:

@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from edgepose import rotations as rot
 from edgepose.orientation import error_model as model
-from edgepose.orientation.arrays import NO_FIELD
 from edgepose.orientation.magnetic_reference import MagneticReference
 from edgepose.orientation.rest import RestDetector
 from edgepose.orientation.sample_checks import MagnetometerMonitor, SampleChecker
@@ -29,10 +28,10 @@ Array = NDArray[np.float64]
 
 _UP = np.array([0.0, 0.0, 1.0])
 _EYE3 = np.eye(3)
+_ZERO = (0.0, 0.0, 0.0)
 _NO_ERROR = np.zeros(model.SIZE)
 _NO_ERROR.flags.writeable = False
 _ROW = 10  # numbers of a sample in a block: dt, gyr, acc, mag
-_DIAGONAL = slice(model.BIAS.start * (model.SIZE + 1), model.BIAS.stop * (model.SIZE + 1), model.SIZE + 1)
 _LEAST_FORCE = 1.0  # m/s^2; less has no direction
 _GAP, _SATURATED, _MAG_LOST, _RESTART = (
     int(e) for e in (Event.GAP, Event.SATURATED, Event.MAG_LOST, Event.RESTART)
@@ -92,15 +91,12 @@ class OrientationFilter:
         self._started = False
         self._quat: Quat = (1.0, 0.0, 0.0, 0.0)
         self._rate: Sequence[float] = (0.0, 0.0, 0.0)  # of the last good sample
-        self._velocity = np.zeros(3)
-        self._bias = np.zeros(3)
-        self._acc_bias = np.zeros(3)
-        self._sensitivity = np.zeros((3, 3))
+        self._known = _NO_ERROR.copy()  # errors estimated so far; that of the orientation is in _quat
         # Sensitivity and bias as floats: the loop over samples has no arrays in it.
         self._correction: tuple[float, ...] = (*_EYE3.ravel().tolist(), 0.0, 0.0, 0.0)
         self._has_heading = False
         self._field_age_s = 0.0  # of the last one that was used or rejected
-        self.state = FilterState(self._bias, np.full(3, self._settings.bias_start), False, False)
+        self.state = FilterState(np.zeros(3), np.full(3, self._settings.bias_start), False, False)
         self._begin_block()
 
     def _begin_block(self) -> None:
@@ -167,7 +163,7 @@ class OrientationFilter:
         if self._magnetometer.check(dt, mag):
             self._fields += 1
         else:
-            mag = NO_FIELD
+            mag = _ZERO
         self._block.extend((dt, x, y, z, *acc, *mag))
         self._block_s += dt
         if self._block_s >= self._settings.block_s:
@@ -203,7 +199,7 @@ class OrientationFilter:
                 covariance[part, part] = before[part, part]
             covariance[model.HEADING, model.HEADING] = heading
         self._kalman.P = covariance
-        self._velocity = np.zeros(3)
+        self._known[model.VEL] = 0.0
         self._rest.restart()
         self._started = True
         if self._magnetometer.check(0.0, mag) and not self._has_heading:
@@ -218,7 +214,7 @@ class OrientationFilter:
         angle = atan2(field[0], field[1])
         rotation = rot.quat_about_z(angle)
         self._quat = _as_quat(rot.quat_multiply(rotation, self._quat))
-        self._velocity = rot.quat_rotate(rotation, self._velocity)
+        self._known[model.VEL] = rot.quat_rotate(rotation, self._known[model.VEL])
         frame = model.IDENTITY.copy()
         frame[model.TURN, model.TURN] = frame[model.VEL, model.VEL] = rot.quat_to_matrix(rotation)
         frame[model.HEADING] = 0.0
@@ -237,34 +233,27 @@ class OrientationFilter:
         block = np.array(self._block).reshape(-1, _ROW)
         gyr, mag = block[:, 1:4], block[:, 7:10]
         quats = np.array(self._quats).reshape(-1, 4)
-        quats[:-1] += quats[1:]  # midpoints, except for the last row, which stays the end of the block
-        quats /= np.sqrt(np.einsum("ni,ni->n", quats, quats))[:, None]
-        rotations = rot.quat_to_matrix(quats)
-        rotation, last = rotations[:-1], rotations[-1]
-        transition = model.transition(block[:, 0], rotation, gyr, block[:, 4:7] - self._acc_bias)
+        known = self._known
+        transition = model.transition(
+            block[:, 0], quats[:-1] + quats[1:], gyr, block[:, 4:7] - known[model.ACC_BIAS], mag
+        )
         noise = model.process_noise(self._noise_density, self._block_s, self._lost_angle, self._lost_speed)
-        self._velocity = self._velocity + transition.velocity
-        self._rest.update(self._block_s, block[:, 1:7], self._bias, float(self.state.bias_sigma.max()))
+        known[model.VEL] += transition.velocity
+        self._rest.update(self._block_s, block[:, 1:7], known[model.BIAS], float(self.state.bias_sigma.max()))
         kalman.predict(F=transition.matrix, Q=noise)
-        field = self._mean_field(rotation, mag) if self._fields else None
+        mean_field = transition.field / self._fields if self._fields else None
         self._field_age_s += self._block_s
-        states, errors, variances = self._measure(field, gyr)
+        states, errors, variances = self._measure(mean_field, gyr)
         kalman.dim_z = len(states)  # filterpy 1.4.5 compares it with the measurement
         kalman.update(np.array(errors), R=np.diag(variances), H=model.IDENTITY[states])
         kalman.P = 0.5 * (kalman.P + kalman.P.T)
-        self._correct_state(kalman.x, last)
+        self._correct_state(kalman.x)
         self._record_step(row, transition.matrix, kalman.P_prior, kalman.x)
         kalman.x = _NO_ERROR
         self._begin_block()
-        if field is not None and not self._has_heading:
-            self._find_north(field, row)
+        if mean_field is not None and not self._has_heading:
+            self._find_north(mean_field, row)
         self._publish()
-
-    def _mean_field(self, rotation: Array, mag: Array) -> Array:
-        """Return the mean (3,) of the fields of a block in the inertial frame."""
-        measured = ~np.isnan(mag[:, 0])
-        field: Array = np.einsum("nij,nj->i", rotation[measured], mag[measured]) / self._fields
-        return field
 
     def _measure(self, field: Array | None, gyr: Array) -> tuple[list[int], list[float], list[float]]:
         """Return the indices of the measured errors, their values and their variances.
@@ -273,20 +262,21 @@ class OrientationFilter:
             field: (3,) mean field of the block in the inertial frame, if there was one.
             gyr: (N, 3) measured rates of the block, rad/s.
         """
-        s, rest = self._settings, self._rest
+        s, rest, known = self._settings, self._rest, self._known
         per_block = max(1.0, s.block_s / self._block_s)
-        states, errors = [6, 7, 8], (-self._velocity).tolist()
+        states, errors = [6, 7, 8], (-known[model.VEL]).tolist()
         if rest.rest:
             variances = [s.rest_vel**2 * per_block] * 3
             states += [3, 4, 5]
-            errors += (rest.rate - self._sensitivity @ rest.rate - self._bias).tolist()
+            gains = _EYE3 - known[model.SENSITIVITY].reshape(3, 3)
+            errors += (gains @ rest.rate - known[model.BIAS]).tolist()
             variances += [(s.rest_rate**2 + rest.rate_sigma**2) * per_block] * 3
         else:
             variances = [s.vel**2 * max(1.0, s.vel_time / self._block_s)] * 3
         if field is not None and self._has_heading:
             tilt_var = 0.5 * float(self._kalman.P[0, 0] + self._kalman.P[1, 1])
             # A longer time without readings is a dropout, which tells nothing about the field.
-            rates = gyr - self._bias
+            rates = gyr - known[model.BIAS]
             rate = float(np.sqrt(np.einsum("ni,ni->n", rates, rates)).mean())
             age_s = min(self._field_age_s, s.mag_lost_s)
             heading = self._reference.heading(field.tolist(), age_s, rate, tilt_var)
@@ -297,27 +287,30 @@ class OrientationFilter:
                 variances.append(heading[1])
         return states, errors, variances
 
-    def _correct_state(self, error: Array, rotation: Array) -> None:
-        """Add the errors (21,) to the state, at an orientation (3, 3)."""
-        w, x, y, z = rot.integrate_rotvec(self._quat, *(error[model.TURN] @ rotation).tolist())
+    def _correct_state(self, error: Array) -> None:
+        """Add the errors (21,) to the state."""
+        # A rotation about inertial axes is, reversed, one of the inverse about its own axes.
+        w, x, y, z = self._quat
+        turn = (-error[model.TURN]).tolist()
+        w, x, y, z = rot.integrate_rotvec((w, -x, -y, -z), *turn)
         size = sqrt(w * w + x * x + y * y + z * z)
-        self._quat = (w / size, x / size, y / size, z / size)
-        self._bias = self._bias + error[model.BIAS]
-        self._velocity = self._velocity + error[model.VEL]
-        self._acc_bias = self._acc_bias + error[model.ACC_BIAS]
-        self._sensitivity = self._sensitivity + error[model.SENSITIVITY].reshape(3, 3)
-        self._correction = (*(_EYE3 - self._sensitivity).ravel().tolist(), *self._bias.tolist())
+        self._quat = (w / size, -x / size, -y / size, -z / size)
+        self._known = known = self._known + error
+        known[model.TURN] = 0.0
+        gains = _EYE3 - known[model.SENSITIVITY].reshape(3, 3)
+        self._correction = (*gains.ravel().tolist(), *known[model.BIAS].tolist())
 
     def _publish(self) -> None:
-        sigma = np.sqrt(self._kalman.P.ravel()[_DIAGONAL])
+        """Set the state that the filter shows."""
+        sigma = np.sqrt(self._kalman.P.reshape(-1)[model.DIAGONAL][model.BIAS])
         disturbed = self._reference.disturbed and not self._magnetometer.lost
-        self.state = FilterState(self._bias, sigma, self._rest.rest, disturbed)
+        self.state = FilterState(self._known[model.BIAS], sigma, self._rest.rest, disturbed)
 
     def _record_step(
         self, row: int, matrix: Array | None, predicted: Array, error: Array, turned: float = 0.0
     ) -> None:
         if self.on_step is not None:
-            self.on_step(Step(row, matrix, predicted, error, self._kalman.P, self._bias, turned))
+            self.on_step(Step(row, matrix, predicted, error, self._kalman.P, self._known[model.BIAS], turned))
 
 
 def _levelled(quat: Quat, acc: Sequence[float]) -> Quat:

@@ -48,8 +48,8 @@ class RestDetector:
         if self._mean is None:
             self._mean = mean
         change = measured - self._mean
-        change *= change
-        gyr_change, acc_change = change.reshape(-1, 2, 3).sum(axis=2).max(axis=0).tolist()
+        change = change.reshape(-1, 2, 3)
+        gyr_change, acc_change = np.einsum("nij,nij->ni", change, change).max(axis=0).tolist()
         self.rate = mean[:3]
         x, y, z = (mean - self._mean)[:3].tolist()
         sway = (x * x + y * y + z * z) / 3.0
