@@ -237,8 +237,11 @@ class OrientationFilter:
         transition = model.transition(
             block[:, 0], quats[:-1] + quats[1:], gyr, block[:, 4:7] - known[model.ACC_BIAS], mag
         )
-        noise = model.process_noise(self._noise_density, self._block_s, self._lost_angle, self._lost_speed)
         known[model.VEL] += transition.velocity
+        speed = hypot(*known[model.VEL].tolist())
+        if speed > self._settings.vel_limit:
+            self._lost_speed += speed
+        noise = model.process_noise(self._noise_density, self._block_s, self._lost_angle, self._lost_speed)
         self._rest.update(self._block_s, block[:, 1:7], known[model.BIAS], float(self.state.bias_sigma.max()))
         kalman.predict(F=transition.matrix, Q=noise)
         mean_field = transition.field / self._fields if self._fields else None
@@ -282,6 +285,10 @@ class OrientationFilter:
             heading = self._reference.heading(field.tolist(), age_s, rate, tilt_var)
             self._field_age_s = 0.0
             if heading is not None:
+                if self._reference.adopted:
+                    # The new field's direction has nothing to do with the old one's.
+                    self._kalman.P[model.HEADING, model.HEADING] += heading[0] ** 2
+                    self._kalman.P_prior = self._kalman.P.copy()
                 states.append(model.HEADING)
                 errors.append(heading[0])
                 variances.append(heading[1])

@@ -27,11 +27,12 @@ class MagneticReference:
 
     Attributes:
         disturbed: whether the field of the last block is not the usual one.
+        adopted: whether the usual field was replaced in the last block.
     """
 
     def __init__(self, settings: FilterSettings) -> None:
         """Start with no field seen."""
-        self.disturbed = False
+        self.disturbed = self.adopted = False
         self._settings = settings
         self._usual: _Field | None = None
         self._other = _Field(0.0, 0.0)
@@ -89,7 +90,8 @@ class MagneticReference:
         elif rate >= s.mag_new_rate:
             # Only while turning: a sensor that lies beside a magnet sees the same field for ever.
             self._other.follow(norm, dip, duration_s, s.mag_reference_s)
-        if self.disturbed and self._other.time_s >= s.mag_new_s:
+        self.adopted = self.disturbed and self._other.time_s >= s.mag_new_s
+        if self.adopted:
             usual, self._other = self._other, _Field(norm, dip)
             self._good_s, self.disturbed, self._rejected_s = s.mag_good_s, False, 0.0
         return usual

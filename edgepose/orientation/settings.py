@@ -26,6 +26,7 @@ class FilterSettings:
         heading_start: error of the heading taken from the first field, one sigma, rad.
         vel: speed of the sensor, one sigma, m/s: a body does not go far in a room.
         vel_time: correlation time of the velocity, s.
+        vel_limit: speed above which the velocity counts as unknown, m/s, so that it shows no tilt.
         rest_gyr: largest change of the rate at rest, rad/s.
         rest_acc: largest change of the force at rest, m/s^2.
         rest_time: time for which both must hold before the sensor counts as at rest, s.
@@ -56,7 +57,7 @@ class FilterSettings:
     """
 
     block_s: float = 0.14
-    gyr_noise: float = radians(0.05)
+    gyr_noise: float = radians(0.1)
     vel_noise: float = 0.03
     bias_start: float = radians(3.0)
     bias_walk: float = radians(0.01)
@@ -68,6 +69,7 @@ class FilterSettings:
     heading_start: float = radians(60.0)
     vel: float = 1.0
     vel_time: float = 1.0
+    vel_limit: float = 3.0
     rest_gyr: float = radians(2.0)
     rest_acc: float = 0.5
     rest_time: float = 1.5
