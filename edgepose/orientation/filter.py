@@ -238,9 +238,7 @@ class OrientationFilter:
             block[:, 0], quats[:-1] + quats[1:], gyr, block[:, 4:7] - known[model.ACC_BIAS], mag
         )
         known[model.VEL] += transition.velocity
-        speed = hypot(*known[model.VEL].tolist())
-        if speed > self._settings.vel_limit:
-            self._lost_speed += speed
+        self._lost_speed += self._excess_speed()
         noise = model.process_noise(self._noise_density, self._block_s, self._lost_angle, self._lost_speed)
         self._rest.update(self._block_s, block[:, 1:7], known[model.BIAS], float(self.state.bias_sigma.max()))
         kalman.predict(F=transition.matrix, Q=noise)
@@ -257,6 +255,14 @@ class OrientationFilter:
         if mean_field is not None and not self._has_heading:
             self._find_north(mean_field, row)
         self._publish()
+
+    def _excess_speed(self) -> float:
+        """Return the speed if the body can hardly have it, else 0, m/s."""
+        speed = hypot(*self._known[model.VEL].tolist())
+        if speed < self._settings.vel_limit:
+            return 0.0
+        sigma = sqrt(self._kalman.P.reshape(-1)[model.DIAGONAL][model.VEL].max())
+        return speed if speed > self._settings.vel_limit + 3.0 * sigma else 0.0
 
     def _measure(self, field: Array | None, gyr: Array) -> tuple[list[int], list[float], list[float]]:
         """Return the indices of the measured errors, their values and their variances.

@@ -26,7 +26,8 @@ class FilterSettings:
         heading_start: error of the heading taken from the first field, one sigma, rad.
         vel: speed of the sensor, one sigma, m/s: a body does not go far in a room.
         vel_time: correlation time of the velocity, s.
-        vel_limit: speed above which the velocity counts as unknown, m/s, so that it shows no tilt.
+        vel_limit: speed that a body hardly exceeds, m/s. A higher one that the error of the tilt does not
+            explain shows no tilt.
         rest_gyr: largest change of the rate at rest, rad/s.
         rest_acc: largest change of the force at rest, m/s^2.
         rest_time: time for which both must hold before the sensor counts as at rest, s.
