@@ -22,7 +22,7 @@ class FilterSettings:
         sensitivity_walk: random walk of each of these, 1 / sqrt(s).
         acc_bias_start: initial accelerometer bias, one sigma per axis, m/s^2.
         acc_bias_walk: random walk of that bias, m/s^2 / sqrt(s).
-        tilt_start: error of the tilt taken from the first sample's force, one sigma, rad.
+        tilt_start: error of the tilt taken from the first sample's force, which may be in motion, one sigma, rad.
         heading_start: error of the heading taken from the first field, one sigma, rad.
         vel: speed of the sensor, one sigma, m/s: a body does not go far in a room.
         vel_time: correlation time of the velocity, s.
@@ -66,7 +66,7 @@ class FilterSettings:
     sensitivity_walk: float = 2e-5
     acc_bias_start: float = 0.1
     acc_bias_walk: float = 1e-3
-    tilt_start: float = radians(10.0)
+    tilt_start: float = radians(20.0)
     heading_start: float = radians(60.0)
     vel: float = 1.0
     vel_time: float = 1.0
