@@ -58,7 +58,7 @@ class FilterSettings:
     """
 
     block_s: float = 0.14
-    gyr_noise: float = radians(0.1)
+    gyr_noise: float = radians(0.2)
     vel_noise: float = 0.03
     bias_start: float = radians(3.0)
     bias_walk: float = radians(0.01)
