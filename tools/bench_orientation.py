@@ -70,9 +70,8 @@ def cross_validate(of_trials: list[Trial], grid: dict[str, tuple[float, ...]]) -
         best = int(np.delete(scores, i, axis=1).mean(axis=(1, 2)).argmin())
         held_out.append(scores[best, i])
         chosen = ", ".join(f"{name} {value:.3g}" for name, value in choices[best].items())
-        lines.append(
-            f"{trial.name}: 6-axis {scores[best, i, 0]:.2f}, 9-axis {scores[best, i, 1]:.2f} ({chosen})"
-        )
+        six, nine = scores[best, i]
+        lines.append(f"{trial.name}: 6-axis {six:.2f}, 9-axis {nine:.2f} ({chosen})")
     six, nine = np.mean(held_out, axis=0)
     worst = scores.mean(axis=1).max(axis=0)
     lines.append(f"left-out mean: 6-axis {six:.2f}, 9-axis {nine:.2f}")

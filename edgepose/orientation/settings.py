@@ -22,7 +22,7 @@ class FilterSettings:
         sensitivity_walk: random walk of each of these, 1 / sqrt(s).
         acc_bias_start: initial accelerometer bias, one sigma per axis, m/s^2.
         acc_bias_walk: random walk of that bias, m/s^2 / sqrt(s).
-        tilt_start: error of the tilt taken from the first sample's force, which may be in motion, one sigma, rad.
+        tilt_start: error of the tilt taken from a first force, perhaps in motion, one sigma, rad.
         heading_start: error of the heading taken from the first field, one sigma, rad.
         vel: speed of the sensor, one sigma, m/s: a body does not go far in a room.
         vel_time: correlation time of the velocity, s.

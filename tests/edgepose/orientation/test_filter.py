@@ -106,6 +106,19 @@ def test_any_first_force(force):
         np.testing.assert_allclose(rot.quat_rotate(result.quat, forces)[:, 2], 9.81, atol=1e-3)
 
 
+def test_axes_that_sense_each_others_rotation_cost_little_heading(simulate):
+    """Scale and cross-axis errors of 1 % show in the tilt, and are then known about the vertical, too."""
+    data = simulate(np.arange(0, 60, 0.02), seed=6, turn=3.0, still=[(0, 4)])
+    gyr = data.gyr @ np.array([[1.01, 0.0, 0.01], [-0.01, 0.99, 0.0], [0.0, 0.01, 1.01]]).T
+    drifts = []
+    for start in (FilterSettings().sensitivity_start, 1e-6):
+        filter = OrientationFilter(FilterSettings(sensitivity_start=start))
+        quat = filter.update(data.time_s, gyr, data.acc).quat
+        error = np.unwrap(rot.yaw_of_quat(rot.quat_multiply(quat, rot.quat_conjugate(data.quat))))
+        drifts.append(rms(np.rad2deg(error - error[200])))
+    assert drifts[0] < 0.5 * drifts[1]
+
+
 # --- chunks and stamps --------------------------------------------------------------------------------------
 
 
