@@ -116,7 +116,7 @@ def test_axes_that_sense_each_others_rotation_cost_little_heading(simulate):
         quat = filter.update(data.time_s, gyr, data.acc).quat
         error = np.unwrap(rot.yaw_of_quat(rot.quat_multiply(quat, rot.quat_conjugate(data.quat))))
         drifts.append(rms(np.rad2deg(error - error[200])))
-    assert drifts[0] < 0.5 * drifts[1]
+    assert drifts[0] < 0.7 * drifts[1]
 
 
 # --- chunks and stamps --------------------------------------------------------------------------------------
