@@ -28,6 +28,7 @@ Array = NDArray[np.float64]
 
 _UP = np.array([0.0, 0.0, 1.0])
 _EYE3 = np.eye(3)
+_CONING = 1.0 / 12.0  # for rates that are means over the interval
 _ZERO = (0.0, 0.0, 0.0)
 _NO_ERROR = np.zeros(model.SIZE)
 _NO_ERROR.flags.writeable = False
@@ -91,6 +92,7 @@ class OrientationFilter:
         self._started = False
         self._quat: Quat = (1.0, 0.0, 0.0, 0.0)
         self._rate: Sequence[float] = (0.0, 0.0, 0.0)  # of the last good sample
+        self._angle = _ZERO  # by which it turned
         self._known = _NO_ERROR.copy()  # errors estimated so far; that of the orientation is in _quat
         # Sensitivity and bias as floats: the loop over samples has no arrays in it.
         self._correction: tuple[float, ...] = (*_EYE3.ravel().tolist(), 0.0, 0.0, 0.0)
@@ -153,11 +155,17 @@ class OrientationFilter:
             rate = self._uncertain(events, dt, gyr, acc)
         x, y, z = rate
         xx, xy, xz, yx, yy, yz, zx, zy, zz, bx, by, bz = self._correction
+        a = (xx * x + xy * y + xz * z - bx) * dt
+        b = (yx * x + yy * y + yz * z - by) * dt
+        c = (zx * x + zy * y + zz * z - bz) * dt
+        # The axis turns between samples, too (coning): to second order by their cross product.
+        d, e, f = self._angle
+        self._angle = (a, b, c)
         self._quat = quat = rot.integrate_rotvec(
             self._quat,
-            (xx * x + xy * y + xz * z - bx) * dt,
-            (yx * x + yy * y + yz * z - by) * dt,
-            (zx * x + zy * y + zz * z - bz) * dt,
+            a + _CONING * (e * c - f * b),
+            b + _CONING * (f * a - d * c),
+            c + _CONING * (d * b - e * a),
         )
         self._quats.extend(quat)
         if self._magnetometer.check(dt, mag):
@@ -179,6 +187,7 @@ class OrientationFilter:
             self._lost_speed += s.lost_share * hypot(*acc) * dt
         if not events & _GAP:
             return gyr
+        self._angle = _ZERO
         self._lost_angle = min(self._lost_angle + s.gap_turn * dt * dt, pi)
         self._lost_speed += s.gap_acc * dt
         return [0.5 * (a + b) for a, b in zip(gyr, self._rate, strict=True)]
@@ -200,6 +209,7 @@ class OrientationFilter:
             covariance[model.HEADING, model.HEADING] = heading
         self._kalman.P = covariance
         self._known[model.VEL] = 0.0
+        self._angle = _ZERO
         self._rest.restart()
         self._started = True
         if self._magnetometer.check(0.0, mag) and not self._has_heading:
