@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from edgepose.imu import ImuFrame, ImuSample, Recording
     from edgepose.inference.model import Model, load_model
     from edgepose.pipeline.python_api import Pipeline
-    from edgepose.placements import PLACEMENTS
+    from edgepose.placements import PLACEMENTS, SENSORS
     from edgepose.pose import PoseFrame
     from edgepose.sinks.base import Sink
     from edgepose.sinks.bvh import BvhSink
@@ -66,6 +66,7 @@ _MODULES = {
     "Pipeline": "edgepose.pipeline.python_api",
     "PoseFrame": "edgepose.pose",
     "Recording": "edgepose.imu",
+    "SENSORS": "edgepose.placements",
     "Sink": "edgepose.sinks.base",
     "SourceConfig": "edgepose.config",
     "StoSink": "edgepose.sinks.opensim",
@@ -83,6 +84,7 @@ _MODULES = {
 __all__ = [
     "JOINTS",
     "PLACEMENTS",
+    "SENSORS",
     "BvhSink",
     "Calibration",
     "CalibrationError",

@@ -1,4 +1,4 @@
-"""IMU measurements: one sample, one frame of six sensors, and whole recordings."""
+"""IMU measurements: one sample, one frame of all sensors, and whole recordings."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ImuSample(NamedTuple):
     """One reading of one sensor, in SI units.
 
     Attributes:
-        sensor: index into `edgepose.placements.PLACEMENTS`.
+        sensor: index into `edgepose.placements.SENSORS`.
         time_s: time of the measurement on the source's clock, seconds. Live sources map device clocks to Unix
             time; files keep their own times.
         quat: unit quaternion w, x, y, z, sensor frame to inertial frame I (Z up); None if the device measures
@@ -45,8 +45,22 @@ class ImuSample(NamedTuple):
     mag: Vector3 | None = None
 
 
+class AddedFrame(NamedTuple):
+    """The A sensors of a rig besides the six, at one instant of the frame clock.
+
+    Attributes:
+        orientation: (A, 4) unit quaternions w, x, y, z, sensor to inertial (R_IS).
+        held: (A,) bool, True for a sensor without new data, or that has not sent any yet.
+        bones: (A, 3, 3) R_TB of their segments, NaN where the heading is unknown; None before calibration.
+    """
+
+    orientation: NDArray[np.float64]
+    held: NDArray[np.bool_]
+    bones: NDArray[np.float64] | None = None
+
+
 class ImuFrame(NamedTuple):
-    """All six sensors at one instant of the frame clock.
+    """All sensors at one instant of the frame clock.
 
     Attributes:
         index: frame number from 0, counting every tick of the clock.
@@ -56,6 +70,7 @@ class ImuFrame(NamedTuple):
         force: (6, 3) specific force averaged over the frame, inertial frame, m/s^2: (0, 0, 9.81) at rest.
         held: (6,) bool, True for a sensor without new data, whose last values are repeated.
         ready_s: time on the source's clock at which the last packet for the frame arrived, seconds.
+        added: the sensors besides the six; None if the rig has no others.
     """
 
     index: int  # type: ignore[assignment]  # hides tuple.index, which is not needed here
@@ -64,6 +79,7 @@ class ImuFrame(NamedTuple):
     force: NDArray[np.float64]
     held: NDArray[np.bool_]
     ready_s: float
+    added: AddedFrame | None = None
 
 
 class SensorData(NamedTuple):
@@ -87,10 +103,10 @@ class SensorData(NamedTuple):
 
 
 class Recording(NamedTuple):
-    """A recording of six sensors.
+    """A recording of the sensors of one wearer.
 
     Attributes:
-        sensors: data by placement name, in the order of PLACEMENTS.
+        sensors: data by name, in the order of SENSORS.
         metadata: rate, frame, units, placements and other information from the file.
         damage: one line for the user (file, row, what to do) if part of the file was bad; the rest is here.
     """

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edgepose.placements import PLACEMENTS, SITES
+from edgepose.placements import ADDED, PLACEMENTS, SITES
 from edgepose.skeleton import JOINTS, grounded_pelvis_position
 
 Array = NDArray[np.float64]
@@ -81,14 +81,19 @@ def parse_status(text: str) -> tuple[frozenset[str], bool]:
     return frozenset(held), _WARMING_UP in parts
 
 
-def held_sensors(held: Sequence[Set[str]]) -> NDArray[np.bool_]:
-    """Return whether each sensor is held, (T, 6) in the order of PLACEMENTS, from the `held` of T poses."""
-    flags = [[name in names for name in PLACEMENTS] for names in held]
-    return np.array(flags, bool).reshape(-1, len(PLACEMENTS))
+def held_sensors(held: Sequence[Set[str]], names: Sequence[str] = PLACEMENTS) -> NDArray[np.bool_]:
+    """Return whether each of N sensors is held, (T, N), from the `held` of T poses."""
+    flags = [[name in silent for name in names] for silent in held]
+    return np.array(flags, bool).reshape(-1, len(names))
+
+
+def known_sensors(held: Sequence[Set[str]]) -> list[str]:
+    """Return the sensors of which poses tell something: the six, and others that were ever held."""
+    return [*PLACEMENTS, *(name for name in ADDED if any(name in silent for silent in held))]
 
 
 def longest_holds(held: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the longest run of poses (6,) in which each sensor is held, from `held` (T, 6)."""
+    """Return the longest run of poses (N,) in which each sensor is held, from `held` (T, N)."""
     edges = np.diff(np.pad(held.astype(int), ((1, 1), (0, 0))), axis=0).T
     return np.array([np.max(np.flatnonzero(e < 0) - np.flatnonzero(e > 0), initial=0) for e in edges])
 

@@ -19,7 +19,7 @@ from edgepose.formats.recordings.npz import write_npz
 from edgepose.formats.recordings.raw_capture import times_header, times_path, times_row
 from edgepose.formats.recordings.registry import salvage_recording
 from edgepose.imu import ImuSample
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import SENSORS
 from edgepose.sinks.output_files import check_output
 from edgepose.sources import Batch, Source
 from edgepose.sources.replay import CAPTURES
@@ -53,12 +53,12 @@ class RecordSummary:
     """Counts of a recording.
 
     Attributes:
-        samples: number of samples of each sensor, in the order of PLACEMENTS.
+        samples: number of samples of each sensor, in the order of SENSORS.
         seconds: time on the source's clock since the first sample.
         error: the error that ended the recording early, if any.
     """
 
-    samples: list[int] = field(default_factory=lambda: [0] * len(PLACEMENTS))
+    samples: list[int] = field(default_factory=lambda: [0] * len(SENSORS))
     seconds: float = 0.0
     error: EdgeposeError | None = None
 

@@ -42,7 +42,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.npz import write_npz
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import Recording, SensorData
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import PLACEMENTS, SENSORS
 from edgepose.skeleton import default_body
 from edgepose.utils.sockets import parse_host_and_port
 from firmware_protocols.registry import PROTOCOLS, Frame
@@ -320,13 +320,13 @@ class Target(NamedTuple):
     tcp: str | None = None
 
 
-def open_lines(wire_format: Format, target: Target) -> list[Line]:
-    """Open one line for all six sensors, or six lines."""
+def open_lines(wire_format: Format, target: Target, sensors: int) -> list[Line]:
+    """Open one line for all sensors, or one for each."""
     if target.bus is not None:
         return [Bus(target.bus, wire_format.default_bitrate)]
     if wire_format.transport == "can":
         return [Pty(slcan=True)]
-    count = len(PLACEMENTS) if wire_format.single_device else 1
+    count = sensors if wire_format.single_device else 1
     if target.tcp is not None:
         return [TcpServer(target.tcp) for _ in range(count)]
     if target.udp is not None:
@@ -377,7 +377,7 @@ class Sensor:
         self.rows = rows_of(data)
         self.times = (data.time_s - start_s).tolist()
         if len(self.times) < 2 or not (np.diff(data.time_s) > 0).all():
-            raise EdgeposeError(f"{PLACEMENTS[index]}: needs at least two samples with increasing times")
+            raise EdgeposeError(f"{SENSORS[index]}: needs at least two samples with increasing times")
         self.period = float(np.median(np.diff(data.time_s)))
         self.row = 0
         self.count = 0
@@ -405,7 +405,7 @@ class Sensor:
                         raise
         except ValueError as error:
             raise EdgeposeError(
-                f"{PLACEMENTS[self.index]}: {wire_format.name} cannot represent its samples: {error}"
+                f"{SENSORS[self.index]}: {wire_format.name} cannot represent its samples: {error}"
             ) from None
 
     def _sample(self, t_us: int) -> Sample:
@@ -435,7 +435,7 @@ class Sensor:
 
 
 class Player:
-    """Sender of the packets of six sensors, until standard input closes."""
+    """Sender of the packets of all sensors, until standard input closes."""
 
     def __init__(self, sensors: list[Sensor], lines: list[Line], wire_format: Format, faults: Faults) -> None:
         """Prepare the queues of the lines and the sensors' clocks."""
@@ -447,8 +447,9 @@ class Player:
             ids = [sensor.rows[0].sensor for sensor in sensors]
             self._requests = {wire_format.request(i)[0]: s for i, s in zip(ids, sensors, strict=True)}
         self._received = [b"" for _ in lines]
-        # The rates of the six clocks are evenly spaced.
-        self._clocks = [1.0 + faults.drift_ppm * 1e-6 * (sensor.index / 2.5 - 1.0) for sensor in sensors]
+        # The rates of the clocks are evenly spaced.
+        last = max(1, len(sensors) - 1)
+        self._clocks = [1.0 + faults.drift_ppm * 1e-6 * (2.0 * i / last - 1.0) for i in range(len(sensors))]
         self._start = 0.0
         self._played_s: float | None = None
 
@@ -505,10 +506,11 @@ class Player:
         return sys.stdin.readline() if sys.stdin in ready else None
 
     def _measure(self, sensor: Sensor) -> None:
-        t_us = round((sensor.due - self._start) * self._clocks[sensor.index] * 1e6)
+        number = self._sensors.index(sensor)
+        t_us = round((sensor.due - self._start) * self._clocks[number] * 1e6)
         sensor.measure(t_us)
         if not self._requests:
-            self._queue(sensor, sensor.index if len(self._lines) > 1 else 0, sensor.due)
+            self._queue(sensor, number if len(self._lines) > 1 else 0, sensor.due)
 
     def _answer(self, line: int) -> None:
         received = self._received[line] + self._lines[line].receive()
@@ -550,11 +552,11 @@ def parse_kill(ctx: click.Context, param: click.Parameter, values: Sequence[str]
     result = []
     for value in values:
         match = re.fullmatch(r"(\w+)@(\d+(?:\.\d+)?)\.\.(\d+(?:\.\d+)?)?", value)
-        if match is None or match[1] not in PLACEMENTS:
+        if match is None or match[1] not in SENSORS:
             raise click.BadParameter(
-                f"{value!r} is not SENSOR@T..T, where SENSOR is one of {', '.join(PLACEMENTS)}"
+                f"{value!r} is not SENSOR@T..T, where SENSOR is one of {', '.join(SENSORS)}"
             )
-        result.append((PLACEMENTS.index(match[1]), float(match[2]), float(match[3] or "inf")))
+        result.append((SENSORS.index(match[1]), float(match[2]), float(match[3] or "inf")))
     return tuple(result)
 
 
@@ -571,16 +573,19 @@ def simulate(
 ) -> None:
     """Open the lines and play the recording on them."""
     start_s = min(float(data.time_s[0]) for data in recording.sensors.values())
-    ids = [0] * len(PLACEMENTS) if wire_format.single_device else list(wire_format.ids)
+    count = len(recording.sensors)
+    # Sensors besides the six have the ids after theirs.
+    ids = [0] * count if wire_format.single_device else [*wire_format.ids][:count]
+    ids += range(max(ids) + 1, max(ids) + 1 + count - len(ids))
     if faults.duplicate_id:
         ids[1] = ids[0]
-    encoders = [wire_format.encoder() for _ in range(len(PLACEMENTS) if wire_format.single_device else 1)]
+    encoders = [wire_format.encoder() for _ in range(count if wire_format.single_device else 1)]
     sensors = []
-    for index, data in enumerate(recording.sensors.values()):
-        sensor = Sensor(index, data, start_s, noisy, encoders[index % len(encoders)])
-        sensor.prepare(wire_format, ids[index])
+    for i, (name, data) in enumerate(recording.sensors.items()):
+        sensor = Sensor(SENSORS.index(name), data, start_s, noisy, encoders[i % len(encoders)])
+        sensor.prepare(wire_format, ids[i])
         sensors.append(sensor)
-    lines = open_lines(wire_format, target)
+    lines = open_lines(wire_format, target, count)
     print_lines(wire_format, target, lines)
     try:
         Player(sensors, lines, wire_format, faults).play(stand)

@@ -28,8 +28,8 @@ from edgepose.analysis.joint_angles import (
 )
 from edgepose.analysis.way import draw_way, seen_from_above, way_of
 from edgepose.calibration.slip import Slip, SlipMonitor
-from edgepose.placements import BONES, PLACEMENTS
-from edgepose.pose import PoseSequence, held_sensors, longest_holds
+from edgepose.placements import BONES
+from edgepose.pose import PoseSequence, held_sensors, known_sensors, longest_holds
 from edgepose.skeleton import Body, forward_kinematics
 from edgepose.utils.durable_files import write_whole
 
@@ -285,10 +285,11 @@ def find_slips(poses: PoseSequence, body: Body) -> list[Slip]:
 
 def _sensors(poses: PoseSequence) -> list[str]:
     """Tabulate how often each sensor's last values were repeated."""
-    held, rate = held_sensors(poses.held), poses.rate
+    names, rate = known_sensors(poses.held), poses.rate
+    held = held_sensors(poses.held, names)
     rows = [
         (name.replace("_", " "), str(column.sum()), f"{100 * column.mean():.1f} %", f"{longest / rate:.2f} s")
-        for name, column, longest in zip(PLACEMENTS, held.T, longest_holds(held), strict=True)
+        for name, column, longest in zip(names, held.T, longest_holds(held), strict=True)
     ]
     filling = sum(poses.warming_up)
     result = [_table(("sensor", "poses with repeated values", "of all", "longest"), rows)]

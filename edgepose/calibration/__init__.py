@@ -6,7 +6,7 @@ are in radians, except those whose names end in `_deg`, which are for people to 
 
 from edgepose.calibration.body_frame import body_from_inertial, check_body_frame
 from edgepose.calibration.checks import HoldError, HoldSummary, MovedError, check_covered, check_hold
-from edgepose.calibration.functional import EXERCISE_S, ROUTINE, headings_from_motion
+from edgepose.calibration.functional import EXERCISE_S, ROUTINE, headings_from_motion, routine
 from edgepose.calibration.heading_reset import (
     HeadingReset,
     WeakMotionError,
@@ -21,6 +21,7 @@ from edgepose.calibration.sensor_to_segment import POSES, Calibration, apply_cal
 from edgepose.calibration.static_pose import (
     Hold,
     SensorHold,
+    all_of,
     check_reported,
     hold_from_recording,
     hold_from_samples,
@@ -53,6 +54,7 @@ __all__ = [
     "MovedError",
     "SensorHold",
     "WeakMotionError",
+    "all_of",
     "apply_calibration",
     "body_from_inertial",
     "calibrate",
@@ -74,6 +76,7 @@ __all__ = [
     "load_calibration",
     "mounting",
     "mounting_warnings",
+    "routine",
     "save",
     "stillest_start",
     "t_pose_start",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -44,25 +45,28 @@ def _finite(text: str) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def body_from_inertial(orientation: Array, body_frame: str) -> Array:
+def body_from_inertial(orientation: Array, body_frame: str, names: Sequence[str] = PLACEMENTS) -> Array:
     """Return R_TI (3, 3) of a wearer who holds the calibration pose.
 
     Args:
-        orientation: (6, 4) mean quaternions of the hold, sensor to inertial, headings reset.
+        orientation: (N, 4) mean quaternions of the hold, sensor to inertial, headings reset.
         body_frame: `head`: the head sensor's axes lie along T (DIP eq. 6). `SENSOR:AXIS`: the horizontal
             direction of that axis of that sensor is forward, gravity shows which way is up. `heading:DEG`:
             the wearer faces this angle from X of I towards Y.
+        names: of the sensors.
 
     Raises:
-        CalibrationError: the way in which the named sensor is worn rules the method out.
+        CalibrationError: the way in which the named sensor is worn rules the method out, or there is none.
     """
     name, _, value = check_body_frame(body_frame).partition(":")
+    if name != "heading" and name not in names:
+        raise CalibrationError(f"body frame {body_frame}: this rig has no {name} sensor; name another one")
     if name == "head":
-        return _frame_of_head(rot.quat_to_matrix(orientation[PLACEMENTS.index("head")]))
+        return _frame_of_head(rot.quat_to_matrix(orientation[list(names).index(name)]))
     if name == "heading":
         angle = math.radians(float(value))
         return _frame_facing(np.array([math.cos(angle), math.sin(angle), 0.0]))
-    axis = rot.quat_to_matrix(orientation[PLACEMENTS.index(name)])[:, "xyz".index(value[-1])]
+    axis = rot.quat_to_matrix(orientation[list(names).index(name)])[:, "xyz".index(value[-1])]
     forward = -axis if value[0] == "-" else axis
     from_vertical = min(tilt_deg(forward), 180.0 - tilt_deg(forward))
     if from_vertical < FRAME_TILT_LIMIT_DEG:

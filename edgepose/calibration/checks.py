@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -41,14 +42,15 @@ class MovedError(HoldError):
 
 
 class HoldSummary(NamedTuple):
-    """Means of a hold that passed its checks.
+    """Means of a hold of N sensors that passed its checks.
 
     Attributes:
-        samples: (6,) number of samples.
-        orientation: (6, 4) mean quaternions, sensor to inertial, without any heading offset.
-        spread_deg: (6,) RMS angle about the mean, degrees.
-        force: (6, 3) mean specific force in I, m/s^2; NaN where a sensor measures none.
+        samples: (N,) number of samples.
+        orientation: (N, 4) mean quaternions, sensor to inertial, without any heading offset.
+        spread_deg: (N,) RMS angle about the mean, degrees.
+        force: (N, 3) mean specific force in I, m/s^2; NaN where a sensor measures none.
         warnings: one line each, naming the sensor.
+        names: of the sensors.
     """
 
     samples: list[int]
@@ -56,13 +58,14 @@ class HoldSummary(NamedTuple):
     spread_deg: Array
     force: Array
     warnings: list[str]
+    names: Sequence[str] = PLACEMENTS
 
 
 def check_hold(hold: Hold, advice: str = "stand still and repeat") -> HoldSummary:
     """Check that every sensor reported, was held still and measured gravity along +Z of I; return the means.
 
     Args:
-        hold: six sensors' samples.
+        hold: the sensors' samples.
         advice: what to do about movement, for the message.
 
     Raises:
@@ -71,18 +74,14 @@ def check_hold(hold: Hold, advice: str = "stand still and repeat") -> HoldSummar
         CalibrationError: any other fault of the hold; names the sensors and what to do.
     """
     check_reported(hold)
-    few = [f"{name} {len(s.quat)}" for name, s in sensor_names(hold) if len(s.quat) < MIN_SAMPLES]
+    few = [f"{s.name} {len(s.quat)}" for s in hold if len(s.quat) < MIN_SAMPLES]
     if few:
         raise CalibrationError(
             f"too few samples in the hold ({', '.join(few)}; at least {MIN_SAMPLES}): "
             "check the rate and the link, or hold longer"
         )
     check_covered(hold, min(s.time_s.min() for s in hold), max(s.time_s.max() for s in hold))
-    broken = [
-        f"{name} ({bad} of {len(s.quat)})"
-        for name, s in sensor_names(hold)
-        if (bad := _not_rotations(s.quat))
-    ]
+    broken = [f"{s.name} ({bad} of {len(s.quat)})" for s in hold if (bad := _not_rotations(s.quat))]
     if broken:
         raise CalibrationError(
             f"quaternions that are not rotations (not of length 1): {', '.join(broken)}; "
@@ -90,8 +89,8 @@ def check_hold(hold: Hold, advice: str = "stand still and repeat") -> HoldSummar
         )
     quats = [unit_or_zero(s.quat) for s in hold]
     shared = [
-        (name, apart)
-        for name, quat in zip(PLACEMENTS, quats, strict=True)
+        (s.name, apart)
+        for s, quat in zip(hold, quats, strict=True)
         if (apart := detect_alternating_devices(quat)) is not None
     ]
     if shared:
@@ -99,21 +98,20 @@ def check_hold(hold: Hold, advice: str = "stand still and repeat") -> HoldSummar
     mean = np.stack([rot.mean_rotation(quat) for quat in quats])
     spread = np.array([_rms(_angles(quat, centre)) for quat, centre in zip(quats, mean, strict=True)])
     moved = [
-        text
-        for name, s, quat, rms in zip(PLACEMENTS, hold, quats, spread, strict=True)
-        if (text := _movement(name, s, quat, rms))
+        text for s, quat, rms in zip(hold, quats, spread, strict=True) if (text := _movement(s, quat, rms))
     ]
     if moved:
         raise MovedError(f"moved during the hold: {', '.join(moved)}; {advice}")
     force, warnings = _gravity(hold, quats)
-    return HoldSummary([len(s.quat) for s in hold], mean, np.degrees(spread), force, warnings)
+    counts = [len(s.quat) for s in hold]
+    return HoldSummary(counts, mean, np.degrees(spread), force, warnings, sensor_names(hold))
 
 
 def check_covered(hold: Hold, start_s: float, end_s: float) -> None:
     """Check that every sensor sent samples during all of a hold.
 
     Args:
-        hold: six sensors' samples.
+        hold: the sensors' samples.
         start_s: start of the hold, on the clock of the samples, seconds.
         end_s: its end.
 
@@ -124,7 +122,7 @@ def check_covered(hold: Hold, start_s: float, end_s: float) -> None:
     check_reported(hold)
     gaps = [np.diff(np.sort([start_s, *s.time_s, end_s])).max() for s in hold]
     if silent := [
-        f"{n} for {gap:.1f} s" for n, gap in zip(PLACEMENTS, gaps, strict=True) if gap > GAP_LIMIT_S
+        f"{s.name} for {gap:.1f} s" for s, gap in zip(hold, gaps, strict=True) if gap > GAP_LIMIT_S
     ]:
         raise HoldError(
             f"silent during a part of the hold: {', '.join(silent)}; check power and link, and hold again or "
@@ -182,24 +180,25 @@ def _angles_between(one: Array, other: Array) -> Array:
     return 2.0 * np.arccos(np.clip(np.abs(np.sum(one * other, axis=-1)), 0.0, 1.0))
 
 
-def _movement(name: str, s: SensorHold, quat: Array, spread: float) -> str | None:
+def _movement(s: SensorHold, quat: Array, spread: float) -> str | None:
     """Describe the movement of one sensor; None if it held still."""
     quarter = max(1, len(quat) // 4)
     drift = _angles(rot.mean_rotation(quat[-quarter:])[None], rot.mean_rotation(quat[:quarter]))[0]
     if math.degrees(spread) > SPREAD_LIMIT_DEG or math.degrees(drift) > DRIFT_LIMIT_DEG:
-        return f"{name} {math.degrees(max(spread, drift)):.1f} deg"
+        return f"{s.name} {math.degrees(max(spread, drift)):.1f} deg"
     gyr = s.gyr[np.isfinite(s.gyr).all(axis=-1)]
     rate = math.degrees(_rms(np.linalg.norm(gyr - gyr.mean(axis=0), axis=-1))) if len(gyr) else 0.0
-    return f"{name} {rate:.0f} deg/s" if rate > RATE_LIMIT_DEG_S else None
+    return f"{s.name} {rate:.0f} deg/s" if rate > RATE_LIMIT_DEG_S else None
 
 
 def _gravity(hold: Hold, quats: list[Array]) -> tuple[Array, list[str]]:
-    """Return mean specific forces in I (6, 3), m/s^2, and warnings about their size; raise if not upwards."""
-    force, warnings = np.full((len(PLACEMENTS), 3), np.nan), []
+    """Return mean specific forces in I (N, 3), m/s^2, and warnings about their size; raise if not upwards."""
+    force, warnings = np.full((len(hold), 3), np.nan), []
     removed: list[str] = []
     tilted: dict[str, float] = {}
     fitting: dict[str, list[str]] = {}
-    for i, (name, s, quat) in enumerate(zip(PLACEMENTS, hold, quats, strict=True)):
+    for i, (s, quat) in enumerate(zip(hold, quats, strict=True)):
+        name = s.name
         measured = np.isfinite(s.acc).all(axis=-1)
         if not measured.any():
             warnings.append(f"{name} measures no acceleration: gravity was not checked")

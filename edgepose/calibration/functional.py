@@ -14,8 +14,7 @@ import numpy as np
 
 from edgepose import rotations as rot
 from edgepose.calibration.heading_reset import HeadingReset, WeakMotionError
-from edgepose.calibration.static_pose import Hold, check_reported
-from edgepose.placements import PLACEMENTS
+from edgepose.calibration.static_pose import Hold, check_reported, sensor_names
 from edgepose.rotations import Array
 
 MIN_LEAN_DEG = 6.0
@@ -40,11 +39,28 @@ ROUTINE = (
     Exercise("Lift the LEFT heel up behind you and put it down, twice", ("left_lower_leg",)),
     Exercise("Lift the RIGHT heel up behind you and put it down, twice", ("right_lower_leg",)),
 )
+_MORE = (
+    Exercise("Lift the LEFT arm forward, stretched, and lower it, twice", ("left_upper_arm",)),
+    Exercise("Lift the RIGHT arm forward, stretched, and lower it, twice", ("right_upper_arm",)),
+    Exercise("Lift the LEFT knee in front of you and lower it, twice", ("left_upper_leg",)),
+    Exercise("Lift the RIGHT knee in front of you and lower it, twice", ("right_upper_leg",)),
+)
+
 EXERCISE_S = 4.0
 """Time for each exercise, seconds."""
 
-_BACK = ("left_forearm", "right_forearm")
+
+_BACK = tuple(
+    f"{side}_{part}" for side in ("left", "right") for part in ("forearm", "upper_arm", "hand", "upper_leg")
+)
+"""Sensors whose segments lean back when they are lifted forward."""
+
 _STEP_S = 0.1
+
+
+def routine(names: Sequence[str]) -> list[Exercise]:
+    """Return the movements that show the headings of a rig's sensors; others move along with these."""
+    return [each for each in (*ROUTINE, *_MORE) if any(name in names for name in each.sensors)]
 
 
 def headings_from_motion(moving: Hold, upright: Array) -> HeadingReset:
@@ -52,7 +68,7 @@ def headings_from_motion(moving: Hold, upright: Array) -> HeadingReset:
 
     Args:
         moving: samples of the movements; `ROUTINE` is best, walking works.
-        upright: (6, 4) mean quaternions of the straight pose, held shortly before or after.
+        upright: (N, 4) mean quaternions of the straight pose, held shortly before or after.
 
     Raises:
         WeakMotionError: a sensor was moved too little, in all directions, or forward as much as back.
@@ -60,7 +76,8 @@ def headings_from_motion(moving: Hold, upright: Array) -> HeadingReset:
     check_reported(moving)
     lean_of = [leans(s.quat, mean) for s, mean in zip(moving, upright, strict=True)]
     forward, spread, wrong = [], [], []
-    for name, lean in zip(PLACEMENTS, lean_of, strict=True):
+    names = sensor_names(moving)
+    for name, lean in zip(names, lean_of, strict=True):
         direction, spread_deg, one_way = main_direction(lean)
         reach = np.degrees(np.arcsin(min(1.0, np.percentile(np.linalg.norm(lean, axis=-1), 98))))
         if reach < MIN_LEAN_DEG:
@@ -79,11 +96,11 @@ def headings_from_motion(moving: Hold, upright: Array) -> HeadingReset:
     ahead = np.array(forward)
     warnings = [
         f"the heading of {name} is only known to {spread_deg:.0f} deg: its movements went different ways"
-        for name, spread_deg in zip(PLACEMENTS, spread, strict=True)
+        for name, spread_deg in zip(names, spread, strict=True)
         if spread_deg > SPREAD_WARNING_DEG
     ]
-    warnings += _wrong_order([s.time_s for s in moving], lean_of)
-    return HeadingReset(-np.arctan2(ahead[:, 1], ahead[:, 0]), np.array(spread), warnings)
+    warnings += _wrong_order(names, [s.time_s for s in moving], lean_of)
+    return HeadingReset(-np.arctan2(ahead[:, 1], ahead[:, 0]), np.array(spread), warnings, names)
 
 
 def leans(quat: Array, upright: Array) -> Array:
@@ -108,16 +125,19 @@ def main_direction(lean: Array) -> tuple[Array, float, float]:
     return (-direction if along < 0 else direction), float(spread), abs(along)
 
 
-def _wrong_order(times: Sequence[Array], leans: Sequence[Array]) -> list[str]:
+def _wrong_order(names: Sequence[str], times: Sequence[Array], leans: Sequence[Array]) -> list[str]:
     """Warn of sensors that moved when `ROUTINE` asked for another one's movement.
 
     That only shows if the limbs moved one after the other; in walking they move together.
     """
     active = {}
-    for name, time_s, lean in zip(PLACEMENTS, times, leans, strict=True):
+    for name, time_s, lean in zip(names, times, leans, strict=True):
         size = np.linalg.norm(lean, axis=-1)
         active[name] = np.unique(np.floor(time_s[size > 0.5 * size.max()] / _STEP_S))
-    limbs = [exercise.sensors[0] for exercise in ROUTINE if len(exercise.sensors) == 1]
+    if any(name in names for exercise in _MORE for name in exercise.sensors):
+        return []  # arms and legs move in two exercises each
+    exercises = [exercise.sensors[0] for exercise in ROUTINE if len(exercise.sensors) == 1]
+    limbs = [name for name in exercises if name in names]
     for i, name in enumerate(limbs):
         for other in limbs[:i]:
             both = np.intersect1d(active[name], active[other]).size

@@ -16,8 +16,8 @@ from edgepose import rotations as rot
 from edgepose.calibration.body_frame import body_from_inertial
 from edgepose.calibration.checks import check_hold, tilt_deg
 from edgepose.calibration.mounting import rotation_of
-from edgepose.calibration.sensor_to_segment import POSES, Calibration
-from edgepose.calibration.static_pose import Hold
+from edgepose.calibration.sensor_to_segment import POSES, Calibration, held_bone
+from edgepose.calibration.static_pose import Hold, all_of, root_of, sensor_names
 from edgepose.errors import CalibrationError
 from edgepose.placements import PLACEMENTS, ROOT
 from edgepose.rotations import Array
@@ -32,23 +32,25 @@ class WeakMotionError(CalibrationError):
 
 
 class HeadingReset(NamedTuple):
-    """Heading offsets of six sensors.
+    """Heading offsets of N sensors.
 
     Attributes:
-        offset: (6,) rotation about Z from each sensor's inertial frame to the common one, rad, -pi to pi.
-        error_deg: (6,) uncertainty of each, degrees. Side by side, mounting and pose: the remaining tilt,
+        offset: (N,) rotation about Z from each sensor's inertial frame to the common one, rad, -pi to pi.
+        error_deg: (N,) uncertainty of each, degrees. Side by side, mounting and pose: the remaining tilt,
             which no rotation about Z can remove. Motion: RMS spread of the directions of its movements.
             Steps: estimated from the ways.
         warnings: one line each, naming the sensor.
+        names: of the sensors.
     """
 
     offset: Array
     error_deg: Array
     warnings: Sequence[str] = ()
+    names: Sequence[str] = PLACEMENTS
 
 
 def turn_about_z(measured: Array, wanted: Array) -> HeadingReset:
-    """Return the rotations about Z that bring orientations (6, 4) nearest to wanted ones (6, 4) or (4,)."""
+    """Return the rotations about Z that bring orientations (N, 4) nearest to wanted ones (N, 4) or (4,)."""
     between = rot.quat_multiply(wanted, rot.quat_conjugate(measured))
     yaw = rot.yaw_of_quat(between)
     tilt = 2.0 * np.arctan2(np.hypot(between[:, 1], between[:, 2]), np.hypot(between[:, 0], between[:, 3]))
@@ -56,43 +58,47 @@ def turn_about_z(measured: Array, wanted: Array) -> HeadingReset:
 
 
 def headings_side_by_side(still: Hold) -> HeadingReset:
-    """Reset headings (DIP 4.5) from all six sensors lying side by side in one orientation.
+    """Reset headings (DIP 4.5) from all sensors lying side by side in one orientation.
 
     Raises:
         CalibrationError: a sensor moved or does not lie like the pelvis sensor; names it.
     """
     mean = check_hold(still, "leave the sensors alone and repeat the heading reset").orientation
-    reset = turn_about_z(mean, mean[ROOT])
-    if crooked := over(reset.error_deg, RESET_TILT_LIMIT_DEG):
+    names = sensor_names(still)
+    reset = turn_about_z(mean, mean[root_of(names)])
+    if crooked := over(reset.error_deg, RESET_TILT_LIMIT_DEG, names):
         raise CalibrationError(
             f"not lying like the {PLACEMENTS[ROOT]} sensor: {crooked}; "
-            "lay all six side by side, same face up, same edge forward, and repeat the heading reset"
+            f"lay {all_of(names)} side by side, same face up, same edge forward, and repeat the heading reset"
         )
-    return reset
+    return reset._replace(names=names)
 
 
-def headings_from_mounting(orientation: Array, mounting: Sequence[str]) -> HeadingReset:
+def headings_from_mounting(
+    orientation: Array, mounting: Sequence[str], names: Sequence[str] = PLACEMENTS
+) -> HeadingReset:
     """Reset headings from the known mounting of each sensor on a wearer who holds the calibration pose.
 
     Args:
-        orientation: (6, 4) mean quaternions of the hold.
-        mounting: six mountings, such as "x up, z back".
+        orientation: (N, 4) mean quaternions of the hold.
+        mounting: N mountings, such as "x up, z back".
+        names: of the sensors.
 
     Raises:
         CalibrationError: gravity contradicts a sensor's mounting; names it.
     """
     mounted = np.stack([rotation_of(words) for words in mounting])
     reset = turn_about_z(orientation, rot.matrix_to_quat(_facing_x().T @ mounted))
-    if wrong := over(reset.error_deg, MOUNTING_TILT_LIMIT_DEG):
+    if wrong := over(reset.error_deg, MOUNTING_TILT_LIMIT_DEG, names):
         raise CalibrationError(
             f"not mounted as the sensor map says, judged by gravity: {wrong}; "
             "is it upside down, or swapped with another one?"
         )
-    return reset
+    return reset._replace(names=names)
 
 
-def headings_from_axis(orientation: Array, axis: str) -> HeadingReset:
-    """Reset headings from one sensor axis, such as "z" or "-x", that points forward in the pose.
+def headings_from_axis(orientation: Array, axis: str, names: Sequence[str] = PLACEMENTS) -> HeadingReset:
+    """Reset headings from one axis of all N sensors, such as "z" or "-x", that points forward in the pose.
 
     Raises:
         CalibrationError: that axis is too steep on a sensor to show a direction; names it.
@@ -100,12 +106,12 @@ def headings_from_axis(orientation: Array, axis: str) -> HeadingReset:
     sign = -1.0 if axis.startswith("-") else 1.0
     forward = sign * rot.quat_to_matrix(orientation)[:, :, "xyz".index(axis[-1])]
     slope = np.array([abs(90.0 - tilt_deg(v)) for v in forward])
-    if steep := over(slope, AXIS_LIMIT_DEG):
+    if steep := over(slope, AXIS_LIMIT_DEG, names):
         raise CalibrationError(
             f"axis {axis} does not face forward: {steep} from level; "
             "name the axis that does, or give each sensor its mounting in the sensor map"
         )
-    return HeadingReset(-np.arctan2(forward[:, 1], forward[:, 0]), slope)
+    return HeadingReset(-np.arctan2(forward[:, 1], forward[:, 0]), slope, (), names)
 
 
 def headings_from_pose(calibration: Calibration, orientation: Array) -> HeadingReset:
@@ -123,15 +129,22 @@ def headings_from_pose(calibration: Calibration, orientation: Array) -> HeadingR
     return turn_about_z(orientation, rot.matrix_to_quat(wanted))
 
 
+def added_headings_from_pose(calibration: Calibration, orientation: Array) -> HeadingReset:
+    """Reset the headings of the added sensors like `headings_from_pose`, from orientations (A, 4)."""
+    added = calibration.added
+    r_it = rot.quat_to_matrix(calibration.body_from_inertial).T
+    held = np.stack([held_bone(calibration.pose, name) for name in added.names])
+    wanted = rot.matrix_to_quat(r_it @ held @ rot.quat_to_matrix(added.bone_from_sensor))
+    return turn_about_z(orientation, wanted)._replace(names=added.names)
+
+
 def _facing_x() -> Array:
     """Return R_TI (3, 3) of a wearer who faces X of the common frame."""
     return body_from_inertial(np.zeros((len(PLACEMENTS), 4)), "heading:0")
 
 
-def over(angle_deg: Array, limit_deg: float) -> str:
+def over(angle_deg: Array, limit_deg: float, names: Sequence[str] = PLACEMENTS) -> str:
     """List the sensors whose angle is over a limit, with the angle, for a message."""
     return ", ".join(
-        f"{name} ({angle:.0f} deg)"
-        for name, angle in zip(PLACEMENTS, angle_deg, strict=True)
-        if angle > limit_deg
+        f"{name} ({angle:.0f} deg)" for name, angle in zip(names, angle_deg, strict=True) if angle > limit_deg
     )

@@ -12,12 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from edgepose.calibration.added import AddedSensors
 from edgepose.calibration.body_frame import check_body_frame
 from edgepose.calibration.mounting import mounting
 from edgepose.calibration.sensor_to_segment import POSES, Calibration
 from edgepose.errors import CalibrationError, EdgeposeError
 from edgepose.imu import FILTERS
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import ADDED, LACKING, PLACEMENTS, SENSORS
 from edgepose.rotations import Array
 from edgepose.skeleton import MAX_HEIGHT, MIN_HEIGHT
 from edgepose.utils.durable_files import write_whole
@@ -25,17 +26,22 @@ from edgepose.utils.text_files import read_text
 
 _FORMAT, _VERSION = "edgepose-calibration", 1
 
+_UNKNOWN = (0.0, np.array([1.0, 0.0, 0.0, 0.0]), 0.0)  # numbers of a sensor that the rig lacks
+
+_Fail = Callable[[str], EdgeposeError]
+
 
 def to_json(calibration: Calibration) -> str:
     """Format a calibration as JSON for `from_json` and for people: sensors by name, degrees, w, x, y, z."""
+    mounted = mounting(calibration)
     sensors = {
         name: {
-            "heading_offset_deg": math.degrees(calibration.heading_offset[i]),
-            "bone_from_sensor": calibration.bone_from_sensor[i].tolist(),
-            "residual_deg": float(calibration.residual_deg[i]),
-            "mounting": mounted,
+            "heading_offset_deg": math.degrees(sensor.heading_offset),
+            "bone_from_sensor": sensor.bone_from_sensor.tolist(),
+            "residual_deg": sensor.residual_deg,
+            "mounting": mounted[name],
         }
-        for i, (name, mounted) in enumerate(zip(PLACEMENTS, mounting(calibration), strict=True))
+        for name, sensor in calibration.sensors.items()
     }
     document = {
         "format": _FORMAT,
@@ -47,6 +53,7 @@ def to_json(calibration: Calibration) -> str:
         "orientation": {"filter": calibration.filter, "north": calibration.north},
         "wearer": {} if calibration.height_m is None else {"height_m": calibration.height_m},
         "sensors": sensors,
+        **({"without": list(calibration.without)} if calibration.without else {}),
         "metadata": dict(calibration.metadata),
     }
     text = json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
@@ -78,13 +85,7 @@ def from_json(text: str, where: str = "calibration") -> Calibration:
         raise fail(
             f"format version {document.get('version')!r}; this program reads {_VERSION}, calibrate again"
         )
-    sensors = _member(document, "sensors", dict, fail)
-    if missing := [name for name in PLACEMENTS if name not in sensors]:
-        raise fail(f"no sensor {', '.join(missing)}; calibrate again with all six")
-    if unknown := [name for name in sensors if name not in PLACEMENTS]:
-        raise fail(f"unknown sensor {', '.join(map(repr, unknown))}; the sensors are {', '.join(PLACEMENTS)}")
-    if bare := [name for name in PLACEMENTS if not isinstance(sensors[name], dict)]:
-        raise fail(f"sensor {', '.join(bare)} is not an object")
+    numbers, without = _sensors(document, fail)
     pose = _member(document, "pose", str, fail)
     if pose not in POSES:
         raise fail(f"pose {pose!r} is none of: {', '.join(POSES)}")
@@ -100,14 +101,20 @@ def from_json(text: str, where: str = "calibration") -> Calibration:
     height_m = _number(wearer.get("height_m", 1.0))
     if height_m is None or not MIN_HEIGHT <= height_m <= MAX_HEIGHT:
         raise fail(f"'wearer': height_m is not a number between {MIN_HEIGHT} and {MAX_HEIGHT}")
-    offsets, mounts, residuals = zip(
-        *(_numbers_of(name, sensors[name], fail) for name in PLACEMENTS), strict=True
-    )
+    offsets, mounts, residuals = zip(*(numbers[name] for name in PLACEMENTS), strict=True)
+    added = [name for name in ADDED if name in numbers]
     return Calibration(
         body_from_inertial=_unit_quaternion(document, "body_from_inertial", "", fail),
         heading_offset=np.radians(offsets),
         bone_from_sensor=np.stack(mounts),
         residual_deg=np.array(residuals),
+        added=AddedSensors(
+            added,
+            np.radians([numbers[name][0] for name in added]),
+            np.array([numbers[name][1] for name in added]).reshape(-1, 4),
+            np.array([numbers[name][2] for name in added]),
+        ),
+        without=without,
         pose=pose,
         body_frame=body_frame,
         created=_member(document, "created", str, fail),
@@ -116,6 +123,32 @@ def from_json(text: str, where: str = "calibration") -> Calibration:
         north=source["north"],
         height_m=height_m if "height_m" in wearer else None,
     )
+
+
+def _sensors(
+    document: dict[str, Any], fail: _Fail
+) -> tuple[dict[str, tuple[float, Array, float]], list[str]]:
+    """Return the numbers of each sensor, see `_numbers_of`, and those of the six that the rig lacks."""
+    sensors = _member(document, "sensors", dict, fail)
+    without = _without(document, fail)
+    if missing := [name for name in PLACEMENTS if name not in sensors and name not in without]:
+        raise fail(f"no sensor {', '.join(missing)}; calibrate again with all six")
+    if unknown := [name for name in sensors if name not in SENSORS]:
+        raise fail(f"unknown sensor {', '.join(map(repr, unknown))}; the sensors are {', '.join(SENSORS)}")
+    if both := [name for name in without if name in sensors]:
+        raise fail(f"sensor {', '.join(both)} is in 'without', too; calibrate again")
+    if bare := [name for name in sensors if not isinstance(sensors[name], dict)]:
+        raise fail(f"sensor {', '.join(bare)} is not an object")
+    numbers = {name: _numbers_of(name, sensors[name], fail) for name in SENSORS if name in sensors}
+    return dict.fromkeys(without, _UNKNOWN) | numbers, without
+
+
+def _without(document: dict[str, Any], fail: _Fail) -> list[str]:
+    """Return the sensors of the six that the rig lacks."""
+    without = document.get("without", [])
+    if not isinstance(without, list) or not set(map(str, without)) <= LACKING:
+        raise fail(f"'without' may only list {', '.join(sorted(LACKING))}")
+    return [name for name in PLACEMENTS if name in without]
 
 
 def save(calibration: Calibration, path: str | Path, overwrite: bool = True) -> None:
@@ -138,9 +171,6 @@ def load_calibration(path: str | Path) -> Calibration:
             f"{path}: not valid JSON (not UTF-8 text); make a new one with `edgepose calibrate`"
         ) from error
     return from_json(text, str(path))
-
-
-_Fail = Callable[[str], EdgeposeError]
 
 
 def _no_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from edgepose import rotations as rot
-from edgepose.calibration.sensor_to_segment import POSES, Calibration
-from edgepose.placements import PLACEMENTS
+from edgepose.calibration.sensor_to_segment import Calibration, held_bone
 from edgepose.rotations import Array
 
 WRONG_DEG = 60.0
@@ -17,14 +16,14 @@ WRONG_DEG = 60.0
 _AXES = (("left", "right"), ("up", "down"), ("forward", "back"))
 
 
-def mounting(calibration: Calibration) -> list[str]:
+def mounting(calibration: Calibration) -> dict[str, str]:
     """Describe each sensor's mounting in the held pose: the body directions nearest to its X and Z axes."""
 
     def nearest(direction: Array) -> str:
         i = int(np.argmax(np.abs(direction)))
         return _AXES[i][int(direction[i] < 0)]
 
-    return [f"x {nearest(r[:, 0])}, z {nearest(r[:, 2])}" for r in _mounted(calibration)]
+    return {name: f"x {nearest(r[:, 0])}, z {nearest(r[:, 2])}" for name, r in _mounted(calibration).items()}
 
 
 def rotation_of(words: str) -> Array:
@@ -38,42 +37,40 @@ def mounting_warnings(calibration: Calibration, stated: Mapping[str, str | None]
 
     Args:
         calibration: of a hold.
-        stated: mounting of each placement's sensor, in the order of PLACEMENTS; None if not stated.
+        stated: mounting of sensors by name; None if not stated.
         source: name of the file that states it, for the message.
     """
     measured, found = _mounted(calibration), mounting(calibration)
-    wanted = [None if words is None else rotation_of(words) for words in stated.values()]
+    wanted = {name: rotation_of(words) for name, words in stated.items() if words is not None}
 
-    def fits(sensor: int, placement: int) -> bool:
-        r = wanted[placement]
+    def fits(sensor: str, placement: str) -> bool:
+        r = wanted.get(placement)
         return r is None or bool(np.degrees(rot.geodesic_angle(measured[sensor], r)) < WRONG_DEG)
 
-    wrong = [i for i in range(len(PLACEMENTS)) if not fits(i, i)]
+    wrong = [name for name in measured if not fits(name, name)]
     lines = []
     while wrong:
-        i = wrong.pop(0)
-        name = PLACEMENTS[i]
-        twin = next((j for j in wrong if fits(i, j) and fits(j, i)), None)
+        name = wrong.pop(0)
+        twin = next((other for other in wrong if fits(name, other) and fits(other, name)), None)
         if twin is not None:
             wrong.remove(twin)
-            lines.append(
-                f"{name} and {PLACEMENTS[twin]} look swapped: each is mounted as {source} says for the other"
-            )
+            lines.append(f"{name} and {twin} look swapped: each is mounted as {source} says for the other")
             continue
-        r = wanted[i]
-        assert r is not None, "a mounting that is not stated cannot be wrong"
         # Whether the axis that should point up points down.
-        upside_down = measured[i][1] @ r[1] < -0.5
+        upside_down = measured[name][1] @ wanted[name][1] < -0.5
         lines.append(
-            f"{name} is mounted {found[i]}{' (upside down)' if upside_down else ''}, but {source} says "
+            f"{name} is mounted {found[name]}{' (upside down)' if upside_down else ''}, but {source} says "
             f"{stated[name]}; check that no two sensors are swapped and that it is the right way round"
         )
     return lines
 
 
-def _mounted(calibration: Calibration) -> Array:
-    """R_TS (6, 3, 3) in the held pose."""
-    return POSES[calibration.pose] @ rot.quat_to_matrix(calibration.bone_from_sensor)
+def _mounted(calibration: Calibration) -> dict[str, Array]:
+    """R_TS (3, 3) of each sensor in the held pose."""
+    return {
+        name: held_bone(calibration.pose, name) @ rot.quat_to_matrix(sensor.bone_from_sensor)
+        for name, sensor in calibration.sensors.items()
+    }
 
 
 def _direction(word: str) -> Array:

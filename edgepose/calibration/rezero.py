@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 
 from edgepose import rotations as rot
 from edgepose.calibration import Calibration, HeadingReset, headings_from_pose
 from edgepose.calibration.fit import fit_pose
+from edgepose.calibration.heading_reset import added_headings_from_pose
 from edgepose.errors import CalibrationError, EdgeposeError
 from edgepose.imu import ImuFrame
 from edgepose.placements import PLACEMENTS
@@ -63,8 +65,8 @@ class HeadingRezero:
         """
         self._calibration = calibration
         self._requests, self._notify = requests, notify
-        self._old: Array | None = None if hold_first else calibration.heading_offset
-        self._new = calibration.heading_offset
+        self._new = _headings(calibration)
+        self._old: Array | None = None if hold_first else self._new
         self._blend_from_s = -np.inf
         self._hold: list[ImuFrame] = []
         self._hold_from_s: float | None = None
@@ -109,8 +111,10 @@ class HeadingRezero:
             return
         self._hold = []
         self._old = self._new = found.offset
-        self._calibration = replace(self._calibration, heading_offset=found.offset)
-        self._notify(f"headings found; tilt off by {_by_sensor(found.error_deg)} deg. You can move now")
+        self._calibration = _with_headings(self._calibration, found.offset)
+        for line in found.warnings:
+            self._notify(line)
+        self._notify(f"headings found; tilt off by {self._by_sensor(found.error_deg)} deg. You can move now")
 
     def _later_hold(self, frame: ImuFrame) -> None:
         self._hold.append(frame)
@@ -121,14 +125,22 @@ class HeadingRezero:
         except EdgeposeError as error:
             self._notify(f"headings stay as they are: {error}")
         else:
-            self._old, self._new = self._calibration.heading_offset, found.offset
+            self._old = _headings(self._calibration)
+            self._new = np.where(np.isnan(found.offset), self._old, found.offset)
             self._blend_from_s = frame.time_s
-            turned = np.degrees(_wrapped(self._new - self._old))
+            turned = np.where(np.isnan(found.error_deg), np.nan, np.degrees(_wrapped(self._new - self._old)))
+            for line in found.warnings:
+                self._notify(line)
             self._notify(
-                f"re-zeroed: headings turned by {_by_sensor(turned)} deg; "
-                f"tilt off by {_by_sensor(found.error_deg)} deg"
+                f"re-zeroed: headings turned by {self._by_sensor(turned)} deg; "
+                f"tilt off by {self._by_sensor(found.error_deg)} deg"
             )
         self._hold, self._hold_from_s = [], None
+
+    def _by_sensor(self, angle_deg: Array) -> str:
+        names = [*PLACEMENTS, *self._calibration.added.names]
+        known = [(name, angle) for name, angle in zip(names, angle_deg, strict=True) if not np.isnan(angle)]
+        return ", ".join(f"{name} {angle:.1f}" for name, angle in known)
 
     def _blended(self, time_s: float) -> Calibration | None:
         if self._old is None:
@@ -137,38 +149,90 @@ class HeadingRezero:
             share = min(max((time_s - self._blend_from_s) / BLEND_S, 0.0), 1.0)
             smooth = share * share * (3.0 - 2.0 * share)
             offset = self._old + smooth * _wrapped(self._new - self._old)
-            self._calibration = replace(self._calibration, heading_offset=offset)
+            # One that was unknown until now has nothing to turn from.
+            offset = np.where(np.isnan(self._old), self._new, offset)
+            self._calibration = _with_headings(self._calibration, offset)
             if share == 1.0:
                 self._old = self._new
         return self._calibration
 
 
+def _headings(calibration: Calibration) -> Array:
+    """Return the heading offsets (6 + A,) of the six sensors and of the added ones."""
+    return np.concatenate([calibration.heading_offset, calibration.added.heading_offset])
+
+
+def _with_headings(calibration: Calibration, offset: Array) -> Calibration:
+    """Return a calibration with other heading offsets (6 + A,)."""
+    six = len(PLACEMENTS)
+    added = (
+        replace(calibration.added, heading_offset=offset[six:]) if len(offset) > six else calibration.added
+    )
+    return replace(calibration, heading_offset=offset[:six], added=added)
+
+
 def _from_hold(calibration: Calibration, frames: list[ImuFrame]) -> HeadingReset:
-    """Reset headings from frames of the held pose.
+    """Reset headings, offsets and errors (6 + A,), from frames of the held pose.
+
+    An added sensor that was silent, moved or does not fit the pose costs only its own heading, then NaN.
 
     Raises:
         CalibrationError: the wearer moved, or gravity shows another pose; names the sensors.
     """
+    worn = ~calibration.missing
+    mean, spread = _still(np.stack([frame.orientation for frame in frames]))
     # Repeated values of a short dropout do no harm.
-    if silent := _names(np.mean([frame.held for frame in frames], axis=0) > HELD_LIMIT):
+    if silent := _names(worn & (np.mean([frame.held for frame in frames], axis=0) > HELD_LIMIT)):
         raise CalibrationError(f"nothing new from {silent}")
-    orientation = np.stack([frame.orientation for frame in frames])
-    mean = np.stack([rot.mean_rotation(quats) for quats in orientation.swapaxes(0, 1)])
-    away = np.linalg.norm(
-        rot.quat_to_rotvec(rot.quat_multiply(rot.quat_conjugate(mean), orientation)), axis=-1
-    )
-    spread = np.degrees(np.sqrt(np.mean(away**2, axis=0)))
-    if moved := _names(spread > SPREAD_LIMIT_DEG, spread):
+    if moved := _names(worn & (spread > SPREAD_LIMIT_DEG), spread):
         raise CalibrationError(f"moved: {moved}; hold still")
     found = headings_from_pose(calibration, mean)
-    if (swapped := fit_pose(replace(calibration, north=False), mean).swapped) is not None:
-        raise CalibrationError(swapped)
-    if crooked := _names(found.error_deg > TILT_LIMIT_DEG, found.error_deg):
+    # With a sensor too few, no order of the others can be found.
+    fit = fit_pose(replace(calibration, north=False), mean) if worn.all() else None
+    if fit is not None and fit.swapped is not None:
+        raise CalibrationError(fit.swapped)
+    if crooked := _names(worn & (found.error_deg > TILT_LIMIT_DEG), found.error_deg):
         raise CalibrationError(
             f"tilt differs from the calibration's: {crooked}; "
             "take its pose, or calibrate again if a sensor has slipped"
         )
-    return found
+    offset = np.where(worn, found.offset, calibration.heading_offset)
+    added = _added_from_hold(calibration, frames)
+    errors = np.concatenate([np.where(worn, found.error_deg, np.nan), added.error_deg])
+    return HeadingReset(np.concatenate([offset, added.offset]), errors, added.warnings)
+
+
+def _added_from_hold(calibration: Calibration, frames: list[ImuFrame]) -> HeadingReset:
+    """Reset the headings (A,) of the added sensors; NaN, and a warning, where that is not possible."""
+    frames_added = [frame.added for frame in frames if frame.added is not None]
+    if not frames_added:
+        return HeadingReset(np.zeros(0), np.zeros(0))
+    mean, spread = _still(np.stack([added.orientation for added in frames_added]))
+    found = added_headings_from_pose(calibration, mean)
+    problems = {
+        "nothing new from": np.mean([added.held for added in frames_added], axis=0) > HELD_LIMIT,
+        "moved:": spread > SPREAD_LIMIT_DEG,
+        "tilt differs from the calibration's:": found.error_deg > TILT_LIMIT_DEG,
+    }
+    bad = np.any(list(problems.values()), axis=0)
+    names = calibration.added.names
+    warnings = [
+        f"{problem} {', '.join(compress(names, wrong))}; the others are re-zeroed"
+        for problem, wrong in problems.items()
+        if wrong.any()
+    ]
+    return HeadingReset(
+        np.where(bad, np.nan, found.offset), np.where(bad, np.nan, found.error_deg), warnings, names
+    )
+
+
+def _still(orientation: Array) -> tuple[Array, Array]:
+    """Return mean quaternions (N, 4), and spread (N,) in degrees, of orientations (T, N, 4)."""
+    mean = np.stack([rot.mean_rotation(quats) for quats in orientation.swapaxes(0, 1)])
+    away = np.linalg.norm(
+        rot.quat_to_rotvec(rot.quat_multiply(rot.quat_conjugate(mean), orientation)), axis=-1
+    )
+    return mean, np.degrees(np.sqrt(np.mean(away**2, axis=0)))
 
 
 def _names(wrong: Array | np.ndarray, angle_deg: Array | None = None) -> str:
@@ -177,10 +241,6 @@ def _names(wrong: Array | np.ndarray, angle_deg: Array | None = None) -> str:
         PLACEMENTS[i] if angle_deg is None else f"{PLACEMENTS[i]} {angle_deg[i]:.0f} deg"
         for i in np.flatnonzero(wrong)
     )
-
-
-def _by_sensor(angle_deg: Array) -> str:
-    return ", ".join(f"{name} {angle:.1f}" for name, angle in zip(PLACEMENTS, angle_deg, strict=True))
 
 
 def _wrapped(angle: Array) -> Array:

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from itertools import chain
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from edgepose import rotations as rot
+from edgepose.calibration.added import NO_SENSORS, AddedSensors
 from edgepose.calibration.body_frame import body_from_inertial
 from edgepose.calibration.checks import HoldSummary
 from edgepose.errors import CalibrationError
 from edgepose.imu import GRAVITY
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import PLACEMENTS, SITES
 from edgepose.rotations import Array
+from edgepose.skeleton import JOINTS
+
+_IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def _arms(angle: float) -> Array:
@@ -30,6 +35,23 @@ def _arms(angle: float) -> Array:
 
 POSES: Mapping[str, Array] = {"straight": _arms(-math.pi / 2), "t-pose": _arms(0.0)}
 """R_TB0 (6, 3, 3) of the poses to hold: `straight` is the N-pose, arms hanging, palms to the thighs."""
+
+
+def held_bone(pose: str, name: str) -> Array:
+    """Return R_TB0 (3, 3) of a sensor's bone in a calibration pose: arms are rotated like their forearms."""
+    joint = JOINTS[SITES[name]]
+    arm = joint.endswith(("shoulder", "elbow", "wrist", "hand"))
+    placement = f"{joint.partition('_')[0]}_forearm" if arm else "pelvis"
+    bone: Array = POSES[pose][PLACEMENTS.index(placement)]
+    return bone
+
+
+class CalibratedSensor(NamedTuple):
+    """What a calibration knows of one sensor; see `Calibration`."""
+
+    heading_offset: float
+    bone_from_sensor: Array
+    residual_deg: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +70,8 @@ class Calibration:
         filter: filter that computed the orientations, one of `edgepose.imu.FILTERS`.
         north: whether all headings count from one north; if not, they change whenever a filter restarts.
         height_m: the wearer's height, metres; None if unknown.
+        added: the sensors besides the six.
+        without: those of the six that the rig lacks; their values in the arrays mean nothing.
     """
 
     body_from_inertial: Array
@@ -61,6 +85,31 @@ class Calibration:
     filter: str = "none"
     north: bool = True
     height_m: float | None = None
+    added: AddedSensors = NO_SENSORS
+    without: Sequence[str] = ()
+
+    @property
+    def sensors(self) -> dict[str, CalibratedSensor]:
+        """All sensors of the rig by name, in the order of SENSORS."""
+        added = self.added
+        rows = zip(self.heading_offset, self.bone_from_sensor, self.residual_deg, strict=True)
+        more = zip(added.heading_offset, added.bone_from_sensor, added.residual_deg, strict=True)
+        names = [*PLACEMENTS, *added.names]
+        return {
+            name: CalibratedSensor(float(heading), mount, float(residual))
+            for name, (heading, mount, residual) in zip(names, chain(rows, more), strict=True)
+            if name not in self.without
+        }
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the sensors of the rig, in the order of SENSORS."""
+        return list(self.sensors)
+
+    @cached_property
+    def missing(self) -> NDArray[np.bool_]:
+        """Which of the six sensors the rig lacks, (6,)."""
+        return np.array([name in self.without for name in PLACEMENTS])
 
     @property
     def compares_headings(self) -> bool:
@@ -75,6 +124,13 @@ class Calibration:
         right = rot.transpose(rot.quat_to_matrix(self.bone_from_sensor))
         bones = np.einsum("sab,ijbc,scd->sijad", left, _quadratic_form(), right)
         return bones.reshape(-1, 16, 9), rot.transpose(left), r_ti @ np.array([0.0, 0.0, -GRAVITY])
+
+    @cached_property
+    def _added_maps(self) -> tuple[Array, Array]:
+        """R_TI with the heading of each added sensor, and its inverse R_BS, (A, 3, 3) both."""
+        headings = rot.quat_to_matrix(rot.quat_about_z(self.added.heading_offset))
+        left = rot.quat_to_matrix(self.body_from_inertial) @ headings
+        return left, rot.transpose(rot.quat_to_matrix(self.added.bone_from_sensor))
 
 
 def _quadratic_form() -> Array:
@@ -105,23 +161,30 @@ def calibrate(
         pose: key of POSES that the wearer held.
         body_frame: see `body_from_inertial`.
         created: ISO 8601 time to store.
-        heading_offset: (6,) of a `HeadingReset`, rad; None if all sensors share a north.
+        heading_offset: (N,) of a `HeadingReset`, rad; None if all sensors share a north.
         metadata: JSON values to store.
         filter: filter that computed the orientations, one of `edgepose.imu.FILTERS`.
         north: whether all headings count from one north.
         height_m: the wearer's height, metres, if known.
+
+    Raises:
+        CalibrationError: no such pose, or the body frame needs a sensor that the rig lacks.
     """
     if pose not in POSES:
         raise CalibrationError(f"pose {pose!r} is none of: {', '.join(POSES)}")
-    offset = np.zeros(len(PLACEMENTS)) if heading_offset is None else np.asarray(heading_offset, float)
+    names = list(summary.names)
+    offset = np.zeros(len(names)) if heading_offset is None else np.asarray(heading_offset, float)
     orientation = rot.quat_multiply(rot.quat_about_z(offset), summary.orientation)
-    r_ti = body_from_inertial(orientation, body_frame)
-    r_bs = rot.transpose(POSES[pose]) @ (r_ti @ rot.quat_to_matrix(orientation))
+    r_ti = body_from_inertial(orientation, body_frame, names)
+    held = np.stack([held_bone(pose, name) for name in names])
+    r_bs = rot.matrix_to_quat(rot.transpose(held) @ (r_ti @ rot.quat_to_matrix(orientation)))
+    six = [names.index(name) if name in names else None for name in PLACEMENTS]
+    added = [i for i, name in enumerate(names) if name not in PLACEMENTS]
     return Calibration(
         rot.matrix_to_quat(r_ti),
-        offset,
-        rot.matrix_to_quat(r_bs),
-        summary.spread_deg,
+        np.array([0.0 if i is None else offset[i] for i in six]),
+        np.stack([_IDENTITY if i is None else r_bs[i] for i in six]),
+        np.array([0.0 if i is None else summary.spread_deg[i] for i in six]),
         pose,
         body_frame,
         created,
@@ -129,7 +192,19 @@ def calibrate(
         filter,
         north,
         height_m,
+        AddedSensors([names[i] for i in added], offset[added], r_bs[added], summary.spread_deg[added]),
+        [name for name in PLACEMENTS if name not in names],
     )
+
+
+def added_bones(calibration: Calibration, orientation: Array) -> Array:
+    """Return R_TB (A, 3, 3) of the added sensors from quaternions (A, 4), as measured.
+
+    Bones of sensors whose heading is unknown are NaN.
+    """
+    left, right = calibration._added_maps
+    bones: Array = left @ rot.quat_to_matrix(orientation) @ right
+    return bones
 
 
 def apply_calibration(

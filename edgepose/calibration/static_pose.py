@@ -10,7 +10,7 @@ import numpy as np
 
 from edgepose.errors import CalibrationError
 from edgepose.imu import ImuSample, Recording
-from edgepose.placements import PLACEMENTS, ROOT
+from edgepose.placements import PLACEMENTS, ROOT, SENSORS
 from edgepose.rotations import Array
 
 MIN_SAMPLES = 10
@@ -24,58 +24,67 @@ class SensorHold(NamedTuple):
         quat: (n, 4) w, x, y, z, sensor to inertial; rows of NaN where not measured.
         acc: (n, 3) specific force in the sensor frame, m/s^2; rows of NaN where not measured.
         gyr: (n, 3) angular rate in the sensor frame, rad/s; rows of NaN where not measured.
+        name: one of SENSORS.
     """
 
     time_s: Array
     quat: Array
     acc: Array
     gyr: Array
+    name: str
 
 
 Hold = Sequence[SensorHold]
-"""One `SensorHold` per placement, in the order of PLACEMENTS."""
+"""One `SensorHold` for each sensor of a rig, in the order of SENSORS."""
 
 
-def hold_from_samples(samples: Iterable[ImuSample]) -> Hold:
-    """Sort samples of all sensors, in order of arrival, by placement; see `_oriented`."""
+def hold_from_samples(samples: Iterable[ImuSample], names: Sequence[str] = PLACEMENTS) -> Hold:
+    """Sort samples, in order of arrival, by sensor, for those with these names; see `_oriented`."""
     missing = (math.nan,) * 4
-    rows: list[list[ImuSample]] = [[] for _ in PLACEMENTS]
+    rows: list[list[ImuSample]] = [[] for _ in SENSORS]
     for sample in samples:
         rows[sample.sensor].append(sample)
     return [
         _oriented(
+            name,
             np.array([s.time_s for s in of_sensor], float),
             np.array([s.quat or missing for s in of_sensor], float).reshape(-1, 4),
             np.array([s.acc or missing[:3] for s in of_sensor], float).reshape(-1, 3),
             np.array([s.gyr or missing[:3] for s in of_sensor], float).reshape(-1, 3),
         )
-        for of_sensor in rows
+        for name in names
+        for of_sensor in (rows[SENSORS.index(name)],)
     ]
 
 
-def hold_from_recording(recording: Recording) -> Hold:
-    """Sort all samples of a recording by placement; see `_oriented`."""
+def hold_from_recording(recording: Recording, names: Sequence[str] = PLACEMENTS) -> Hold:
+    """Return the samples of sensors of a recording; see `_oriented`."""
 
     def filled(rows: Array | None, n: int, width: int) -> Array:
         return np.full((n, width), np.nan) if rows is None else rows
 
     return [
-        _oriented(d.time_s, filled(d.quat, n, 4), filled(d.acc, n, 3), filled(d.gyr, n, 3))
-        for d in (recording.sensors[name] for name in PLACEMENTS)
+        _oriented(name, d.time_s, filled(d.quat, n, 4), filled(d.acc, n, 3), filled(d.gyr, n, 3))
+        for name in names
+        for d in (recording.sensors[name],)
         for n in (len(d.time_s),)
     ]
 
 
-def _oriented(time_s: Array, quat: Array, acc: Array, gyr: Array) -> SensorHold:
+def _oriented(name: str, time_s: Array, quat: Array, acc: Array, gyr: Array) -> SensorHold:
     """Keep the rows with an orientation; all if there is none, to tell a raw sensor from a silent one."""
     measured = ~np.isnan(quat).all(axis=-1)
     rows = measured if measured.any() else slice(None)
-    return SensorHold(time_s[rows], quat[rows], acc[rows], gyr[rows])
+    return SensorHold(time_s[rows], quat[rows], acc[rows], gyr[rows], name)
 
 
 def trim(hold: Hold, start_s: float, end_s: float) -> Hold:
     """Return the part of a hold from `start_s` up to but without `end_s`, on the source's clock."""
-    return [SensorHold(*(column[(s.time_s >= start_s) & (s.time_s < end_s)] for column in s)) for s in hold]
+    return [
+        SensorHold(s.time_s[rows], s.quat[rows], s.acc[rows], s.gyr[rows], s.name)
+        for s in hold
+        for rows in ((s.time_s >= start_s) & (s.time_s < end_s),)
+    ]
 
 
 def stillest_start(hold: Hold, seconds: float) -> float:
@@ -90,7 +99,7 @@ def stillest_start(hold: Hold, seconds: float) -> float:
     check_reported(hold)
     first, last = max(s.time_s.min() for s in hold), min(s.time_s.max() for s in hold)
     # Only tenths of a second with samples: the clock may have jumped.
-    starts = first + 0.1 * np.unique(np.floor((hold[ROOT].time_s - first) / 0.1))
+    starts = first + 0.1 * np.unique(np.floor((hold[root_of(sensor_names(hold))].time_s - first) / 0.1))
     starts = starts[(starts >= first) & (starts + seconds <= last + 0.1)]
     spread = np.zeros(len(starts))
     for s in hold:
@@ -106,23 +115,33 @@ def stillest_start(hold: Hold, seconds: float) -> float:
         spread = np.maximum(spread, np.where(count < enough, np.inf, angle))
     if not np.isfinite(spread).any():
         raise CalibrationError(
-            f"no {seconds:g} s in which all six sensors reported: "
+            f"no {seconds:g} s in which {all_of(sensor_names(hold))} sensors reported: "
             f"they overlap for {max(last - first, 0.0):.1f} s from {first:.1f} s"
         )
     return float(starts[np.argmax(spread <= spread.min() + math.radians(0.5))])
 
 
-def sensor_names(hold: Hold) -> Iterable[tuple[str, SensorHold]]:
-    """Pair the sensors with their placements."""
-    return zip(PLACEMENTS, hold, strict=True)
+def sensor_names(hold: Hold) -> list[str]:
+    """Return the names of the sensors of a hold."""
+    return [s.name for s in hold]
+
+
+def root_of(names: Sequence[str]) -> int:
+    """Return the index of the pelvis among the sensors of a rig."""
+    return list(names).index(PLACEMENTS[ROOT])
+
+
+def all_of(names: Sequence[str]) -> str:
+    """Return "all six" or "all N" for the sensors of a rig, for a message."""
+    return "all six" if len(names) == len(PLACEMENTS) else f"all {len(names)}"
 
 
 def check_reported(hold: Hold) -> None:
     """Raise CalibrationError unless every sensor sent orientations."""
-    silent = [name for name, s in sensor_names(hold) if not len(s.quat)]
+    silent = [s.name for s in hold if not len(s.quat)]
     if silent:
         raise CalibrationError(f"nothing from {', '.join(silent)}: check power, link and placement of each")
-    raw = [name for name, s in sensor_names(hold) if np.isnan(s.quat).all()]
+    raw = [s.name for s in hold if np.isnan(s.quat).all()]
     if raw:
         raise CalibrationError(
             f"no orientation from {', '.join(raw)}: set each to send quaternions, "

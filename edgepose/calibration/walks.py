@@ -100,7 +100,8 @@ def _complete(sensor: SensorHold) -> SensorHold:
     order = np.argsort(sensor.time_s, kind="stable")
     order = order[np.isfinite(sensor.acc[order]).all(axis=1)]
     order = order[np.diff(sensor.time_s[order], prepend=-np.inf) > 0.0]
-    return SensorHold(*(column[order] for column in sensor))
+    time_s, quat, acc, gyr, name = sensor
+    return SensorHold(time_s[order], quat[order], acc[order], gyr[order], name)
 
 
 def _stands(sensors: Hold) -> Iterator[tuple[float, float]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from datetime import datetime, timezone
 from typing import Any, NamedTuple
 
@@ -10,10 +11,11 @@ import numpy as np
 
 from edgepose import __version__, calibration
 from edgepose.calibration import Calibration
-from edgepose.cli.calibration_session import CalibrationPlan, Measured, Notify, finds_forward
+from edgepose.cli.calibration_session import CalibrationPlan, Measured, finds_forward
+from edgepose.cli.recorded_holds import Notify
 from edgepose.config import SourceConfig
 from edgepose.orientation.stage import OrientationStage
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import PLACEMENTS, SENSORS
 from edgepose.rotations import Array
 from edgepose.sources.sensor_map import SensorMap
 
@@ -99,22 +101,20 @@ def _metadata(source: SourceConfig, plan: CalibrationPlan, measured: Measured) -
         metadata["from_s"] = measured.from_s
     if measured.devices:
         metadata["devices"] = {
-            PLACEMENTS[index]: device._asdict() for index, device in sorted(measured.devices.items())
+            SENSORS[index]: device._asdict() for index, device in sorted(measured.devices.items())
         }
-    metadata["samples"] = dict(zip(PLACEMENTS, summary.samples, strict=True))
-    metadata["force_m_s2"] = _by_placement(np.linalg.norm(summary.force, axis=-1))
+    metadata["samples"] = dict(zip(summary.names, summary.samples, strict=True))
+    metadata["force_m_s2"] = _by_name(summary.names, np.linalg.norm(summary.force, axis=-1))
     metadata["warnings"] = measured.warnings
     if reset is not None:
         metadata["heading_reset"] = {
             "source": plan.heading_reset,
-            "error_deg": _by_placement(reset.error_deg),
+            "error_deg": _by_name(reset.names, reset.error_deg),
         }
     return metadata
 
 
-def _by_placement(values: Array) -> dict[str, float | None]:
-    """Return the numbers (6,) rounded, by placement; None for NaN."""
-    return {
-        name: None if math.isnan(v) else round(float(v), 3)
-        for name, v in zip(PLACEMENTS, values, strict=True)
-    }
+def _by_name(names: Sequence[str], values: Array) -> dict[str, float | None]:
+    """Return the numbers (N,) rounded, by sensor; None for NaN."""
+    pairs = zip(names, values, strict=True)
+    return {name: None if math.isnan(v) else round(float(v), 3) for name, v in pairs}

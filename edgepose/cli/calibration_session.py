@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import chain
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,23 +22,16 @@ from edgepose.cli.prompts import (
     wait_for_all_sensors,
     wait_for_start,
 )
+from edgepose.cli.recorded_holds import END_S, Notify, extent, hold_in, read_holds
 from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
-from edgepose.formats.recordings.base import iter_samples
-from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import ImuSample
 from edgepose.orientation.stage import OrientationStage
 from edgepose.pipeline.rig_comparison import without_common_heading
+from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 from edgepose.sources import Batch, Device, open_source
-from edgepose.sources.replay import is_recording
 from edgepose.utils.fault_messages import HEADING_RESETS
-
-Notify = Callable[[str], None]
-"""Shows a line to the user."""
-
-END_S = 0.1
-"""Longest time from the last sample of a recording to its end, seconds."""
 
 LISTEN_S = 1.0
 """Time in which most sensors send all that they measure, seconds."""
@@ -58,7 +50,7 @@ def finds_forward(heading_reset: str | None) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrationPlan:
-    """Steps of a calibration; all fields except `mounting` are flags of `edgepose calibrate`.
+    """Steps of a calibration; all fields except the last two are flags of `edgepose calibrate`.
 
     Attributes:
         pose: pose of the hold, or `TWO_POSES`.
@@ -68,7 +60,8 @@ class CalibrationPlan:
         hold_s: length of the hold, seconds.
         start: start of the hold in a recording; None looks for the stillest part.
         countdown_s: time before each live hold, seconds.
-        mounting: how the sensors are worn, in the order of PLACEMENTS, if the heading reset needs it.
+        names: sensors of the rig; recordings may hold further ones.
+        mounting: how the sensors are worn, by name, if the heading reset needs it.
     """
 
     pose: str
@@ -78,7 +71,8 @@ class CalibrationPlan:
     hold_s: float
     start: RecordingTime | None
     countdown_s: float
-    mounting: Sequence[str] = ()
+    names: Sequence[str] = PLACEMENTS
+    mounting: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def first_pose(self) -> str:
@@ -130,20 +124,21 @@ def measure_live(
     Raises:
         EdgeposeError: sensors are missing, the wearer moved, or headings would be arbitrary.
     """
+    names = plan.names
+    _check_six(plan, names)
     reset, damaged = _side_by_side(source, plan, orient, guide)
+    orient.names = names
     with open_source(**source.arguments()) as opened:
-        batches = wait_for_all_sensors((b._replace(samples=orient(b.samples)) for b in opened), guide)
+        batches = wait_for_all_sensors((b._replace(samples=orient(b.samples)) for b in opened), guide, names)
         _check_before_hold(batches, guide, orient, plan, opened.devices)
         if plan.heading_reset == "live":
-            reset = record_hold(
-                batches, "lying", plan.countdown_s, plan.hold_s, guide, calibration.headings_side_by_side
-            )
+            check = calibration.headings_side_by_side
+            reset = record_hold(batches, "lying", plan.countdown_s, plan.hold_s, guide, check, names)
             if guide.phone is None:  # otherwise every hold begins with its start button
                 text = "Put the sensors on. Press Enter when the wearer is ready."
                 wait_for_start(batches, guide, text, plan.first_pose)
-        summary = record_hold(
-            batches, plan.first_pose, plan.countdown_s, plan.hold_s, guide, calibration.check_hold
-        )
+        check_hold, pose = calibration.check_hold, plan.first_pose
+        summary = record_hold(batches, pose, plan.countdown_s, plan.hold_s, guide, check_hold, names)
         _check_north(orient, plan, opened.devices)
         t_pose = None
         if plan.pose == TWO_POSES:
@@ -161,6 +156,7 @@ def measure_live(
                 plan.countdown_s,
                 guide,
                 lambda moving: calibration.headings_from_motion(moving, upright),
+                names,
             )
         elif plan.heading_reset == "steps":
             upright = summary.orientation
@@ -170,7 +166,8 @@ def measure_live(
                 guide,
                 lambda moving: calibration.headings_from_steps(moving, upright),
             )
-    return Measured(summary, reset or _mounted(plan, summary), None, opened.devices, damaged, t_pose)
+    reset = _reset_of(names, reset or _mounted(plan, summary))
+    return Measured(summary, reset, None, opened.devices, damaged, t_pose)
 
 
 def _check_before_hold(
@@ -190,7 +187,7 @@ def _check_before_hold(
         listening = Stage(LISTEN, "...", "Listening to the sensors.", plan.first_pose, LISTEN_S)
         samples += collect(batches, listening, guide)[0]
         try:
-            calibration.check_reported(calibration.hold_from_samples(samples))
+            calibration.check_reported(calibration.hold_from_samples(samples, plan.names))
             _check_north(orient, plan, devices)
             return
         except EdgeposeError:
@@ -207,9 +204,10 @@ def measure_recorded(
         EdgeposeError: they are not in it, the wearer moved, or headings would be arbitrary.
     """
     reset, damaged = _side_by_side(source, plan, orient, notify)
-    everything, damage, devices = _read(source, orient)
+    everything, damage, devices = read_holds(source, orient, plan.names)
+    _check_six(plan, orient.names)
     _check_north(orient, plan, devices)
-    still, start_s = _window(source.name, (everything, damage), plan.start, plan.hold_s, notify)
+    everything, still, start_s = hold_in(source.name, (everything, damage), plan.start, plan.hold_s, notify)
     if plan.start is None:
         notify("If the wearer stood in the pose at another time, give its start with --from.")
     summary = calibration.check_hold(still, "choose a still part with --from, or record again")
@@ -226,8 +224,17 @@ def measure_recorded(
     elif plan.heading_reset == "steps":
         moving = _movements(source.name, everything, plan, start_s)  # with the stand before the steps
         reset = calibration.headings_from_steps(moving, summary.orientation, must_stop=False)
-    reset = reset or _mounted(plan, summary)
+    reset = _reset_of(summary.names, reset or _mounted(plan, summary))
     return Measured(summary, reset, start_s, devices, damaged or damage is not None, t_pose)
+
+
+def _check_six(plan: CalibrationPlan, names: Sequence[str]) -> None:
+    """Raise EdgeposeError if the plan needs a rig of the six sensors, and it has others."""
+    flag = "--heading-reset steps" if plan.heading_reset == "steps" else f"--pose {plan.pose}"
+    if (plan.heading_reset == "steps" or plan.pose == TWO_POSES) and list(names) != list(PLACEMENTS):
+        raise EdgeposeError(
+            f"{flag} works with the six sensors only, and this rig has {len(names)}: use another one"
+        )
 
 
 def _raised(straight: Array, held: Hold) -> HoldSummary:
@@ -251,7 +258,7 @@ def _movements(name: str, everything: Hold, plan: CalibrationPlan, begin_s: floa
     """
     span = begin_s, begin_s + ROUTINE_S
     if plan.motion is not None:
-        first_s, last_s = _extent(everything)
+        first_s, last_s = extent(everything)
         start_s, end_s = (time.on_clock(first_s) for time in plan.motion)
         span = start_s, end_s
         if not first_s - 1e-6 <= start_s < end_s <= last_s + END_S:
@@ -262,7 +269,7 @@ def _movements(name: str, everything: Hold, plan: CalibrationPlan, begin_s: floa
     moving = calibration.trim(everything, *span)
     if not all(len(sensor.time_s) for sensor in moving):
         raise EdgeposeError(
-            f"{name}: not all six sensors report during the movements; give their time with "
+            f"{name}: not all sensors report during the movements; give their time with "
             "--motion FROM:TO, or use another --heading-reset"
         )
     return moving
@@ -283,13 +290,15 @@ def _side_by_side(
         return None, False
     notify(f"Heading reset from {path}.")
     fresh = orient.fresh()
-    everything, damage, _ = _read(dataclasses.replace(source, file=path, port=None, can=None), fresh)
+    # What the lying sensors of a rig are connected to is in their file.
+    lying_source = dataclasses.replace(source, file=path, port=None, can=None)
+    everything, damage, _ = read_holds(lying_source, fresh, plan.names)
     if not fresh.north:
         raise EdgeposeError(
             "without magnetometers the filter starts each recording with arbitrary headings, which another "
             f"recording cannot reset: use {HEADING_RESETS}"
         )
-    lying, _ = _window(str(path), (everything, damage), None, plan.hold_s, notify)
+    _, lying, _ = hold_in(str(path), (everything, damage), None, plan.hold_s, notify)
     return calibration.headings_side_by_side(lying), damage is not None
 
 
@@ -298,9 +307,31 @@ def _mounted(plan: CalibrationPlan, summary: HoldSummary) -> HeadingReset | None
     kind, _, axis = (plan.heading_reset or "").partition(":")
     if kind != "mounting":
         return None
-    if plan.mounting:
-        return calibration.headings_from_mounting(summary.orientation, plan.mounting)
-    return calibration.headings_from_axis(summary.orientation, axis)
+    names = summary.names
+    if not plan.mounting:
+        return calibration.headings_from_axis(summary.orientation, axis, names)
+    if unknown := [name for name in names if name not in plan.mounting]:
+        raise EdgeposeError(
+            f"--sensors has no mounting of {', '.join(unknown)}, which --heading-reset mounting needs"
+        )
+    mounting = [plan.mounting[name] for name in names]
+    return calibration.headings_from_mounting(summary.orientation, mounting, names)
+
+
+def _reset_of(names: Sequence[str], reset: HeadingReset | None) -> HeadingReset | None:
+    """Return the part of a heading reset for some of its sensors.
+
+    Raises:
+        EdgeposeError: it lacks one of them.
+    """
+    if reset is None or list(reset.names) == list(names):
+        return reset
+    if lacking := [name for name in names if name not in reset.names]:
+        raise EdgeposeError(
+            f"the heading reset has no {', '.join(lacking)}: record it with all sensors of the rig"
+        )
+    rows = [list(reset.names).index(name) for name in names]
+    return HeadingReset(reset.offset[rows], reset.error_deg[rows], reset.warnings, names)
 
 
 def _check_north(orient: OrientationStage, plan: CalibrationPlan, devices: Mapping[int, Device]) -> None:
@@ -317,65 +348,3 @@ def _check_north(orient: OrientationStage, plan: CalibrationPlan, devices: Mappi
         raise EdgeposeError(
             f"without a magnetometer in each sensor the filter's headings are arbitrary: add {HEADING_RESETS}"
         )
-
-
-# --- recordings ---------------------------------------------------------------------------------------------
-
-
-def _read(source: SourceConfig, orient: OrientationStage) -> tuple[Hold, str | None, Mapping[int, Device]]:
-    """Return all samples of a recording or a raw capture, its damage, and the devices that sent them."""
-    path = source.file
-    assert path is not None
-    if is_recording(path):
-        recording = read_recording(path, _serial_numbers(source.sensors), salvage=True)
-        everything = (
-            calibration.hold_from_recording(recording)
-            if orient.passes
-            else calibration.hold_from_samples(orient(list(iter_samples(recording))))
-        )
-        return everything, recording.damage, {}
-    with open_source(**dataclasses.replace(source, realtime=False).arguments()) as opened:
-        everything = calibration.hold_from_samples(
-            chain.from_iterable(orient(batch.samples) for batch in opened)
-        )
-        return everything, opened.damage, opened.devices
-
-
-def _serial_numbers(sensors: Path | None) -> Mapping[int, str] | None:
-    """Return placements by serial number from a sensor map."""
-    if sensors is None:
-        return None
-    from edgepose.sources.sensor_map import read_map
-
-    return read_map(sensors).serial_numbers()
-
-
-def _window(
-    name: str,
-    read: tuple[Hold, str | None],
-    at: RecordingTime | None,
-    seconds: float,
-    notify: Notify,
-) -> tuple[Hold, float]:
-    """Return the hold in a recording, and its start on the recording's clock, seconds."""
-    everything, damage = read
-    if damage:
-        notify(f"warning: {damage}")
-    first, last = _extent(everything)
-    start = calibration.stillest_start(everything, seconds) if at is None else at.on_clock(first)
-    if at is not None and not first - 1e-6 <= start <= last - seconds + END_S:
-        raise EdgeposeError(
-            f"{name}: it does not contain {seconds:g} s from {start:g} s on; it lasts from {first:.2f} to "
-            f"{last:.2f} s, choose --from and --hold within that"
-        )
-    why = "" if at is not None else ", the first of the stillest parts"
-    notify(f"{name}: hold from {start:.2f} to {start + seconds:.2f} s{why}.")
-    hold = calibration.trim(everything, start, start + seconds)
-    calibration.check_covered(hold, start, start + seconds)
-    return hold, start
-
-
-def _extent(everything: Hold) -> tuple[float, float]:
-    """Return the times of the first and the last sample of all sensors; 0 if there are none."""
-    times = [sensor.time_s for sensor in everything if len(sensor.time_s)]
-    return min((t.min() for t in times), default=0.0), max((t.max() for t in times), default=0.0)

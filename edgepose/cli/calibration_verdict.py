@@ -13,7 +13,6 @@ import numpy as np
 from edgepose.calibration import Calibration, mounting
 from edgepose.cli.calibration_session import Measured
 from edgepose.config import SourceConfig
-from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 
 DAMAGED = "a part of the recording was left out, see the warnings"
@@ -32,9 +31,10 @@ class Judgement(NamedTuple):
 def judge(result: Calibration, measured: Measured, warnings: Sequence[str]) -> Judgement:
     """Judge a calibration by its residuals, the errors of its headings and the warnings about it."""
     problems = []
-    if swaying := _over(result.residual_deg, GOOD_RESIDUAL_DEG):
+    names = measured.summary.names
+    if swaying := _over(names, measured.summary.spread_deg, GOOD_RESIDUAL_DEG):
         problems.append(f"{swaying} swayed: stand with your back against a wall, and calibrate again")
-    if measured.reset is not None and (loose := _over(measured.reset.error_deg, GOOD_HEADING_DEG)):
+    if measured.reset is not None and (loose := _over(names, measured.reset.error_deg, GOOD_HEADING_DEG)):
         problems.append(f"the heading of {loose} is uncertain: repeat, with movements straight ahead")
     if warnings:
         problems.append("see the warnings" if len(warnings) > 1 else f"warning: {warnings[0]}")
@@ -43,10 +43,9 @@ def judge(result: Calibration, measured: Measured, warnings: Sequence[str]) -> J
     return Judgement("FAIR", f"The calibration can be used, but {'; '.join(problems)}.")
 
 
-def _over(angle_deg: Array, limit_deg: float) -> str:
-    return ", ".join(
-        f"{PLACEMENTS[i]} ({angle_deg[i]:.1f} deg)" for i in np.flatnonzero(angle_deg > limit_deg)
-    )
+def _over(names: Sequence[str], angle_deg: Array, limit_deg: float) -> str:
+    angles = zip(names, angle_deg, strict=True)
+    return ", ".join(f"{name} ({angle:.1f} deg)" for name, angle in angles if angle > limit_deg)
 
 
 def next_command(source: SourceConfig, out: str) -> str:
@@ -65,12 +64,12 @@ def table(result: Calibration, measured: Measured) -> str:
     """Return a row for each sensor, at most 79 columns wide."""
     summary, reset = measured.summary, measured.reset
     lines = ["sensor          samples  residual  m/s^2 heading its error  sits"]
-    for i, (name, sits) in enumerate(zip(PLACEMENTS, mounting(result), strict=True)):
+    for i, (name, sits) in enumerate(mounting(result).items()):
         force = float(np.linalg.norm(summary.force[i]))
         heading = "-" if reset is None else f"{math.degrees(reset.offset[i]):.1f}"
         error = "-" if reset is None else f"{reset.error_deg[i]:.1f}"
         lines.append(
-            f"{name:16}{summary.samples[i]:7d}{result.residual_deg[i]:10.2f}"
+            f"{name:16}{summary.samples[i]:7d}{summary.spread_deg[i]:10.2f}"
             f"{'-' if math.isnan(force) else f'{force:.2f}':>7}{heading:>8}{error:>10}  {sits}"
         )
     return "\n".join(lines)
@@ -82,7 +81,7 @@ def values(
     """Return a calibration for scripts; docs/reference/scripts.md describes the keys."""
     summary, reset = measured.summary, measured.reset
     judgement = judge(result, measured, warnings)
-    nothing = np.full(len(PLACEMENTS), math.nan)
+    nothing = np.full(len(summary.names), math.nan)
     return {
         "source": source.name,
         "out": out,
@@ -96,13 +95,13 @@ def values(
             {
                 "placement": name,
                 "samples": summary.samples[i],
-                "residual_deg": result.residual_deg[i],
+                "residual_deg": summary.spread_deg[i],
                 "force_m_s2": np.linalg.norm(summary.force[i]),
                 "heading_deg": math.nan if reset is None else math.degrees(reset.offset[i]),
                 "heading_error_deg": (nothing if reset is None else reset.error_deg)[i],
                 "mounting": mounted,
             }
-            for i, (name, mounted) in enumerate(zip(PLACEMENTS, mounting(result), strict=True))
+            for i, (name, mounted) in enumerate(mounting(result).items())
         ],
     }
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from edgepose import calibration
@@ -11,14 +11,14 @@ from edgepose.cli.guide.guide import Guide, start_stage
 from edgepose.cli.guide.stage import COUNTDOWN, HOLD, MOVE, Stage
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import PLACEMENTS, SENSORS
 from edgepose.sources import Batch
 
 REPEATS = 3
 """Number of retries of a live hold with movement in it, or of movements that are too weak."""
 
 ALL_REPORT_S = 10.0
-"""Longest wait for the first samples of all six sensors of a live source, seconds."""
+"""Longest wait for the first samples of all sensors of a live source, seconds."""
 
 MOVE_COUNTDOWN_S = 3.0
 """Longest time before each movement, seconds."""
@@ -26,7 +26,7 @@ MOVE_COUNTDOWN_S = 3.0
 _INSTRUCTIONS = {
     "straight": "Stand straight: feet parallel, arms hanging, palms on the thighs, looking ahead.",
     "t-pose": "Stand in a T-pose: feet parallel, arms out to the sides, palms down, looking ahead.",
-    "lying": "Lay all six sensors side by side, same face up, same edge forward, and let go of them.",
+    "lying": "Lay {all_of_them} sensors side by side, same face up, same edge forward, and let go of them.",
 }
 
 _STEPS = "Take two or three steps straight ahead, stop with arms hanging, and stand still"
@@ -37,25 +37,29 @@ _MOVES = {
     "right_forearm": ("RIGHT", "forearm"),
     "left_lower_leg": ("LEFT", "heel"),
     "right_lower_leg": ("RIGHT", "heel"),
+    "left_upper_arm": ("LEFT", "forearm"),
+    "right_upper_arm": ("RIGHT", "forearm"),
+    "left_upper_leg": ("LEFT", "heel"),
+    "right_upper_leg": ("RIGHT", "heel"),
 }
 """Word and picture of each movement, by the first sensor that it moves."""
 
 
-def wait_for_all_sensors(batches: Iterator[Batch], guide: Guide) -> Iterator[Batch]:
-    """Wait until all six sensors have reported, and return the remaining batches.
+def wait_for_all_sensors(batches: Iterator[Batch], guide: Guide, names: Sequence[str]) -> Iterator[Batch]:
+    """Wait until all sensors of a rig have reported, and return the remaining batches.
 
     Raises:
         EdgeposeError: a sensor is still missing after `ALL_REPORT_S`.
     """
     passed_s, prompted_s = 0.0, 0
     start_s: float | None = None
-    missing = set(range(len(PLACEMENTS)))
+    missing = {SENSORS.index(name) for name in names}
     for now_s, samples, *_ in batches:
         start_s = now_s if start_s is None else start_s
         passed_s = now_s - start_s
         missing -= {sample.sensor for sample in samples}
         if not missing:
-            guide("All six sensors report.")
+            guide(f"{calibration.all_of(names).capitalize()} sensors report.")
             return batches
         if int(passed_s) > prompted_s:
             prompted_s = int(passed_s)
@@ -68,7 +72,7 @@ def wait_for_all_sensors(batches: Iterator[Batch], guide: Guide) -> Iterator[Bat
 
 
 def _names(sensors: set[int]) -> str:
-    return ", ".join(PLACEMENTS[i] for i in sorted(sensors))
+    return ", ".join(SENSORS[i] for i in sorted(sensors))
 
 
 def record_hold(
@@ -78,6 +82,7 @@ def record_hold(
     hold_s: float,
     guide: Guide,
     check: Callable[[Hold], Any],
+    names: Sequence[str] = PLACEMENTS,
     at_once: bool = False,
 ) -> Any:
     """Record a live hold, and return what `check` returns for it.
@@ -89,13 +94,14 @@ def record_hold(
         hold_s: length of the hold, seconds.
         guide: shows the wearer what to do.
         check: evaluates the hold; if it raises HoldError, the hold is repeated.
+        names: sensors of the rig.
         at_once: do not wait for the phone's start button: the wearer must not move away.
 
     Raises:
         HoldError: there was movement, or a silent sensor, in every repetition.
         EdgeposeError: the source ended too early.
     """
-    text = _INSTRUCTIONS[pose]
+    text = _INSTRUCTIONS[pose].format(all_of_them=calibration.all_of(names))
     if guide.phone is not None and not at_once:
         wait_for_start(batches, guide, f"Press start; {countdown_s:g} s later the hold begins. {text}", pose)
     guide.instruct(text)
@@ -106,7 +112,7 @@ def record_hold(
             collect(batches, countdown, guide)
         samples, start_s = collect(batches, hold, guide)
         try:
-            held = calibration.hold_from_samples(samples)
+            held = calibration.hold_from_samples(samples, names)
             calibration.check_covered(held, start_s, start_s + hold_s)
             return check(held)
         except HoldError as error:
@@ -137,15 +143,20 @@ def collect(batches: Iterator[Batch], stage: Stage, guide: Guide) -> tuple[list[
 
 
 def record_motion(
-    batches: Iterator[Batch], countdown_s: float, guide: Guide, check: Callable[[Hold], Any]
+    batches: Iterator[Batch],
+    countdown_s: float,
+    guide: Guide,
+    check: Callable[[Hold], Any],
+    names: Sequence[str] = PLACEMENTS,
 ) -> Any:
-    """Record the movements of `calibration.ROUTINE`, and return what `check` returns for them.
+    """Record the movements of `calibration.routine`, and return what `check` returns for them.
 
     Args:
         batches: samples of the live source.
         countdown_s: time before the hold, seconds; that before each movement is `MOVE_COUNTDOWN_S` at most.
         guide: shows the wearer what to do.
         check: evaluates the movements; if it raises WeakMotionError, they are repeated.
+        names: sensors of the rig.
 
     Raises:
         WeakMotionError: every repetition was too weak.
@@ -155,14 +166,14 @@ def record_motion(
     wait_s = min(countdown_s, MOVE_COUNTDOWN_S)
 
     def movements() -> Iterator[ImuSample]:
-        for exercise in calibration.ROUTINE:
+        for exercise in calibration.routine(names):
             word, figure = _MOVES[exercise.sensors[0]]
             text = exercise.text
             if wait_s:
                 collect(batches, Stage(COUNTDOWN, "", text, figure, wait_s), guide)
             yield from collect(batches, Stage(MOVE, word, text, figure, calibration.EXERCISE_S), guide)[0]
 
-    return _until_clear(movements, guide, check)
+    return _until_clear(movements, guide, check, names)
 
 
 def record_steps(
@@ -189,16 +200,19 @@ def record_steps(
         for stage in (stand, walk):
             yield from collect(batches, stage, guide)[0]
 
-    return _until_clear(steps, guide, check)
+    return _until_clear(steps, guide, check, PLACEMENTS)
 
 
 def _until_clear(
-    record: Callable[[], Iterator[ImuSample]], guide: Guide, check: Callable[[Hold], Any]
+    record: Callable[[], Iterator[ImuSample]],
+    guide: Guide,
+    check: Callable[[Hold], Any],
+    names: Sequence[str],
 ) -> Any:
     """Record movements until `check` accepts them, and return what it returns for them."""
     for left in range(REPEATS, -1, -1):
         try:
-            return check(calibration.hold_from_samples(record()))
+            return check(calibration.hold_from_samples(record(), names))
         except WeakMotionError as error:
             if not left:
                 raise

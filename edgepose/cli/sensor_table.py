@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
+from edgepose.calibration.static_pose import all_of
 from edgepose.cli.terminal.live_page import is_coloured
 from edgepose.cli.terminal.messages import LEAST_COLUMNS, pieces, printable
 
@@ -126,8 +127,9 @@ def _grouped_advice(state: State) -> list[str]:
             pattern = _NUMBER.sub("#", finding.advice)
             groups.setdefault(pattern, []).append((sensor.placement, finding.advice))
     lines = []
+    everyone = f"{all_of([sensor.placement for sensor, _ in state.sensors])} sensors"
     for group in groups.values():
-        names = ", ".join(name for name, _ in group) if len(group) < len(state.sensors) else "all six sensors"
+        names = ", ".join(name for name, _ in group) if len(group) < len(state.sensors) else everyone
         words = _NUMBER.split(group[0][1])
         columns = zip(*(_NUMBER.findall(advice) for _, advice in group), strict=True)
         numbers = [*map(_span, columns), ""]

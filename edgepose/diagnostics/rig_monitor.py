@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from edgepose.diagnostics.rules import MAKE_POSES_WRONG, diagnose
 from edgepose.diagnostics.sensor_health import SensorHealthMonitor
 from edgepose.imu import ImuSample
+from edgepose.placements import PLACEMENTS
 
 WATCHED_S = 60.0
 """Length of the watch, seconds: its cost is small, but there is little left to see after that."""
@@ -18,15 +19,17 @@ _EVERY_S = 2.0
 class RigMonitor:
     """Checks samples like `edgepose check`, and reports each fault once, in the same words."""
 
-    def __init__(self, phase: float = 0.0) -> None:
+    def __init__(self, names: Sequence[str] = PLACEMENTS, phase: float = 0.0) -> None:
         """Start the watch with the first samples.
 
         Args:
+            names: sensors of the rig.
             phase: from 0 to 1, makes several rigs of one process take turns: a judgement takes as long as a
                 frame lasts.
         """
+        self._names = names
         self._first_s = _EVERY_S * (1.0 + phase)
-        self._health: SensorHealthMonitor | None = SensorHealthMonitor()
+        self._health: SensorHealthMonitor | None = SensorHealthMonitor(names=names)
         self._start_s = self._next_s = math.nan
         self._now_s = math.nan
         self._reported: set[tuple[str, str]] = set()
@@ -60,6 +63,8 @@ class RigMonitor:
         for sensor in self._health.report(self._now_s):
             finding = diagnose(sensor)
             key = (sensor.placement, finding.name)
+            if sensor.placement not in self._names:
+                continue
             if finding.name in MAKE_POSES_WRONG and key not in self._reported:
                 self._reported.add(key)
                 lines.append(f"warning: {sensor.placement}: {finding.advice}")

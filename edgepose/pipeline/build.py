@@ -17,13 +17,14 @@ from edgepose.config import WearerConfig
 from edgepose.diagnostics.rig_monitor import RigMonitor
 from edgepose.errors import FileFormatError, prefix_errors
 from edgepose.orientation.stage import OrientationStage
+from edgepose.pipeline.added_sensors import AddedSensors
 from edgepose.pipeline.calibrated_settings import age_days, check_settings, with_calibrated_settings
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.network import Network
 from edgepose.pipeline.place_stage import PlaceStage
 from edgepose.pipeline.pose_resampler import PoseResampler
 from edgepose.pipeline.remote_control import Request, Requests
-from edgepose.pipeline.rig_comparison import changes, missing_heading_reset, missing_quantities
+from edgepose.pipeline.rig_comparison import changes, missing_heading_reset, missing_quantities, unlike_six
 from edgepose.pipeline.run_report import RunReport, about, latency
 from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
 from edgepose.sinks.open import open_outputs
@@ -75,11 +76,17 @@ class OpenWearer:
         with prefix_errors(config.name):
             sensors = config.source.sensors
             self._sensor_map = None if sensors is None else read_map(sensors)
+            without = calibration.without
             self.source = stack.enter_context(
-                open_source(**config.source.arguments(), blocking=blocking, wanted=self._next_ready_s)
+                open_source(
+                    **config.source.arguments(),
+                    blocking=blocking,
+                    wanted=self._next_ready_s,
+                    without=without,
+                )
             )
             self._requests = Requests(stack, config.control, by_key)
-            self._orient = OrientationStage(calibration.filter, magnetometer=calibration.north)
+            self._orient = OrientationStage(calibration.filter, calibration.north, calibration.names)
         self._sinks: list[Sink] = []
 
     def open_outputs(self, stack: ExitStack, network: Network, stopped: Callable[[], bool]) -> None:
@@ -138,8 +145,12 @@ class OpenWearer:
         )
         place = None
         if not self._config.no_place:
-            place = PlaceStage(outputs.body, partial(self._requests.poll, "origin"), self.notify)
-        self._clock = FrameSynchronizer(rate, grid=several and source.file is None)
+            poll = partial(self._requests.poll, "origin")
+            place = PlaceStage(outputs.body, poll, self.notify, self._calibration.without)
+        added, without = self._calibration.added.names, self._calibration.without
+        self._clock = FrameSynchronizer(
+            rate, grid=several and source.file is None, added=added, without=without
+        )
         return WearerPipeline(
             self._clock,
             headings,
@@ -148,11 +159,13 @@ class OpenWearer:
             self.notify if source.live else lambda text: None,
             on_pose,
             MisfitDetector(self._calibration, self._differences),
-            RigMonitor(phase),
+            RigMonitor(self._calibration.names, phase),
             self.notify,
             future / rate if source.live else None,
             place,
             None if outputs.rate is None else PoseResampler(outputs.rate, rate),
+            AddedSensors(added) if added else None,
+            without,
         )
 
     def _next_ready_s(self) -> float:
@@ -212,6 +225,8 @@ def load_wearer(config: WearerConfig, notify: Notify) -> tuple[WearerConfig, Cal
         )
     for line in lines:
         _with_name(config.name, notify)(f"warning: {line}")
+    if (rig := unlike_six(calibration)) is not None:
+        _with_name(config.name, notify)(rig)
     if config.source.live and (days := age_days(calibration)) >= 1:
         _with_name(config.name, notify)(
             f"the calibration is {days} day{'s' if days > 1 else ''} old: calibrate again if a sensor was "

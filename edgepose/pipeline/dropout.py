@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from edgepose.calibration import POSES
 from edgepose.placements import PLACEMENTS, ROOT
 from edgepose.rotations import rotation_about_axis, yaw_of_matrix
 
@@ -50,6 +51,21 @@ def extrapolate_dropouts(
     orientation[legs] = rotation_about_axis("y", pelvis_heading_change) @ before[legs]
     acceleration[others] = acceleration[ROOT]
     return orientation, acceleration
+
+
+def assumed_bones(orientation: Array, missing: NDArray[np.bool_]) -> Array:
+    """Return the orientations (6, 3, 3) before a run with a rig that lacks sensors.
+
+    The segments without a sensor are those of a wearer who stands straight, in the heading of the pelvis.
+    From then on they are extrapolated like those of silent sensors.
+
+    Args:
+        orientation: (6, 3, 3) R_TB of the first frame.
+        missing: (6,) which sensors the rig lacks; the pelvis is not among them.
+    """
+    result = orientation.copy()
+    result[missing] = rotation_about_axis("y", yaw_of_matrix(orientation[ROOT])) @ POSES["straight"][missing]
+    return result
 
 
 def _heading_changes(before: Array, now: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import inf
 
 from edgepose.imu import ImuFrame
@@ -21,21 +22,34 @@ class DropoutMonitor:
         any_held: whether a sensor was held in the last frame.
     """
 
-    def __init__(self) -> None:
-        """Start with all sensors live."""
-        self._since_s: list[float | None] = [None] * len(PLACEMENTS)
-        self._reported_s = [-inf] * len(PLACEMENTS)
-        self._is_reported = [False] * len(PLACEMENTS)
+    def __init__(self, added: Sequence[str] = (), without: Sequence[str] = ()) -> None:
+        """Start with all sensors live.
+
+        Args:
+            added: sensors besides the six.
+            without: those of the six that the rig lacks, which are not reported.
+        """
+        self._names = [*PLACEMENTS, *added]
+        self._without = without
+        self._since_s: list[float | None] = [None] * len(self._names)
+        self._reported_s = [-inf] * len(self._names)
+        self._is_reported = [False] * len(self._names)
         self.any_held = False
+        self._was_held = False
 
     def update(self, frame: ImuFrame) -> list[str]:
         """Return one message per sensor that dropped out or came back."""
         lines: list[str] = []
-        now_held = frame.held.tolist()
-        before, self.any_held = self.any_held, True in now_held
-        if not before and not self.any_held:
+        states = frame.held.tolist()
+        self.any_held = True in states
+        if frame.added is not None:
+            states += frame.added.held.tolist()
+        before, self._was_held = self._was_held, True in states
+        if not before and not self._was_held:
             return lines
-        for i, (name, held) in enumerate(zip(PLACEMENTS, now_held, strict=True)):
+        for i, (name, held) in enumerate(zip(self._names, states, strict=True)):
+            if name in self._without:
+                continue
             since_s = self._since_s[i]
             if not held:
                 if self._is_reported[i] and since_s is not None:
@@ -49,8 +63,9 @@ class DropoutMonitor:
                 and frame.time_s - self._reported_s[i] >= QUIET_S
             ):
                 self._is_reported[i], self._reported_s[i] = True, frame.time_s
+                replaced = "its last values are repeated" if i < len(PLACEMENTS) else "its bone is predicted"
                 lines.append(
-                    f"{name}: no data for {frame.time_s - since_s:.0f} s; its last values are repeated: "
+                    f"{name}: no data for {frame.time_s - since_s:.0f} s; {replaced}: "
                     "check its power and connection"
                 )
         return lines

@@ -1,4 +1,4 @@
-"""Resampling of six sensors, each at its own rate, to frames at one fixed rate.
+"""Resampling of a rig's sensors, each at its own rate, to frames at one fixed rate.
 
 Frames depend only on the samples' own times, so a recording yields the same frames whether it is read at once
 or bit by bit. Plain floats are used on purpose: at six sensors of 100 Hz and more, numpy on four numbers at a
@@ -8,18 +8,18 @@ time costs ten times as much.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from math import asin, ceil, inf, sin, sqrt
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from edgepose.errors import EdgeposeError
-from edgepose.imu import GAP_S, ImuFrame, ImuSample, Quaternion, Vector3
-from edgepose.placements import PLACEMENTS
+from edgepose.imu import GAP_S, AddedFrame, ImuFrame, ImuSample, Quaternion, Vector3
+from edgepose.placements import PLACEMENTS, SENSORS
 
 START_TIMEOUT_S = 3.0
-"""Longest time until each of the six sensors has sent a sample, seconds."""
+"""Longest time until each of the six sensors, as far as the rig has them, has sent a sample, seconds."""
 
 STALE_S = 0.5
 """Longest silence of a sensor that is still waited for, seconds."""
@@ -28,6 +28,7 @@ _HOLD_PERIODS = 2.5  # age of a sensor's last sample, in its periods, at which t
 _WAIT_PERIODS, _WAIT_S = 1.5, 0.010  # see `_Sensor.wait_s`
 _PERIOD_RANGE_S = (0.001, 0.2)
 _PERIOD_MEMORY = 20  # samples
+_IDENTITY, _NO_FORCE = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 
 Interpolation = Literal["slerp", "hold"]
 
@@ -95,16 +96,25 @@ class FrameSynchronizer:
     silent for half a second is not waited for. If a sensor had nothing new for two and a half of its periods
     (and at least a frame), its last values are repeated and the frame marks it as `held`.
 
+    Frames do not wait for the first sample of an added sensor, which is held until then; after that, it
+    counts like the others.
+
     On a grid, t0 is rounded up to a multiple of `1 / rate`, so that the clocks of several wearers tick at
     once.
 
     Attributes:
         dropped: samples ignored because they came after their frame, or were duplicates.
         restarts: restarts of the ticks, after all sensors were silent for over a minute; frame numbers go on.
+        unused: why samples of sensors that are not needed are left out, by name.
     """
 
     def __init__(
-        self, rate: float = 60.0, interpolation: Interpolation = "slerp", grid: bool = False
+        self,
+        rate: float = 60.0,
+        interpolation: Interpolation = "slerp",
+        grid: bool = False,
+        added: Sequence[str] = (),
+        without: Sequence[str] = (),
     ) -> None:
         """Create the synchroniser.
 
@@ -113,13 +123,20 @@ class FrameSynchronizer:
             interpolation: orientation at a tick: "slerp" between the samples before and after it, or "hold"
                 for the last one.
             grid: place ticks at multiples of `1 / rate` on the source's clock.
+            added: sensors of the rig besides the six.
+            without: those of the six that the rig lacks; they are held in all frames.
         """
         self.dropped = 0
         self.restarts = 0
+        self.unused: dict[str, str] = {}
         self._rate = rate
         self._slerp = interpolation == "slerp"
         self._grid = grid
         self._sensors = [_Sensor() for _ in PLACEMENTS]
+        self._missing = [name in without for name in PLACEMENTS]
+        self._added = {SENSORS.index(name): _Sensor() for name in added}
+        worn = [s for s, missing in zip(self._sensors, self._missing, strict=True) if not missing]
+        self._awaited = [*worn, *self._added.values()]
         self._index = 0
         self._t0: float | None = None
         self._tick = 0  # k of the next tick since t0
@@ -143,7 +160,9 @@ class FrameSynchronizer:
             self._first_arrival_s = arrival_s
         for sample in samples:
             if self._after_gap or self._is_after_gap(sample):
-                self._after_gap.append((sample, arrival_s))
+                # Only the six restart the ticks.
+                if self._after_gap or sample.sensor < len(PLACEMENTS):
+                    self._after_gap.append((sample, arrival_s))
             else:
                 self._take(sample, arrival_s)
 
@@ -152,6 +171,9 @@ class FrameSynchronizer:
 
     def _take(self, sample: ImuSample, arrival_s: float) -> None:
         sensor, time_s, quat, acc, _, _ = sample
+        if sensor >= len(PLACEMENTS) or self._missing[sensor]:
+            self._take_added(sample, arrival_s)
+            return
         if quat is None:
             raise EdgeposeError(
                 f"{PLACEMENTS[sensor]}: the device sends no orientation; set it to send quaternions, "
@@ -173,6 +195,17 @@ class FrameSynchronizer:
             self.dropped += 1
         elif time_s > self._newest_s:
             self._newest_s = time_s
+
+    def _take_added(self, sample: ImuSample, arrival_s: float) -> None:
+        sensor = self._added.get(sample.sensor)
+        if sensor is None or sample.quat is None:
+            unknown = "the calibration does not have them; calibrate again to use them"
+            raw = "they have no orientation; let them send quaternions, or calibrate with --filter kalman"
+            self.unused.setdefault(SENSORS[sample.sensor], unknown if sensor is None else raw)
+        elif sample.time_s <= self._last_tick_s or not sensor.add(
+            _Entry(sample.time_s, sample.quat, _NO_FORCE, arrival_s)
+        ):
+            self.dropped += 1
 
     def frames(self, now_s: float) -> list[ImuFrame]:
         """Return the frames that are ready.
@@ -220,17 +253,20 @@ class FrameSynchronizer:
     def _start(self, now_s: float) -> bool:
         if self._first_arrival_s is None:
             return False
-        missing = [
-            name for name, sensor in zip(PLACEMENTS, self._sensors, strict=True) if sensor.newest_s == -inf
+        worn = [
+            (name, sensor)
+            for name, sensor, missing in zip(PLACEMENTS, self._sensors, self._missing, strict=True)
+            if not missing
         ]
-        if missing:
+        silent = [name for name, sensor in worn if sensor.newest_s == -inf]
+        if silent:
             if now_s - self._first_arrival_s > START_TIMEOUT_S or self._after_gap:
                 span = "up to the end" if now_s == inf else f"in the first {START_TIMEOUT_S:g} s"
                 raise EdgeposeError(
-                    f"no samples of {', '.join(missing)} {span}; switch these sensors on and check their ids"
+                    f"no samples of {', '.join(silent)} {span}; switch these sensors on and check their ids"
                 )
             return False
-        self._t0 = self._first_tick(max(sensor.pending[0].time_s for sensor in self._sensors))
+        self._t0 = self._first_tick(max(sensor.pending[0].time_s for _, sensor in worn))
         return True
 
     def _first_tick(self, time_s: float) -> float:
@@ -252,7 +288,7 @@ class FrameSynchronizer:
             tick_s = self._t0 + self._tick / self._rate
             if tick_s > end_s:
                 break
-            for sensor in self._sensors:
+            for sensor in self._awaited:
                 if sensor.newest_s >= tick_s:
                     continue
                 if now_s - sensor.newest_s <= STALE_S:
@@ -271,7 +307,12 @@ class FrameSynchronizer:
         start_s = self._t0 + (self._tick - 1) / self._rate
         orientation, force, held = [], [], []
         ready_s = -inf
-        for sensor in self._sensors:
+        for sensor, is_missing in zip(self._sensors, self._missing, strict=True):
+            if is_missing:
+                orientation.append(_IDENTITY)
+                force.append(_NO_FORCE)
+                held.append(True)
+                continue
             pending = sensor.pending
             before = sensor.last
             inside = []
@@ -306,7 +347,27 @@ class FrameSynchronizer:
             np.array(force),
             np.array(held),
             ready_s if ready_s > -inf else min(now_s, tick_s),
+            self._added_frame(tick_s) if self._added else None,
         )
+
+    def _added_frame(self, tick_s: float) -> AddedFrame:
+        orientation, held = [], []
+        for sensor in self._added.values():
+            pending = sensor.pending
+            while pending and pending[0].time_s <= tick_s:
+                sensor.take()
+            last = sensor.last
+            quat, is_held = _IDENTITY, True
+            if last is not None:
+                quat, age_s = last.quat, tick_s - last.time_s
+                is_held = age_s > max(_HOLD_PERIODS * sensor.period_s, 1.0 / self._rate)
+                if not is_held and self._slerp and age_s > 0.0 and pending:
+                    following = pending[0]
+                    if following.time_s - tick_s <= sensor.wait_s:
+                        quat = _slerp(quat, following.quat, age_s / (following.time_s - last.time_s))
+            orientation.append(quat)
+            held.append(is_held)
+        return AddedFrame(np.array(orientation), np.array(held))
 
 
 def _mean_force(entries: list[_Entry], start_s: float, end_s: float) -> Vector3:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import inf
 
 from edgepose.inference.engine import EngineOutput
@@ -26,6 +26,7 @@ class PlaceStage:
         body: Body,
         requests: Callable[[], list[float]] = list,
         notify: Callable[[str], None] = lambda text: None,
+        without: Sequence[str] = (),
     ) -> None:
         """Put the wearer above the origin.
 
@@ -33,9 +34,11 @@ class PlaceStage:
             body: the wearer's body.
             requests: called at each pose; returns the delay in seconds of each newly requested reset.
             notify: called with a message after each reset.
+            without: sensors that the rig lacks.
         """
         self._tracker = PlaceTracker(body)
         self._requests, self._notify = requests, notify
+        self._lower_body = LOWER_BODY.difference(without)
         self._reset_at_s = inf
         self._place: Place | None = None
         self._way = Way()
@@ -48,7 +51,7 @@ class PlaceStage:
     def add_to(self, pose: PoseFrame, output: EngineOutput) -> PoseFrame:
         """Return a pose with translation and contacts, given the network's output for it."""
         self._reset_if_due(pose.time_s)
-        if self._place is None or not pose.held >= LOWER_BODY:
+        if self._place is None or not pose.held >= self._lower_body:
             self._place = self._tracker.update(pose.time_s, pose.rotations, output.place)
             self._way.add(self._place.translation)
         return pose._replace(translation=self._place.translation, contacts=self._place.contacts)

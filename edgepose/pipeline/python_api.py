@@ -11,6 +11,7 @@ from edgepose.calibration.rezero import HeadingRezero
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.orientation.stage import OrientationStage
+from edgepose.pipeline.added_sensors import AddedSensors
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.place_stage import PlaceStage
 from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
@@ -93,13 +94,16 @@ class Pipeline:
         """
         buffer, engine = _PoseBuffer(), self._model.engine()
         calibration = self._calibration
-        orient = OrientationStage(calibration.filter, magnetometer=calibration.north)
+        added = calibration.added.names
+        orient = OrientationStage(calibration.filter, calibration.north, calibration.names)
         pipeline = WearerPipeline(
-            FrameSynchronizer(self._model.rate_hz),
+            FrameSynchronizer(self._model.rate_hz, added=added, without=calibration.without),
             HeadingRezero(calibration),
             [buffer],
             orient,
-            place=PlaceStage(self._body) if self._follow else None,
+            place=PlaceStage(self._body, without=calibration.without) if self._follow else None,
+            added=AddedSensors(added) if added else None,
+            without=calibration.without,
         )
         self.summary = pipeline.summary
         failure: EdgeposeError | None = None

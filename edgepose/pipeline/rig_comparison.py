@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from edgepose.calibration import Calibration, mounting_warnings
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import SENSORS
 from edgepose.sources import Device
 from edgepose.sources.sensor_map import SensorMap
 from edgepose.utils.fault_messages import no_common_heading
@@ -25,9 +25,33 @@ def changes(
     """
     lines = other_devices(calibration, devices)
     if sensor_map is not None:
+        lines += _other_sensors(calibration, sensor_map)
         stated = {name: device.mounting for name, device in sensor_map.devices.items()}
         lines += mounting_warnings(calibration, stated, str(sensor_map.path))
     return lines
+
+
+def _other_sensors(calibration: Calibration, sensor_map: SensorMap) -> list[str]:
+    """Return a warning if a map has other sensors than a calibration."""
+    lacking = [name for name in calibration.sensors if name not in sensor_map.devices]
+    further = [name for name in sensor_map.devices if name not in calibration.sensors]
+    parts = [f"it has {', '.join(lacking)} besides"] if lacking else []
+    parts += [f"it lacks {', '.join(further)}"] if further else []
+    if not parts:
+        return []
+    return [
+        f"the calibration has other sensors than {sensor_map.path}, {' and '.join(parts)}: calibrate again"
+    ]
+
+
+def unlike_six(calibration: Calibration) -> str | None:
+    """Return a line on the sensors that a rig has besides the six, or lacks; None if it has just these."""
+    parts = []
+    if calibration.added.names:
+        parts.append(f"{', '.join(calibration.added.names)} measured besides the six")
+    if calibration.without:
+        parts.append(f"{', '.join(calibration.without)} not measured: poses are less accurate")
+    return f"sensors  {len(calibration.sensors)}; {'; '.join(parts)}" if parts else None
 
 
 def missing_quantities(
@@ -62,7 +86,7 @@ def other_devices(calibration: Calibration, devices: Mapping[int, Device]) -> li
     """
     before = _devices_of(calibration)
     different = [
-        f"{PLACEMENTS[placement]} was {then} and is {now}"
+        f"{SENSORS[placement]} was {then} and is {now}"
         for placement, now in sorted(devices.items())
         if (then := before.get(placement)) is not None and _differs(then, now)
     ]
@@ -108,7 +132,7 @@ def _devices_of(calibration: Calibration) -> dict[int, Device]:
         return {}
     return {
         placement: device
-        for placement, name in enumerate(PLACEMENTS)
+        for placement, name in enumerate(SENSORS)
         if (device := _device_from_entry(entries.get(name))) is not None
     }
 

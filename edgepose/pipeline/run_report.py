@@ -107,10 +107,8 @@ class RunReport:
                 "after all sensors were silent for a minute or more"
             )
         if summary.held:
-            worst = sorted(zip(summary.held_by_sensor, PLACEMENTS, strict=True), reverse=True)
-            lines.append(
-                "held     " + ", ".join(f"{name} in {count} frames" for count, name in worst if count)
-            )
+            worst = summary.held_by_sensor.most_common()
+            lines.append("held     " + ", ".join(f"{name} in {count} frames" for name, count in worst))
         for slip in summary.slips:
             lines.append(f"slipped  {slip.placement} by about {slip.angle_deg:.0f} deg")
         if summary.way_m is not None:
@@ -138,7 +136,7 @@ class RunReport:
             "seconds": summary.seconds,
             "warming_up": summary.warming_up,
             "held": summary.held,
-            "held_by_sensor": dict(zip(PLACEMENTS, summary.held_by_sensor, strict=True)),
+            "held_by_sensor": dict.fromkeys(PLACEMENTS, 0) | summary.held_by_sensor,
             "packets": self.packets._asdict(),
             "late": self.late,
             "skipped": self.skipped,

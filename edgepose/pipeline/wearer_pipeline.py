@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from array import array
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import compress
 
@@ -14,12 +15,14 @@ from numpy.typing import NDArray
 from edgepose.calibration import apply_calibration
 from edgepose.calibration.misfit import MisfitDetector
 from edgepose.calibration.rezero import HeadingRezero
+from edgepose.calibration.sensor_to_segment import added_bones
 from edgepose.calibration.slip import Slip
 from edgepose.diagnostics.rig_monitor import RigMonitor
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuFrame, ImuSample
 from edgepose.inference.engine import EngineInput, EngineOutput, check_finite
-from edgepose.pipeline.dropout import extrapolate_dropouts
+from edgepose.pipeline.added_sensors import AddedSensors
+from edgepose.pipeline.dropout import assumed_bones, extrapolate_dropouts
 from edgepose.pipeline.dropout_monitor import DropoutMonitor
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.place_stage import PlaceStage
@@ -43,7 +46,7 @@ class RunSummary:
         poses: poses written.
         warming_up: poses written before the network's window was full.
         held: poses written in which a sensor's last values were repeated.
-        held_by_sensor: frames in which each sensor was held, in the order of PLACEMENTS.
+        held_by_sensor: frames in which each sensor was held, by name.
         backlog_s: time that the newest batch had waited before it was read, seconds.
         seconds: wall time from the first samples to the end.
         latency_s: time from the arrival of the newest packet here until the newest pose was sent, seconds.
@@ -56,7 +59,7 @@ class RunSummary:
     poses: int = 0
     warming_up: int = 0
     held: int = 0
-    held_by_sensor: list[int] = field(default_factory=lambda: [0] * len(PLACEMENTS))
+    held_by_sensor: Counter[str] = field(default_factory=Counter)
     backlog_s: float = 0.0
     seconds: float = 0.0
     latency_s: float = 0.0
@@ -75,15 +78,19 @@ class RunSummary:
         self.poses += 1
 
 
-def pose_frame(output: EngineOutput) -> PoseFrame:
+def pose_frame(output: EngineOutput, without: Sequence[str] = ()) -> PoseFrame:
     """Return the pose of a frame from the network's output, without translation and contacts.
+
+    Args:
+        output: of the network.
+        without: sensors that the rig lacks, which do not count as held.
 
     Raises:
         ModelError: the network has computed NaN or infinity.
     """
     check_finite(output)
     frame: ImuFrame = output.frame
-    held = frozenset(compress(PLACEMENTS, frame.held.tolist()))
+    held = frozenset(compress(PLACEMENTS, frame.held.tolist())).difference(without)
     return PoseFrame(frame.index, frame.time_s, output.rotations, output.std, None, held, output.warming_up)
 
 
@@ -110,6 +117,8 @@ class WearerPipeline:
         look_ahead_s: float | None = None,
         place: PlaceStage | None = None,
         resampler: PoseResampler | None = None,
+        added: AddedSensors | None = None,
+        without: Sequence[str] = (),
     ) -> None:
         """Join the stages.
 
@@ -128,6 +137,8 @@ class WearerPipeline:
                 own pace; see `PoseWriter`.
             place: follows the wearer through the room; None leaves the poses without translation.
             resampler: changes the rate of the poses that are written; None keeps that of the frames.
+            added: measured bones besides those of the six sensors, if the rig has them.
+            without: those of the six sensors that the rig lacks.
         """
         self.summary, self.clock = RunSummary(), clock
         self.arrived = self._started = time.perf_counter()
@@ -137,7 +148,9 @@ class WearerPipeline:
             self.summary.slips = misfits.slips
         self._sinks = SinkGroup(sinks, warn)
         self._writer, self._place = PoseWriter(self._sinks, look_ahead_s, warn, resampler), place
-        self._dropouts = DropoutMonitor()
+        self._added, self._without = added, without
+        self._dropouts = DropoutMonitor([] if added is None else added.names, without)
+        self._reported_unused = 0
         self._source_s = 0.0  # time on the source's clock at 0 of the clock of `arrived`
         self._bones: NDArray[np.float64] | None = None  # those of the previous frame
 
@@ -149,6 +162,7 @@ class WearerPipeline:
         self._source_s = arrival_s - self.arrived
         if batch.samples:
             self.clock.push(self._orient(batch.samples), arrival_s)
+            self._report_unused()
         yield from self._engine_inputs(self.clock.frames(batch.now_s))
         # Poses do not wait for this: every two seconds it takes as long as several of them.
         if self._rig is not None:
@@ -173,7 +187,9 @@ class WearerPipeline:
         for output in outputs:
             frame: ImuFrame = output.frame
             age_s = time.perf_counter() + self._source_s - frame.time_s
-            pose = pose_frame(output)
+            pose = pose_frame(output, self._without)
+            if self._added is not None and frame.added is not None:
+                pose = self._added.correct(pose, frame.added)
             if self._place is not None:
                 pose = self._place.add_to(pose, output)
                 summary.way_m = self._place.way_m
@@ -181,8 +197,7 @@ class WearerPipeline:
             summary.warming_up += output.warming_up
             if pose.held:
                 summary.held += 1
-                for i in np.flatnonzero(frame.held):
-                    summary.held_by_sensor[i] += 1
+                summary.held_by_sensor.update(pose.held)
             summary.sent(time.perf_counter() - arrived)
             self._on_pose(summary)
 
@@ -202,6 +217,17 @@ class WearerPipeline:
         if self.summary.error is None or self.summary.error in self._sinks.errors:
             self.summary.error = self._sinks.error
 
+    def _report_unused(self) -> None:
+        unused = self.clock.unused
+        if len(unused) == self._reported_unused:
+            return
+        reasons: dict[str, list[str]] = {}
+        for name in list(unused)[self._reported_unused :]:
+            reasons.setdefault(unused[name], []).append(name)
+        self._reported_unused = len(unused)
+        for reason, names in reasons.items():
+            self._warn(f"warning: samples of {', '.join(names)} are left out: {reason}")
+
     def _engine_inputs(self, frames: list[ImuFrame]) -> Iterator[EngineInput]:
         for frame in frames:
             for line in self._dropouts.update(frame):
@@ -212,7 +238,12 @@ class WearerPipeline:
                 if self._misfits is not None:
                     for line in self._misfits.update(frame, bones):
                         self._warn(line)
+                if self._bones is None and self._without:
+                    self._bones = assumed_bones(bones, calibration.missing)
                 if self._dropouts.any_held:
                     bones, acceleration = extrapolate_dropouts(bones, acceleration, frame.held, self._bones)
                 self._bones = bones
+                if frame.added is not None:
+                    measured = added_bones(calibration, frame.added.orientation)
+                    frame = frame._replace(added=frame.added._replace(bones=measured))
                 yield EngineInput(frame, bones.astype(np.float32), acceleration.astype(np.float32))

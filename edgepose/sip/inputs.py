@@ -9,7 +9,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.base import iter_samples, recording_from_samples
 from edgepose.formats.recordings.registry import read_sensors
 from edgepose.imu import Recording
-from edgepose.placements import PLACEMENTS, SITES
+from edgepose.placements import SITES
 from edgepose.sip.measurements import SensorMount, mounts, mounts_from_hold
 from edgepose.sources.replay import is_recording
 from edgepose.sources.whole_file import read_file
@@ -30,11 +30,11 @@ def read(path: Path, calibration: Calibration) -> Recording:
         raise EdgeposeError(f"{path}: the recording has no samples")
     if calibration.filter == "none":
         return recording
-    others = [name for name in recording.sensors if name not in PLACEMENTS]
+    others = [name for name in recording.sensors if name not in calibration.sensors]
     if others:
         raise EdgeposeError(
-            f"{path}: the calibration was made with --filter {calibration.filter}, which takes only the six "
-            f"placements, but the recording has {', '.join(others)}; use orientations that the sensors send"
+            f"{path}: the calibration was made with --filter {calibration.filter}, without "
+            f"{', '.join(others)}: calibrate again with all sensors, or use orientations that they send"
         )
     from edgepose.orientation import OrientationEstimator
 
@@ -50,7 +50,7 @@ def mounted(
 ) -> dict[str, SensorMount]:
     """Return the mounting of each sensor of a recording, by name.
 
-    The calibration knows the six placements. Mountings of other sensors come from the calibration's pose,
+    Mountings of sensors that the calibration does not know come from its pose,
     which the wearer holds in this recording: at `hold_from_s` on its clock, or, if the calibration was made
     from this very file, at the time of its hold.
 

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose import rotations as rot
-from edgepose.calibration import GRAVITY, POSES, Calibration
+from edgepose.calibration import GRAVITY, Calibration
 from edgepose.calibration.checks import GAP_LIMIT_S
+from edgepose.calibration.sensor_to_segment import held_bone
 from edgepose.errors import EdgeposeError
 from edgepose.imu import GAP_S, Recording, SensorData
-from edgepose.placements import PLACEMENTS, SITES
-from edgepose.skeleton import JOINTS
+from edgepose.placements import SITES
 
 Array = NDArray[np.float64]
 
@@ -69,11 +69,15 @@ class SensorMount(NamedTuple):
 
 
 def mounts(calibration: Calibration) -> dict[str, SensorMount]:
-    """Return the mounts of the six sensors that a calibration knows, by placement."""
+    """Return the mounts of the sensors that a calibration knows, by name."""
     r_ti = rot.quat_to_matrix(calibration.body_from_inertial)
-    left = r_ti @ rot.quat_to_matrix(rot.quat_about_z(calibration.heading_offset))
-    right = rot.quat_to_matrix(calibration.bone_from_sensor)
-    return {name: SensorMount(left[i], right[i]) for i, name in enumerate(PLACEMENTS)}
+    return {
+        name: SensorMount(
+            r_ti @ rot.quat_to_matrix(rot.quat_about_z(sensor.heading_offset)),
+            rot.quat_to_matrix(sensor.bone_from_sensor),
+        )
+        for name, sensor in calibration.sensors.items()
+    }
 
 
 def mounts_from_hold(
@@ -106,17 +110,8 @@ def mounts_from_hold(
                 "pose"
             )
         r_is = rot.quat_to_matrix(rot.mean_rotation(inside))
-        found[name] = SensorMount(r_ti, rot.transpose(_held_bone(calibration.pose, name)) @ r_ti @ r_is)
+        found[name] = SensorMount(r_ti, rot.transpose(held_bone(calibration.pose, name)) @ r_ti @ r_is)
     return found
-
-
-def _held_bone(pose: str, name: str) -> Array:
-    """Return R_TB0 (3, 3) of any bone in a calibration pose: arms are rotated like their forearms."""
-    joint = JOINTS[SITES[name]]
-    side = joint.partition("_")[0]
-    arm = joint.endswith(("shoulder", "elbow", "wrist", "hand"))
-    placement = f"{side}_forearm" if arm else "pelvis"
-    return POSES[pose][PLACEMENTS.index(placement)]
 
 
 def measure(recording: Recording, mounted: dict[str, SensorMount], rate: float) -> Measurements:

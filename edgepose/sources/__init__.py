@@ -135,6 +135,7 @@ def open_source(
     listen: str | None = None,
     connect: str | None = None,
     wanted: Callable[[], float] | None = None,
+    without: Sequence[str] = (),
 ) -> Source:
     """Return the source that the options describe; nothing is opened before it is entered.
 
@@ -159,6 +160,7 @@ def open_source(
         wanted: returns the time on the source's clock before which a caller has no use for more samples of
             live lines, seconds: those that come until then are delivered together. By default a thread reads
             each line, and all samples are delivered as they come.
+        without: sensors that the rig lacks and that recordings need not hold.
 
     Raises:
         EdgeposeError: no input or more than one; an unknown protocol or kind of file; an invalid map.
@@ -172,7 +174,7 @@ def open_source(
     if file is not None:
         from edgepose.sources.replay import open_file
 
-        return open_file(Path(file), realtime, protocol, sensor_map, lenient, blocking)
+        return open_file(Path(file), realtime, protocol, sensor_map, lenient, blocking, without)
     from edgepose.sources.line_config import line_specs
     from edgepose.sources.live import LiveSource
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 
 from edgepose.errors import DeviceError
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import SENSORS
 from edgepose.sources.line_reader import LineReader
 from edgepose.utils import fault_messages as messages
 
@@ -72,12 +72,12 @@ def warn_about_clock_resets(line: LineReader) -> None:
         before = line.clock_resets.get(placement, 0)
         if clock.resets - before >= messages.JUMPS_OF_TWO and not line.duplicate_ids:
             line.duplicate_ids = True
-            _log.warning("%s: %s: %s", line.spec.name, PLACEMENTS[placement], messages.two_devices())
+            _log.warning("%s: %s: %s", line.spec.name, SENSORS[placement], messages.two_devices())
         elif clock.resets > before:
             _log.warning(
                 "%s: %s: %s: calibrate again",
                 line.spec.name,
-                PLACEMENTS[placement],
+                SENSORS[placement],
                 messages.clock_restarted(),
             )
         line.clock_resets[placement] = clock.resets

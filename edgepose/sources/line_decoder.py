@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import SENSORS
 from edgepose.sources import Device, SourceCounters
 from edgepose.sources.protocol_detection import Chunk, Detector, decode, refused_by
 from firmware_protocols.base import Decoder, DeviceInfo, Protocol
@@ -25,7 +25,7 @@ MOST_UNKNOWN = 16
 """Number of ids without a placement that are named: a sender can make up any number of them."""
 
 PlacementById = Mapping[int | None, int]
-"""Index into PLACEMENTS by device id on the line; the key None is the only device, whatever its id."""
+"""Index into SENSORS by device id on the line; the key None is the only device, whatever its id."""
 
 Clock = Callable[[int, int | None, float], float]
 """Time of a measurement, seconds, from placement index, device time in us and arrival in seconds."""
@@ -213,7 +213,7 @@ class LineDecoder:
         other = self._placement_owner.setdefault(placement, self.name)
         if other != self.name:
             raise EdgeposeError(
-                f"{other} and {self.name} both have a sensor for {PLACEMENTS[placement]}, id {sensor}; "
+                f"{other} and {self.name} both have a sensor for {SENSORS[placement]}, id {sensor}; "
                 "give each sensor its own id, or assign sensors to placements with --sensors"
             )
         self._known[sensor] = placement

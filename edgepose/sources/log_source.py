@@ -13,7 +13,7 @@ from typing import Protocol
 from edgepose.errors import EdgeposeError
 from edgepose.formats.ledger import Ledger
 from edgepose.imu import ImuSample
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import SENSORS
 from edgepose.sources import Batch, Batches, Device, SourceCounters, sum_counters
 from edgepose.sources.clock_sync import DeviceClock
 from edgepose.sources.line_decoder import LineDecoder
@@ -151,7 +151,7 @@ class LogSource:
             raise EdgeposeError(f"{self._path}: {self._problem()}")
         for placement, times in sorted(self._clocks.restarts.items()):
             fault = two_devices() if times >= JUMPS_OF_TWO else clock_restarted(times)
-            _log.warning("%s: %s: %s", self._path, PLACEMENTS[placement], fault)
+            _log.warning("%s: %s: %s", self._path, SENSORS[placement], fault)
 
     def _samples(self) -> Iterator[ImuSample]:
         steady = _SteadyTime()

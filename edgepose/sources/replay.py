@@ -65,18 +65,20 @@ class RecordingSource:
         lenient: bool = False,
         blocking: bool = True,
         ids: Mapping[int, str] | None = None,
+        without: Sequence[str] = (),
     ) -> None:
         """Store the settings; `__enter__` reads the file.
 
         Args:
             path: the file, or the folder of a session.
             realtime: deliver it at its own pace.
-            lenient: accept any sensors; otherwise all six are needed.
+            lenient: accept any sensors; otherwise all six are needed, but for those of `without`.
             blocking: see `open_source`.
             ids: placements by serial number, see `read_recording`.
+            without: sensors that the rig lacks.
         """
         self._path = path
-        self._read = salvage_recording if lenient else partial(read_recording, salvage=True)
+        self._read = salvage_recording if lenient else partial(read_recording, salvage=True, without=without)
         self._realtime, self._blocking, self._ids = realtime, blocking, ids
         self._recording: Recording | None = None
         self._packets = 0
@@ -136,6 +138,7 @@ def open_file(
     sensor_map: SensorMap | None,
     lenient: bool = False,
     blocking: bool = True,
+    without: Sequence[str] = (),
 ) -> Source:
     """Return the source for a file; the arguments are those of `edgepose.sources.open_source`.
 
@@ -146,7 +149,7 @@ def open_file(
         if protocol != "auto":
             protocol_named(protocol)  # raises for an unknown name, although a recording needs no protocol
         ids = None if sensor_map is None else sensor_map.serial_numbers()
-        return RecordingSource(path, realtime, lenient, blocking, ids)
+        return RecordingSource(path, realtime, lenient, blocking, ids, without)
     clocks = LogClocks()
     named = None if protocol == "auto" else protocol_named(protocol)
     if is_can_log(path) and (named is None or named.transport == "can"):

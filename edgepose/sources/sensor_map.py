@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from edgepose.errors import ConfigError
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import PLACEMENTS, ROOT, SENSORS
 from edgepose.sources.line_decoder import PlacementById
 from edgepose.utils.similar_names import choices
 from edgepose.utils.text_files import read_toml
@@ -74,13 +74,18 @@ class SensorMap(NamedTuple):
 
     Attributes:
         path: the file, for messages.
-        devices: devices by placement, in the order of PLACEMENTS.
+        devices: devices by sensor, in the order of SENSORS.
         ports: settings by port or bus.
     """
 
     path: str
     devices: Mapping[str, Device]
     ports: Mapping[str, PortSettings]
+
+    @property
+    def without(self) -> list[str]:
+        """Those of the six sensors that the rig lacks."""
+        return [name for name in PLACEMENTS if name not in self.devices]
 
     def lines(self, key: str) -> list[str]:
         """Return the lines of a kind that the devices name, each once: "port", "can", "listen", "connect"."""
@@ -94,8 +99,8 @@ class SensorMap(NamedTuple):
     def places(self, line: str, sender: str | None = None) -> PlacementById:
         """Return the placements by id on one line, for the datagrams of one sender if it is a socket."""
         return {
-            device.id: i
-            for i, device in enumerate(self.devices.values())
+            device.id: SENSORS.index(name)
+            for name, device in self.devices.items()
             if device.line in (None, line, channel(line)) and device.sender in (None, sender)
         }
 
@@ -114,7 +119,7 @@ class SensorMap(NamedTuple):
         Raises:
             ConfigError: two devices differ only in their lines.
         """
-        result = {device.id: i for i, device in enumerate(self.devices.values())}
+        result = {device.id: SENSORS.index(name) for name, device in self.devices.items()}
         if len(result) < len(self.devices):
             raise ConfigError(
                 f"{self.path}: it distinguishes sensors by port or address, but a capture holds only one "
@@ -167,14 +172,13 @@ def read_map(path: Path) -> SensorMap:
     tables = content.pop("ports", {})
     if not isinstance(tables, dict):
         raise ConfigError(f'{path}: ports must be tables, such as  [ports."/dev/ttyUSB0"]')
-    unknown = [name for name in content if name not in PLACEMENTS]
+    unknown = [name for name in content if name not in SENSORS]
     if unknown:
-        hint = choices(unknown[0], [*PLACEMENTS, "ports"], "placements are")
+        hint = choices(unknown[0], [*SENSORS, "ports"], "placements are")
         raise ConfigError(f"{path}: unknown placement {unknown[0]!r}; {hint}")
-    missing = [name for name in PLACEMENTS if name not in content]
-    if missing:
-        raise ConfigError(f"{path}: no entry for {', '.join(missing)}; all six sensors need one")
-    devices = {name: _device(f"{path}: {name}", content[name]) for name in PLACEMENTS}
+    if PLACEMENTS[ROOT] not in content:
+        raise ConfigError(f"{path}: no entry for {PLACEMENTS[ROOT]}, without which no rig works")
+    devices = {name: _device(f"{path}: {name}", content[name]) for name in SENSORS if name in content}
     for (other, before), (name, device) in combinations(devices.items(), 2):
         if _same(device, before):
             raise ConfigError(

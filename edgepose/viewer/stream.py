@@ -7,6 +7,7 @@ import re
 import socket
 import time
 from collections import deque
+from collections.abc import Sequence
 from statistics import median
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
-from edgepose.pose import PoseFrame, held_sensors, longest_holds
+from edgepose.pose import PoseFrame, held_sensors, known_sensors, longest_holds
 from edgepose.sinks.udp import decode
 
 WINDOW_S = 5.0
@@ -87,11 +88,12 @@ class UdpPoseStream:
             return f"waiting for poses{long}{bad}"
         span = min(WINDOW_S, max(1.0, now - self._recent[0].arrival_s)) if self._recent else WINDOW_S
         rate = len(self._recent) / span
-        held = held_sensors([recent.held for recent in self._recent])
+        names = known_sensors([recent.held for recent in self._recent])
+        held = held_sensors([recent.held for recent in self._recent], names)
         counts = [f"{rate:.0f} poses/s", f"{self.poses} poses", f"{self.lost} lost"]
         counts += [f"{self.bad} bad"] if self.bad else []
         counts += self._latency()
-        return f"{', '.join(counts)}\n\n**{self._state(now)}**\n\n{sensor_table(held, rate or 60.0)}"
+        return f"{', '.join(counts)}\n\n**{self._state(now)}**\n\n{sensor_table(held, rate or 60.0, names)}"
 
     def _state(self, now: float) -> str:
         """Return the status of the newest pose, and whether anything comes and moves."""
@@ -115,13 +117,13 @@ def plain(status: str) -> str:
     return re.sub(r"[^A-Za-z0-9_ ;]", "?", status[:200])
 
 
-def sensor_table(held: NDArray[np.bool_], rate: float) -> str:
-    """Format a Markdown table of the sensors in the last poses: held (N, 6), oldest first.
+def sensor_table(held: NDArray[np.bool_], rate: float, names: Sequence[str] = PLACEMENTS) -> str:
+    """Format a Markdown table of the sensors with these names in the last poses: held (T, N), oldest first.
 
     A held sensor has sent nothing new for a pose, so the table shows rates up to that of the poses.
     """
     lines = ["| sensor | new/s | longest gap | now |", "|---|--:|--:|---|"]
-    for name, column, longest in zip(PLACEMENTS, held.T, longest_holds(held), strict=True):
+    for name, column, longest in zip(names, held.T, longest_holds(held), strict=True):
         new = rate * float((~column).mean()) if len(column) else 0.0
         gap = longest / rate
         now = "held" if len(column) and column[-1] else "ok"

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
-from edgepose.pose import CONTACTS, PoseSequence, held_sensors
+from edgepose.pose import CONTACTS, PoseSequence, held_sensors, known_sensors
 from edgepose.skeleton import JOINTS, Body, forward_kinematics
 from edgepose.utils.sockets import check_page
 from edgepose.viewer.body_mesh import RADII, build, ground, radius
@@ -192,7 +192,8 @@ class Viewer:
             figure = SkeletonView(self._server, "reference", self._body, REFERENCE, 0.5)
             path = FloorPath(self._server, "reference/path", _rgb(REFERENCE["trunk"]))
             second = _Track(figure, path, reference, self._body)
-        held = held_sensors(poses.held)
+        names = known_sensors(poses.held)
+        held = held_sensors(poses.held, names)
         window = max(1, round(WINDOW_S * poses.rate))
         shown = -1
         while not stopped():
@@ -207,7 +208,7 @@ class Viewer:
             if now - self._updated_s >= TABLE_S:
                 self._updated_s = now
                 line.update_slider()
-                table = sensor_table(held[max(0, i + 1 - window) : i + 1], poses.rate)
+                table = sensor_table(held[max(0, i + 1 - window) : i + 1], poses.rate, names)
                 error = "" if compared is None else f"{compared.text(i)}\n\n"
                 text.content = (
                     f"pose {i + 1} of {len(times)}, {poses.rate:g} poses/s\n\n"

@@ -7,6 +7,7 @@ import numpy as np
 from edgepose import calibration as cal
 from edgepose import rotations as rot
 from edgepose.calibration import SensorHold
+from edgepose.placements import PLACEMENTS
 
 RATE = 60.0
 WALK_S, STEPS = 3.0, 4
@@ -57,5 +58,5 @@ def walker(
             force[:, 1] += drift * ((share > 0.5) & (share < 1.0))
         acc = rot.quat_rotate(rot.quat_conjugate(quat), force)
         turned = rot.quat_multiply(rot.quat_about_z(HEADINGS[i]), quat)
-        sensors.append(SensorHold(t, turned, acc, np.full_like(acc, np.nan)))
+        sensors.append(SensorHold(t, turned, acc, np.full_like(acc, np.nan), PLACEMENTS[i]))
     return sensors

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,12 @@ from edgepose.cli.options.inputs import recordings_or_source
 from edgepose.cli.options.json_result import json_option, show_json
 from edgepose.cli.options.outputs import address, check_files, overwrite_option
 from edgepose.cli.options.recording_time import RecordingTime, RecordingTimeType
-from edgepose.cli.options.source import filter_options, source_options
+from edgepose.cli.options.source import (
+    filter_options,
+    lacking_sensors,
+    source_options,
+    without_option,
+)
 from edgepose.cli.terminal import messages as terminal
 from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
@@ -37,7 +42,7 @@ from edgepose.orientation.stage import OrientationStage
 from edgepose.placements import PLACEMENTS
 from edgepose.sinks.output_files import check_output
 from edgepose.skeleton import MAX_HEIGHT, MIN_HEIGHT
-from edgepose.sources.sensor_map import read_map
+from edgepose.sources.sensor_map import SensorMap, read_map
 
 PAGE_PORT = 8090
 """Port of the page without an address."""
@@ -94,7 +99,7 @@ _PLAN_FLAGS = [
         "--heading-reset",
         callback=_heading_reset,
         metavar="FILE|live|motion|steps|mounting[:AXIS]",
-        help="Align the headings of sensors without a common north. FILE: by a recording of all six "
+        help="Align the headings of sensors without a common north. FILE: by a recording of all "
         "lying side by side in one orientation. live: the same, with the sensors themselves. motion: by "
         "movements after the hold. steps: by some steps straight ahead after the hold. mounting: by the "
         "mountings in the sensor map. mounting:AXIS: by this axis of every sensor, which faces forward in "
@@ -143,6 +148,7 @@ def _plan_options(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.command()
 @recordings_or_source
 @source_options
+@without_option
 @filter_options
 @click.option(
     "--out",
@@ -179,6 +185,7 @@ def _plan_options(command: Callable[..., Any]) -> Callable[..., Any]:
 def calibrate(
     inputs: tuple[Path, ...],
     source: SourceConfig,
+    without: tuple[str, ...],
     filter: str,
     no_mag: bool,
     out: str,
@@ -189,7 +196,7 @@ def calibrate(
     jobs: int,
     as_json: bool,
 ) -> None:
-    """Find out how the six sensors sit on their wearer.
+    """Find out how the sensors sit on their wearer.
 
     The wearer holds a pose for a few seconds, live (--port, --can, --listen, --connect) or in a recording
     (--file). The calibration contains the direction that the wearer faces and the orientation of each sensor
@@ -215,11 +222,11 @@ def calibrate(
         check_files([("--out", out)], files)
         _check_writable(out, overwrite)
     sensor_map = None if source.sensors is None else read_map(source.sensors)
-    mountings = (
-        {} if sensor_map is None else {name: device.mounting for name, device in sensor_map.devices.items()}
-    )
+    plan = dataclasses.replace(plan, names=_names(sensor_map, without))
+    if lacking := lacking_sensors(plan.names):
+        terminal.say(lacking)
     if plan.heading_reset == "mounting":
-        plan = dataclasses.replace(plan, mounting=_all_mountings(mountings))
+        plan = dataclasses.replace(plan, mounting=_all_mountings(sensor_map))
     job = CalibrationJob(source, plan, filter, not no_mag, height_m, sensor_map)
     if inputs:
         from edgepose.cli.calibrate_recordings import calibrate_recordings
@@ -314,14 +321,21 @@ def _check_use(source: SourceConfig, plan: CalibrationPlan, page: tuple[str, int
         )
 
 
-def _all_mountings(mountings: Mapping[str, str | None]) -> list[str]:
-    """Return the mounting of each sensor.
+def _names(sensor_map: SensorMap | None, without: Sequence[str]) -> list[str]:
+    """Return the sensors of the rig: those of the map, or the six, but for those that it is without."""
+    stated = PLACEMENTS if sensor_map is None else sensor_map.devices
+    return [name for name in stated if name not in without]
+
+
+def _all_mountings(sensor_map: SensorMap | None) -> dict[str, str]:
+    """Return the mounting of each sensor, by name.
 
     Raises:
         EdgeposeError: the sensor map does not have all of them.
     """
-    known = [text for text in mountings.values() if text is not None]
-    if len(known) < len(PLACEMENTS):
+    devices = {} if sensor_map is None else sensor_map.devices
+    known = {name: device.mounting for name, device in devices.items() if device.mounting is not None}
+    if not known or len(known) < len(devices):
         raise EdgeposeError(
             "--heading-reset mounting needs --sensors MAP.toml with a mounting for each sensor, "
             "or the axis with which all of them face forward, such as mounting:z"

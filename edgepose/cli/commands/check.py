@@ -16,16 +16,18 @@ import click
 from edgepose.cli.exit_codes import ATTENTION, DONE, FAILED
 from edgepose.cli.options.calibrated_run import CalibratedRun, calibration_options
 from edgepose.cli.options.json_result import json_option, show_json
-from edgepose.cli.options.source import source_options
+from edgepose.cli.options.source import lacking_sensors, source_options, without_option
 from edgepose.cli.sensor_table import State, page_lines, table_lines
 from edgepose.cli.terminal.live_page import Page, is_terminal
 from edgepose.cli.terminal.messages import say, warnings_to
 from edgepose.cli.terminal.stop_signal import StopSignal
 from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
+from edgepose.placements import PLACEMENTS
 from edgepose.utils.machine_lag import MachineLag
 
 if TYPE_CHECKING:
+    from edgepose.calibration import Calibration
     from edgepose.diagnostics.sensor_health import SensorHealthMonitor
     from edgepose.sources import Source
 
@@ -40,6 +42,7 @@ DEFAULT_S = 10.0
 
 @click.command()
 @source_options
+@without_option
 @click.option(
     "--seconds",
     type=click.FloatRange(0, min_open=True),
@@ -52,6 +55,7 @@ DEFAULT_S = 10.0
 def check(
     ctx: click.Context,
     source: SourceConfig,
+    without: tuple[str, ...],
     seconds: float | None,
     calibrated: CalibratedRun | None,
     as_json: bool,
@@ -63,7 +67,7 @@ def check(
     The sensors may lie on a table or be worn. Hold them still for some seconds: gravity, noise and bias only
     show at rest. Then turn each one to and fro: gyroscope and orientation can only be compared in motion.
 
-    The exit code is 0 if all six sensors are fine, and 3 if one of them is not, or if the rig has changed
+    The exit code is 0 if all sensors are fine, and 3 if one of them is not, or if the rig has changed
     since the calibration. It is 1 if sensors or file could not be read to the end.
 
     \b
@@ -78,7 +82,8 @@ def check(
     from edgepose.sources import open_source
 
     warnings: list[str] = []
-    health = SensorHealthMonitor(None if calibrated is None else calibrated.calibration)
+    calibration = None if calibrated is None else calibrated.calibration
+    health = SensorHealthMonitor(calibration, _names(source, calibration, without))
     with ExitStack() as stack:
         page = stack.enter_context(Page()) if is_terminal() and source.live and not as_json else None
         stack.enter_context(warnings_to(warnings.append, hidden=page is not None))
@@ -107,6 +112,19 @@ def check(
         warnings.append(opened.damage)
     _show(source.name, state, warnings, error, as_json)
     ctx.exit(ATTENTION if state.problems or changed else FAILED if opened.damage else DONE)
+
+
+def _names(source: SourceConfig, calibration: Calibration | None, without: tuple[str, ...]) -> list[str]:
+    """Return the sensors of the rig, of its map, calibration, or the six; say which of the six it lacks."""
+    from edgepose.sources.sensor_map import read_map
+
+    stated = list(PLACEMENTS) if calibration is None else calibration.names
+    if source.sensors is not None:
+        stated = list(read_map(source.sensors).devices)
+    names = [name for name in stated if name not in without]
+    if lacking := lacking_sensors(names):
+        say(lacking)
+    return names
 
 
 def _show(name: str, state: State, warnings: list[str], error: EdgeposeError | None, as_json: bool) -> None:

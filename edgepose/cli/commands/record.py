@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from datetime import datetime, timezone
 from math import inf
@@ -18,7 +18,7 @@ from edgepose.cli.terminal.messages import end_status, has_terminal, say, status
 from edgepose.cli.terminal.stop_signal import StopSignal
 from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import PLACEMENTS, SENSORS
 
 if TYPE_CHECKING:
     from edgepose.record import RecordSummary
@@ -68,15 +68,16 @@ def record(source: SourceConfig, out: str, seconds: float | None, overwrite: boo
         opened = stack.enter_context(open_source(**source.arguments()))
         stop = stack.enter_context(StopSignal())
         output = recorder.open_output(out, _metadata(source, opened.metadata), overwrite)
-        say(f"recording to {out}; Ctrl-C ends it. Sample counts are in the order {', '.join(PLACEMENTS)}")
+        names = _names(source)
+        say(f"recording to {out}; Ctrl-C ends it. Sample counts are in the order {', '.join(names)}")
         summary = recorder.record(
             opened,
             output,
             inf if seconds is None else seconds,
-            _progress(opened),
+            _progress(opened, names),
             stopped=lambda: stop.asked,
         )
-    _report(out, summary, opened)
+    _report(out, summary, opened, names)
     if summary.error:
         raise summary.error
     if opened.damage:
@@ -92,7 +93,14 @@ def _metadata(source: SourceConfig, of_file: Mapping[str, str]) -> dict[str, str
     return {**about, "started": datetime.now(timezone.utc).isoformat(timespec="seconds"), **written}
 
 
-def _progress(source: Source) -> Callable[[RecordSummary], None]:
+def _names(source: SourceConfig) -> list[str]:
+    """Return the sensors that are expected: those of the map, or the six."""
+    from edgepose.sources.sensor_map import read_map
+
+    return list(PLACEMENTS if source.sensors is None else read_map(source.sensors).devices)
+
+
+def _progress(source: Source, names: Sequence[str]) -> Callable[[RecordSummary], None]:
     """Return a callback that updates one line on a terminal; elsewhere it writes a line every 10 s."""
     every_s = 1.0 if has_terminal() else 10.0
     shown_s, shown_total = time.monotonic(), 0
@@ -104,23 +112,26 @@ def _progress(source: Source) -> Callable[[RecordSummary], None]:
             total = sum(summary.samples)
             rate = (total - shown_total) / (now_s - shown_s)
             shown_s, shown_total = now_s, total
+            counts = [summary.samples[SENSORS.index(name)] for name in names]
             status(
-                f"{summary.seconds:.0f} s, {' '.join(map(str, summary.samples))}, {rate:.0f} a second, "
+                f"{summary.seconds:.0f} s, {' '.join(map(str, counts))}, {rate:.0f} a second, "
                 f"{source.counters.lost} lost"
             )
 
     return show
 
 
-def _report(out: str, summary: RecordSummary, source: Source) -> None:
+def _report(out: str, summary: RecordSummary, source: Source, names: Sequence[str]) -> None:
     """Report the counts of a finished recording."""
     end_status()
     total = sum(summary.samples)
     rate = total / summary.seconds if summary.seconds else 0.0
     counts = source.counters
     say(f"samples  {total} in {summary.seconds:.1f} s, {rate:.0f} a second; to {out}")
-    say(f"sensors  {', '.join(f'{n} {name}' for name, n in zip(PLACEMENTS, summary.samples, strict=True))}")
+    by_name = {name: n for name, n in zip(SENSORS, summary.samples, strict=True) if n or name in names}
+    say(f"sensors  {', '.join(f'{n} {name}' for name, n in by_name.items())}")
     say(f"packets  {counts.packets} good, {counts.lost} lost, {counts.bad} bad, {counts.unknown} unknown")
-    silent = [name for name, n in zip(PLACEMENTS, summary.samples, strict=True) if not n]
+    silent = [name for name, n in by_name.items() if not n]
     if total and silent:
-        say(f"warning: nothing arrived from {', '.join(silent)}; poses need all six sensors")
+        needed = "poses need all six sensors" if len(names) == len(PLACEMENTS) else "check power, link and id"
+        say(f"warning: nothing arrived from {', '.join(silent)}; {needed}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,8 @@ from edgepose.config import SourceConfig, checked_protocol
 from edgepose.errors import ConfigError
 from edgepose.formats.recordings.registry import READERS
 from edgepose.imu import FILTERS
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import LACKING, PLACEMENTS
+from edgepose.utils.similar_names import choices
 from firmware_protocols.registry import protocol_names
 
 BITS_PER_SECOND = click.IntRange(1)
@@ -44,6 +45,31 @@ sensors_option = click.option(
     "repository. Lines named in it need no flag of their own.  [default: ids in the usual order]",
 )
 """The flag --sensors."""
+
+
+def _without(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, ...]:
+    names = () if value is None else tuple(name.strip() for name in value.split(","))
+    for name in names:
+        if name not in LACKING:
+            allowed = [each for each in PLACEMENTS if each in LACKING]
+            raise click.BadParameter(choices(name, allowed, f"{name!r}: a rig can do without"))
+    return names
+
+
+def lacking_sensors(names: Sequence[str]) -> str:
+    """Return a line about those of the six sensors that are not among these names; "" if all are."""
+    lacking = [name for name in PLACEMENTS if name not in names]
+    return f"A rig without {', '.join(lacking)}: poses are less accurate." if lacking else ""
+
+
+without_option = click.option(
+    "--without",
+    callback=_without,
+    metavar="NAME[,NAME...]",
+    help="Sensors of the six that the rig lacks, such as head; poses are less accurate without them. A map "
+    "of --sensors without an entry for them says the same.",
+)
+"""The flag --without."""
 
 
 def source_options(command: Callable[..., Any]) -> Callable[..., Any]:

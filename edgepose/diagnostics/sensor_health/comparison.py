@@ -16,7 +16,7 @@ from edgepose.diagnostics.sensor_health.repeats import FROZEN_S, is_constant, ne
 from edgepose.diagnostics.sensor_health.rest import is_table
 from edgepose.diagnostics.sensor_health.sensor import Sensor
 from edgepose.diagnostics.sensor_health.worn import WornComparison
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import PLACEMENTS, SENSORS
 from edgepose.rotations import Array
 
 
@@ -29,9 +29,9 @@ class RigComparison:
         self._table_deg: Array | None = None
 
     def update(self, sensors: Sequence[Sensor]) -> None:
-        """Compare the sensors, in the order of PLACEMENTS, in their current state."""
+        """Compare the sensors, in the order of SENSORS, in their current state."""
         if self._worn is not None:
-            self._worn.check_bones(sensors)
+            self._worn.check_bones(sensors[: len(PLACEMENTS)])
         resting = {i: rest for i, sensor in enumerate(sensors) if (rest := sensor.present_rest()) is not None}
         reporting = sum(len(sensor.window) > 0 for sensor in sensors)
         if len(resting) < 2 or len(resting) < reporting:
@@ -41,15 +41,17 @@ class RigComparison:
             quats = np.stack([rest.quat for rest in rests])
             reset = turn_about_z(quats, quats[-1])
             if reset.error_deg.max() < RESET_TILT_LIMIT_DEG:  # false for sensors without orientation
-                self._table_deg = np.full(len(PLACEMENTS), np.nan)
+                self._table_deg = np.full(len(SENSORS), np.nan)
                 self._table_deg[list(resting)] = from_median(-reset.offset)
-        elif self._worn is not None and len(resting) == len(PLACEMENTS):
+        elif self._worn is not None and set(range(len(PLACEMENTS))) <= resting.keys():
             self._table_deg = None
-            self._worn.compare_pose(rests)
+            self._worn.compare_pose([resting[i] for i in range(len(PLACEMENTS))])
 
     def result(self) -> list[dict[str, Any]]:
         """Return fields for the `SensorHealth` of each sensor."""
-        fields = [{} for _ in PLACEMENTS] if self._worn is None else self._worn.result()
+        fields: list[dict[str, Any]] = [{} for _ in SENSORS]
+        if self._worn is not None:
+            fields[: len(PLACEMENTS)] = self._worn.result()
         if self._table_deg is not None:
             for of_sensor, heading in zip(fields, self._table_deg.tolist(), strict=True):
                 of_sensor |= {"heading_deg": heading, "heading_on": "table"}
@@ -62,7 +64,7 @@ def compare_values(sensors: Sequence[Sensor]) -> list[dict[str, Any]]:
     values = [newest_values(sensor.window) for sensor in sensors]
     for (i, one), (j, other) in combinations(enumerate(values), 2):
         if FEWEST < len(one) * 0.8 <= len(one & other):
-            fields[i]["same_as"], fields[j]["same_as"] = PLACEMENTS[j], PLACEMENTS[i]
+            fields[i]["same_as"], fields[j]["same_as"] = SENSORS[j], SENSORS[i]
     # All sensors of a simulated rig at rest are constant, though not from exactly the same time.
     if sum(is_constant(sensor.window, FROZEN_S) is False for sensor in sensors) >= 2:
         for sensor_fields, sensor in zip(fields, sensors, strict=True):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 from edgepose.calibration.checks import GRAVITY_TILT_LIMIT_DEG
 from edgepose.calibration.sensor_to_segment import Calibration
@@ -13,7 +13,7 @@ from edgepose.diagnostics.sensor_health.comparison import RigComparison, compare
 from edgepose.diagnostics.sensor_health.report import SensorHealth
 from edgepose.diagnostics.sensor_health.sensor import Sensor
 from edgepose.imu import ImuSample
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import PLACEMENTS, SENSORS
 from edgepose.sources.clock_sync import DeviceClock
 from edgepose.utils.fault_messages import shared_convention
 
@@ -24,9 +24,15 @@ _MOST_PENDING = 5000
 class SensorHealthMonitor:
     """Takes the samples of a rig and reports the health of its sensors at any time."""
 
-    def __init__(self, calibration: Calibration | None = None) -> None:
-        """Create the monitor; with a calibration, headings and placements are checked on the body."""
-        self._sensors = [Sensor() for _ in PLACEMENTS]
+    def __init__(self, calibration: Calibration | None = None, names: Sequence[str] = PLACEMENTS) -> None:
+        """Create the monitor.
+
+        Args:
+            calibration: with it, headings and placements of the six sensors are checked on the body.
+            names: sensors of the rig; others are reported only if they send something.
+        """
+        self._names = names
+        self._sensors = [Sensor() for _ in SENSORS]
         self._comparison = RigComparison(calibration)
         self._next_fold_s = -math.inf
 
@@ -53,7 +59,7 @@ class SensorHealthMonitor:
     def report(
         self, now_s: float, clocks: Mapping[int, DeviceClock] | None = None, lag_ms: float = 0.0
     ) -> list[SensorHealth]:
-        """Return the health of the sensors, in the order of PLACEMENTS.
+        """Return the health of the sensors, in the order of SENSORS.
 
         Args:
             now_s: time up to which all samples have been added, on their clock, seconds.
@@ -64,7 +70,7 @@ class SensorHealthMonitor:
         self._next_fold_s = now_s + 2.0 * _FOLD_S  # the next report comes before
         result = []
         rig, values = self._comparison.result(), compare_values(self._sensors)
-        for i, (name, sensor) in enumerate(zip(PLACEMENTS, self._sensors, strict=True)):
+        for i, (name, sensor) in enumerate(zip(SENSORS, self._sensors, strict=True)):
             fields = rig[i] | values[i] | {"lag_ms": lag_ms}
             if clocks is not None and i in clocks:
                 ppm, error = clocks[i].drift_ppm()
@@ -81,7 +87,9 @@ class SensorHealthMonitor:
         }
         conventions = shared_convention(tilted)
         return [
-            dataclasses.replace(health, convention=conventions.get(health.placement)) for health in result
+            dataclasses.replace(health, convention=conventions.get(health.placement))
+            for health in result
+            if health.samples or health.placement in self._names
         ]
 
     def _fold(self) -> None:

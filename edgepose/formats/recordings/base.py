@@ -21,7 +21,7 @@ from edgepose.errors import FileFormatError
 from edgepose.formats.ledger import Ledger
 from edgepose.formats.registered import FileFormat
 from edgepose.imu import ImuSample, Recording, SensorData
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import SENSORS
 from edgepose.utils.fault_messages import clock_restarted
 
 Array = NDArray[np.float64]
@@ -44,13 +44,13 @@ class ReadOptions(NamedTuple):
     """Options for reading a recording; formats ignore those that do not apply.
 
     Attributes:
-        names: sensors that may occur, for formats that allow more than the six placements.
+        names: sensors that may occur.
         salvage: leave bad rows out and report them in `Recording.damage` instead of raising. CSV and NPZ
             only: files of other programs are always salvaged.
         ids: placements by serial number, for formats that identify sensors by it.
     """
 
-    names: Sequence[str] = PLACEMENTS
+    names: Sequence[str] = SENSORS
     salvage: bool = False
     ids: Mapping[int, str] | None = None
 
@@ -80,7 +80,7 @@ class RecordingFormat(FileFormat):
 
 def iter_samples(recording: Recording) -> Iterator[ImuSample]:
     """Iterate over all samples of a recording in time order."""
-    streams = [_sensor_samples(PLACEMENTS.index(name), data) for name, data in recording.sensors.items()]
+    streams = [_sensor_samples(SENSORS.index(name), data) for name, data in recording.sensors.items()]
     return heapq.merge(*streams, key=attrgetter("time_s"))
 
 
@@ -110,7 +110,7 @@ def recording_from_samples(
             values = getattr(sample, quantity)
             row += (nan,) * size if values is None else values
             empty += size if values is None else 0
-        table.add(PLACEMENTS[sample.sensor], number, row, empty)
+        table.add(SENSORS[sample.sensor], number, row, empty)
     return Recording(table.sensors(), dict(metadata or {}), table.damage())
 
 
@@ -169,7 +169,7 @@ class SampleTable:
         count: number of good rows so far; rows of the last, unchecked blocks count as good.
     """
 
-    def __init__(self, name: str, salvage: bool = False, names: Sequence[str] = PLACEMENTS) -> None:
+    def __init__(self, name: str, salvage: bool = False, names: Sequence[str] = SENSORS) -> None:
         """Create an empty table.
 
         Args:

@@ -18,7 +18,7 @@ from edgepose.errors import FileFormatError
 from edgepose.formats.recordings.base import ReadOptions, RecordingFormat, SampleTable, iter_samples, shorten
 from edgepose.formats.tables import COMMENTS, SEPARATORS, encoding_of, tidied
 from edgepose.imu import ImuSample, Recording
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import SENSORS
 from edgepose.utils.counted_lines import MAX_LINE, CountedLines
 from edgepose.utils.similar_names import choices
 
@@ -46,7 +46,7 @@ def csv_header(metadata: Mapping[str, str]) -> str:
 
 def csv_row(sample: ImuSample) -> str:
     """Format one line of a CSV recording: times to the microsecond, numbers to nine digits."""
-    cells = [f"{sample.time_s:.6f}", PLACEMENTS[sample.sensor]]
+    cells = [f"{sample.time_s:.6f}", SENSORS[sample.sensor]]
     for quantity, size in ((sample.quat, 4), (sample.acc, 3), (sample.gyr, 3), (sample.mag, 3)):
         cells += [""] * size if quantity is None else [f"{v:.9g}" for v in quantity]
     return ",".join(cells) + "\n"

@@ -26,8 +26,12 @@ from edgepose.imu import GRAVITY, ImuSample, Recording
 from firmware_protocols.rotation import rotate_back
 from firmware_protocols.sample import unit_quaternion
 
-LABELS = ("LeftForeArm", "RightForeArm", "LeftLowerLeg", "RightLowerLeg", "Head", "Pelvis")
-"""MVN's names of the six placements, in their order."""
+LABELS = (
+    "LeftForeArm", "RightForeArm", "LeftLowerLeg", "RightLowerLeg", "Head", "Pelvis", "T8",
+    "LeftShoulder", "RightShoulder", "LeftUpperArm", "RightUpperArm", "LeftHand", "RightHand",
+    "LeftUpperLeg", "RightUpperLeg", "LeftFoot", "RightFoot",
+)  # fmt: skip
+"""MVN's names of SENSORS, in their order; that on the breastbone is called T8."""
 
 _WIDTHS = {
     "sensorOrientation": 4,
@@ -49,10 +53,10 @@ _MOST_SENSORS = 100
 
 
 def read_mvnx(path: Path) -> Recording:
-    """Read a recording of the sensors at the six placements, as far as the file has them.
+    """Read a recording of the sensors, as far as the file has them.
 
     Raises:
-        FileFormatError: it cannot be read, is not MVNX, or has none of the six sensors.
+        FileFormatError: it cannot be read, is not MVNX, or has none of the sensors.
     """
     frames = _Frames(path)
     problems: list[str] = []

@@ -28,9 +28,13 @@ READERS = {
 
 
 def read_recording(
-    path: Path | str, ids: Mapping[int, str] | None = None, *, salvage: bool = False
+    path: Path | str,
+    ids: Mapping[int, str] | None = None,
+    *,
+    salvage: bool = False,
+    without: Sequence[str] = (),
 ) -> Recording:
-    """Read a recording of all six sensors in any format; a file with an unknown ending, and "-", is CSV.
+    """Read a recording of at least the six sensors in any format; an unknown ending, and "-", is CSV.
 
     A bad row of CSV or NPZ is an error; in other programs' formats it is left out and reported in `damage`.
 
@@ -38,12 +42,13 @@ def read_recording(
         path: file, or folder of a session.
         ids: placements by serial number, for sessions whose file or folder names contain no placements.
         salvage: leave bad rows of CSV and NPZ out, too.
+        without: sensors that the rig lacks and that are not needed.
 
     Raises:
         FileFormatError: it cannot be read, or is not a recording of all six sensors at one time.
     """
     recording = _read(Path(path), ReadOptions(ids=ids, salvage=salvage))
-    missing = missing_sensors(recording)
+    missing = [name for name in missing_sensors(recording) if name not in without]
     if missing:
         damage = f" ({recording.damage})" if recording.damage else ""
         raise FileFormatError(
@@ -72,8 +77,6 @@ def salvage_recording(path: Path | str, ids: Mapping[int, str] | None = None) ->
 
 def read_sensors(path: Path | str, names: Sequence[str]) -> Recording:
     """Read the good part of a recording of any of the named sensors.
-
-    Only CSV and NPZ can contain other sensors than the six.
 
     Raises:
         FileFormatError: it cannot be read, or is not a recording of such sensors.

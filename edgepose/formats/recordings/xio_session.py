@@ -11,7 +11,7 @@ from edgepose.errors import FileFormatError
 from edgepose.formats.recordings.base import RecordingFormat, recording_from_samples
 from edgepose.formats.tables import open_table
 from edgepose.imu import ImuSample, Recording
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import SENSORS
 from edgepose.utils.similar_names import choices
 from firmware_protocols.sample import Sample
 from firmware_protocols.ximu3 import Ximu3Decoder
@@ -60,7 +60,7 @@ def read_session(folder: Path, ids: Mapping[int, str] | None = None) -> Recordin
     rows = [
         sample
         for name, sensor_folder in folders.items()
-        for sample in _samples(PLACEMENTS.index(name), sensor_folder, problems)
+        for sample in _samples(SENSORS.index(name), sensor_folder, problems)
     ]
     recording = recording_from_samples(rows, _METADATA, name=str(folder), salvage=True)
     if recording.damage:
@@ -91,7 +91,7 @@ def by_placement(folder: Path, sensors: Sequence[Path], ids: Mapping[int, str] |
         how = f"in the names of its {'folders' if sensors[0].is_dir() else 'files'}"
         how = how if ids is None else "with a serial number of --sensors"
         names = ", ".join(sensor.name for sensor in sensors)
-        hint = choices(_words(sensors[0].name).strip("_"), PLACEMENTS, "placements are")
+        hint = choices(_words(sensors[0].name).strip("_"), SENSORS, "placements are")
         raise FileFormatError(f"{folder}: no placement {how} ({names}); {hint}")
     return result
 
@@ -101,7 +101,7 @@ def placement_of(name: str, ids: Mapping[int, str] | None) -> str | None:
     if ids is not None:
         numbers = [int(number, 16) for number in _SERIAL_NUMBER.findall(name)]
         return next((ids[number] for number in numbers if number in ids), None)
-    return next((placement for placement in PLACEMENTS if f"_{placement}_" in f"_{_words(name)}_"), None)
+    return next((placement for placement in SENSORS if f"_{placement}_" in f"_{_words(name)}_"), None)
 
 
 def _words(name: str) -> str:

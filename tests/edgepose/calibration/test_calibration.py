@@ -32,16 +32,16 @@ def random_quats(rng: np.random.Generator, *shape: int) -> np.ndarray:
 
 
 def still(
-    quat: np.ndarray, n: int = 100, rate: float = 100.0, acc: np.ndarray | None = None
+    quat: np.ndarray, n: int = 100, rate: float = 100.0, acc: np.ndarray | None = None, name: str = "pelvis"
 ) -> cal.SensorHold:
     """A sensor at rest: quaternion (4,) sensor to inertial, true specific force."""
     quats = np.tile(quat, (n, 1))
     acc = rot.quat_rotate(rot.quat_conjugate(quats), [0, 0, 9.81]) if acc is None else np.tile(acc, (n, 1))
-    return cal.SensorHold(np.arange(n) / rate, quats, acc, np.zeros((n, 3)))
+    return cal.SensorHold(np.arange(n) / rate, quats, acc, np.zeros((n, 3)), name)
 
 
 def rig_at_rest(quats: np.ndarray) -> list[cal.SensorHold]:
-    return [still(q) for q in quats]
+    return [still(q, name=name) for q, name in zip(quats, PLACEMENTS, strict=True)]
 
 
 def moved(hold: list[cal.SensorHold], sensor: int, quat: np.ndarray) -> list[cal.SensorHold]:
@@ -325,11 +325,11 @@ def test_a_turning_rate_counts_as_movement_but_a_bias_does_not(hold: list[cal.Se
 
 
 def test_sensors_that_never_reported_are_named(hold: list[cal.SensorHold]) -> None:
-    nothing = cal.hold_from_samples([])[0]
+    nothing = cal.hold_from_samples([])
     with pytest.raises(EdgeposeError, match="nothing from left_forearm, pelvis: check power"):
-        cal.check_hold([nothing, *hold[1:5], nothing])
+        cal.check_hold([nothing[0], *hold[1:5], nothing[5]])
     with pytest.raises(EdgeposeError, match="nothing from pelvis"):
-        cal.stillest_start([*hold[:5], nothing], 0.5)
+        cal.stillest_start([*hold[:5], nothing[5]], 0.5)
 
 
 def test_raw_sensors_are_told_from_silent_ones() -> None:
@@ -354,7 +354,7 @@ def test_samples_without_an_orientation_among_others_are_left_out() -> None:
 
 def test_too_few_samples(hold: list[cal.SensorHold]) -> None:
     with pytest.raises(EdgeposeError, match=r"too few samples in the hold \(head 9; at least 10\)"):
-        cal.check_hold([*hold[:HEAD], still(hold[HEAD].quat[0], 9), hold[PELVIS]])
+        cal.check_hold([*hold[:HEAD], still(hold[HEAD].quat[0], 9, name="head"), hold[PELVIS]])
 
 
 @pytest.mark.parametrize("bad", [[0, 0, 0, 0], [2, 0, 0, 0], [math.nan, 0, 0, 0], [math.inf, 0, 0, 0]])
@@ -433,7 +433,7 @@ Q = np.array([0.5, 0.1, -0.7, 0.5]) / np.linalg.norm([0.5, 0.1, -0.7, 0.5])
 def test_gravity_that_is_not_up_says_why(
     hold: list[cal.SensorHold], quat: np.ndarray, acc: np.ndarray, why: str
 ) -> None:
-    hold[HEAD] = still(quat, acc=acc)
+    hold[HEAD] = still(quat, acc=acc, name="head")
     with pytest.raises(EdgeposeError) as error:
         cal.check_hold(hold)
     message = str(error.value)
@@ -457,7 +457,7 @@ def test_the_first_of_the_still_windows_is_taken(hold: list[cal.SensorHold]) -> 
         quat = rot.quat_multiply(
             s.quat[0], rot.rotvec_to_quat(amount[:, None] * rng.standard_normal((3000, 3)))
         )
-        long.append(cal.SensorHold(time_s, quat, np.zeros((3000, 3)), np.zeros((3000, 3))))
+        long.append(s._replace(time_s=time_s, quat=quat, acc=np.zeros((3000, 3)), gyr=np.zeros((3000, 3))))
     start = cal.stillest_start(long, 4.0)
     assert 105.0 <= start <= 105.3
     assert [len(s.time_s) for s in cal.trim(long, start, start + 4.0)] == [400] * 6
@@ -551,7 +551,12 @@ def of_head(**changes: Any) -> str:
             corrupt(sensors__head=KeyError, sensors__pelvis=KeyError),
             "no sensor head, pelvis; calibrate again with all six",
         ),
-        (corrupt(sensors__chest={}), "unknown sensor 'chest'"),
+        (corrupt(sensors__tail={}), "unknown sensor 'tail'"),
+        (corrupt(sensors__chest={}), "sensor chest: 'heading_offset_deg' is not a number"),
+        (corrupt(sensors__head=KeyError), "no sensor head; calibrate again with all six"),
+        (corrupt(without=["head"]), "sensor head is in 'without', too"),
+        (corrupt(without=["pelvis"]), "'without' may only list head, left_forearm"),
+        (corrupt(without="head"), "'without' may only list head, left_forearm"),
         (corrupt(sensors__head=3), "sensor head is not an object"),
         (of_head(bone_from_sensor=[1, 0, 0]), "sensor head: 'bone_from_sensor' is not a unit"),
         (of_head(bone_from_sensor=[1, 1, 0, 0]), "sensor head: 'bone_from_sensor' is not a unit"),

@@ -43,7 +43,9 @@ def hold_of(orientation: np.ndarray) -> list[cal.SensorHold]:
     """Six sensors from orientations (T, 6, 4)."""
     time_s = np.arange(len(orientation)) / RATE
     empty = np.full((len(time_s), 3), math.nan)
-    return [cal.SensorHold(time_s, orientation[:, i], empty, empty) for i in range(len(PLACEMENTS))]
+    return [
+        cal.SensorHold(time_s, orientation[:, i], empty, empty, name) for i, name in enumerate(PLACEMENTS)
+    ]
 
 
 def exercised(bones: np.ndarray, mounting: np.ndarray, yaw: np.ndarray) -> cal.HeadingReset:

@@ -79,7 +79,7 @@ def test_lost_samples_are_refused():
     moving = walker()
     during = moving[3].time_s < 2.0 + WALK_S / 2
     later = moving[3].time_s > 2.3 + WALK_S / 2
-    moving[3] = SensorHold(*(column[during | later] for column in moving[3]))
+    moving[3] = SensorHold(*(column[during | later] for column in moving[3][:-1]), moving[3].name)
     with pytest.raises(CalibrationError, match=r"silent during the steps: right_lower_leg for 0\.3\d s"):
         cal.headings_from_steps(moving, upright(moving))
     moving[3] = moving[3]._replace(acc=np.full_like(moving[3].acc, np.nan))

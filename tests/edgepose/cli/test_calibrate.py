@@ -485,7 +485,7 @@ def test_headings_from_the_mounting_in_a_map(tmp_path: Path) -> None:
             pose="straight", body_frame="heading:70", created="", heading_offset=ERRORS,
         )
     )  # fmt: skip
-    rows = zip(PLACEMENTS, range(6), found, strict=True)
+    rows = zip(PLACEMENTS, range(6), found.values(), strict=True)
     rig = tmp_path / "rig.toml"
     rig.write_text("".join(f'{name} = {{ id = {i}, mounting = "{sits}" }}\n' for name, i, sits in rows))
     out = tmp_path / "calib.json"

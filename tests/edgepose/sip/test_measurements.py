@@ -11,7 +11,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.npz import write_npz
 from edgepose.formats.recordings.registry import read_recording, read_sensors
 from edgepose.imu import Recording, SensorData
-from edgepose.placements import SITES
+from edgepose.placements import PLACEMENTS, SITES
 from edgepose.sip import inputs as reading
 from edgepose.sip.measurements import SensorMount, measure, mounts_from_hold
 
@@ -185,14 +185,14 @@ def test_orientations_are_made_as_the_calibration_says(wearer, with_thigh):
         assert np.degrees(np.median(tilt)) < 2.0, name
         assert not np.array_equal(made.quat, sent.sensors[name].quat)
     with pytest.raises(
-        EdgeposeError, match=r"with --filter kalman, which takes only the six .* left_upper_leg"
+        EdgeposeError, match=r"with --filter kalman, without left_upper_leg: calibrate again with all"
     ):
         reading.read(with_thigh, calibration)
 
 
 def test_only_named_bones_are_read(with_thigh, tmp_path):
     with pytest.raises(EdgeposeError, match="unknown sensor"):
-        read_recording(with_thigh)
+        read_sensors(with_thigh, PLACEMENTS)
     assert list(read_sensors(with_thigh, tuple(SITES)).sensors)[-1] == "left_upper_leg"
     np.savez(tmp_path / "tail.npz", t=np.zeros(1), tail_quat=np.ones((1, 4)))
     with pytest.raises(EdgeposeError, match=r"unknown sensor; the names are left_forearm, .*right_foot"):

@@ -83,7 +83,7 @@ def test_two_hubs_and_a_bus(read):
         (PORTS + '\nhead = { port = "x" }', r"rig\.toml: head is defined twice"),
         ("[head]\nid = 1\n[pelvis]\nid = 2\n[head]\nid = 3", r"rig\.toml: head is defined twice"),
         (PORTS.replace("head", "hat"), r"rig\.toml: unknown placement 'hat'; placements are left_forearm, "),
-        (PORTS.replace("head", "#"), r"rig\.toml: no entry for head; all six"),
+        (PORTS.replace("pelvis", "#"), r"rig\.toml: no entry for pelvis, without which"),
         (PORTS.replace("USB3", "USB2"), "right_lower_leg and left_lower_leg are the same device"),
         (IDS.replace("23", "20"), "right_lower_leg and left_forearm are the same device"),
         (PORTS.replace('port = "/dev/ttyUSB1"', 'port = "/dev/ttyUSB0", id = 3'), "are the same device"),
@@ -142,7 +142,7 @@ MAPS = [text for text in re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL) if "c
 @pytest.mark.parametrize("text", MAPS)
 def test_examples_of_maps_are_maps(read, text):
     rig = read(text)
-    assert list(rig.devices) == list(PLACEMENTS)
+    assert set(rig.devices) >= set(PLACEMENTS)
     for settings in rig.ports.values():
         assert settings.protocol in PROTOCOLS
 

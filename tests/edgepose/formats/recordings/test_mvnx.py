@@ -15,8 +15,8 @@ from edgepose.calibration import GRAVITY
 from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.mvnx import LABELS, read_mvnx
 from edgepose.formats.recordings.registry import read_recording, salvage_recording
-from edgepose.imu import Recording
-from edgepose.placements import PLACEMENTS
+from edgepose.imu import Recording, SensorData
+from edgepose.placements import SENSORS as ALL
 from edgepose.rotations import quat_rotate
 
 REAL = Path(__file__).parents[3] / "data" / "imu" / "six-sites-3s.npz"
@@ -31,6 +31,7 @@ SENSORS = (
     "LeftLowerLeg",
 )
 FRAMES = 40
+NAMES = [name for name, label in zip(ALL, LABELS, strict=True) if label in SENSORS]
 
 
 def numbers(values: list[np.ndarray]) -> str:
@@ -38,12 +39,11 @@ def numbers(values: list[np.ndarray]) -> str:
 
 
 def lists(recording: Recording, i: int, version: int) -> str:
-    """What a frame says of all sensors; those of no placement lie on a table."""
-    table = {"quat": np.array([1.0, 0, 0, 0]), "acc": np.array([0, 0, GRAVITY]), "gyr": np.zeros(3)}
+    """What a frame says of all sensors."""
     rows = []
     for label in SENSORS:
-        data = recording.sensors[PLACEMENTS[LABELS.index(label)]]._asdict() if label in LABELS else None
-        rows.append({key: table[key] if data is None else data[key][i] for key in table})
+        data = recording.sensors[ALL[LABELS.index(label)]]
+        rows.append({"quat": data.quat[i], "acc": data.acc[i], "gyr": data.gyr[i]})
     result = f"<sensorOrientation>{numbers([row['quat'] for row in rows])}</sensorOrientation>\n"
     result += f"<sensorMagneticField>{numbers([[0.25, -0.5, 1.0]] * len(rows))}</sensorMagneticField>\n"
     if version == 4:
@@ -55,8 +55,12 @@ def lists(recording: Recording, i: int, version: int) -> str:
 
 
 def write(path: Path, version: int = 4, rate: int = 60) -> Recording:
-    """A second of a real recording as MVN exports it."""
+    """A second of a real recording as MVN exports it, with more sensors, which lie on a table."""
     recording = read_recording(REAL)
+    count = len(recording.sensors["head"].time_s)
+    rows = (np.tile(row, (count, 1)) for row in ([1.0, 0, 0, 0], [0, 0, GRAVITY], [0.0, 0, 0]))
+    lying = SensorData(recording.sensors["head"].time_s, *rows)
+    recording = recording._replace(sensors=dict.fromkeys(ALL, lying) | recording.sensors)
     segments = " ".join(["1 0 0 0"] * 23)
     frames = "".join(
         f'<frame time="{1000 * i // rate}" index="{i}" tc="12:00:00:00" ms="1700000000000" type="normal">\n'
@@ -79,7 +83,7 @@ def write(path: Path, version: int = 4, rate: int = 60) -> Recording:
 
 
 def same(found: Recording, wanted: Recording, version: int, rate: int = 60) -> None:
-    assert list(found.sensors) == list(PLACEMENTS)
+    assert list(found.sensors) == NAMES
     for name, data in found.sensors.items():
         np.testing.assert_allclose(data.time_s, np.arange(FRAMES) / rate, atol=1e-9)
         np.testing.assert_allclose(data.quat, wanted.sensors[name].quat[:FRAMES], atol=2e-6)
@@ -109,7 +113,7 @@ def test_by_the_command(command, tmp_path):
     (folder / "cut.mvnx").write_text(text[: len(text) // 2])
     result = command("convert", folder, "--to", "npz", "--out", tmp_path / "out", "--jobs", 2)
     assert result.returncode == 1
-    assert re.search(r"walk\.MVNX +240 +0\.7  ok\n", result.stdout)
+    assert re.search(r"walk\.MVNX +320 +0\.7  ok\n", result.stdout)
     assert re.search(r"cut\.mvnx +\d+ +0\.3  damaged\n", result.stdout)
     assert re.search(r"cut\.mvnx: damaged: breaks off \(.*: line \d+, column", result.stderr)
     found = read_recording(tmp_path / "out" / "deep" / "walk.npz")
@@ -143,9 +147,9 @@ def test_bad_frames_cost_only_themselves(tmp_path):
     assert f"{path}: 1 bad rows left out" in found.damage
     assert "(head) has a quaternion that is not of unit length" in found.damage
     assert {name: len(data.time_s) for name, data in found.sensors.items()} == {
-        name: FRAMES - 4 if name == "head" else FRAMES - 3 for name in PLACEMENTS
+        name: FRAMES - 4 if name == "head" else FRAMES - 3 for name in NAMES
     }
-    assert [np.isnan(data.mag[:, 0]).sum() for data in found.sensors.values()] == [1] * 6
+    assert [np.isnan(data.mag[:, 0]).sum() for data in found.sensors.values()] == [1] * len(NAMES)
     assert len(wanted.sensors["head"].time_s) > FRAMES
 
 
@@ -171,7 +175,7 @@ def test_frames_before_a_second_subject_are_good(tmp_path):
     assert (
         "breaks off (the frame rate '0' of its subject is not possible), the 40 frames before" in found.damage
     )
-    assert [len(data.time_s) for data in found.sensors.values()] == [FRAMES] * 6
+    assert [len(data.time_s) for data in found.sensors.values()] == [FRAMES] * len(NAMES)
 
 
 def test_a_lost_frame_is_a_gap(tmp_path):
@@ -188,7 +192,7 @@ def test_fewer_sensors(tmp_path):
     path = tmp_path / "walk.mvnx"
     write(path)
     path.write_text(path.read_text().replace('"LeftForeArm"', '"Prop1"'))
-    assert list(read_mvnx(path).sensors) == [name for name in PLACEMENTS if name != "left_forearm"]
+    assert list(read_mvnx(path).sensors) == [name for name in NAMES if name != "left_forearm"]
 
 
 LAUGHS = '<!DOCTYPE mvnx [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">]>\n<mvnx'
@@ -313,7 +317,7 @@ def write_recording(path: Path, recording: Recording) -> Path:
             f'<frame time="{1000 * i // 60}" type="normal"><sensorOrientation>{quats}</sensorOrientation>'
             f"<sensorFreeAcceleration>{free}</sensorFreeAcceleration></frame>\n"
         )
-    sensors = "".join(f'<sensor label="{label}"/>' for label in LABELS)
+    sensors = "".join(f'<sensor label="{label}"/>' for label in LABELS[: len(data)])
     path = path.with_suffix(".mvnx")
     path.write_text(
         f'<mvnx version="4"><subject frameRate="60"><sensors>{sensors}</sensors>\n'
