@@ -244,6 +244,7 @@ class WearerConfig:
         filter: orientation filter, one of `edgepose.imu.FILTERS`; None for that of the calibration.
         no_mag: do not use magnetometers in the filter; they are not used either if the calibration did not.
         no_place: do not follow the wearer through the room; poses have no translation.
+        no_drift_correction: leave the headings of sensors without a common north as they are.
         control: address to listen on for requests, see `edgepose.pipeline.remote_control`.
         name: the wearer's name in messages; empty for a single wearer.
         path: the TOML file that the configuration was read from, if any.
@@ -255,6 +256,7 @@ class WearerConfig:
     filter: str | None = None
     no_mag: bool = False
     no_place: bool = False
+    no_drift_correction: bool = False
     control: tuple[str, int] | None = None
     name: str = ""
     path: Path | None = None
@@ -345,6 +347,7 @@ _KEYS = {
     "rate": _NUMBER,
     "page-port": _WHOLE,
     "no-place": _SWITCH,
+    "no-drift-correction": _SWITCH,
     "control": _TEXT,
 }
 

@@ -26,7 +26,7 @@ from edgepose.pipeline.pose_resampler import PoseResampler
 from edgepose.pipeline.remote_control import Request, Requests
 from edgepose.pipeline.rig_comparison import changes, missing_heading_reset, missing_quantities, unlike_six
 from edgepose.pipeline.run_report import RunReport, about, latency
-from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
+from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline, drift_corrector
 from edgepose.sinks.open import open_outputs
 from edgepose.sources import open_source
 from edgepose.sources.live import unix_now
@@ -166,6 +166,7 @@ class OpenWearer:
             None if outputs.rate is None else PoseResampler(outputs.rate, rate),
             AddedSensors(added) if added else None,
             without,
+            None if self._config.no_drift_correction else drift_corrector(self._calibration),
         )
 
     def _next_ready_s(self) -> float:

@@ -167,9 +167,11 @@ def _step(engine: MultiWearerEngine, frames: dict[int, _Waiting], wearers: dict[
 
 
 def _total(summaries: Sequence[RunSummary]) -> RunSummary:
-    """Sum the counts that are shown during a run."""
+    """Sum the counts that are shown during a run; corrections of headings are those of all sensors."""
+    corrections = [angle for summary in summaries for angle in summary.corrections_deg or ()]
     return RunSummary(
         poses=sum(summary.poses for summary in summaries),
         held=sum(summary.held for summary in summaries),
         backlog_s=max(summary.latency_s for summary in summaries),
+        corrections_deg=corrections or None,
     )

@@ -14,7 +14,7 @@ from edgepose.orientation.stage import OrientationStage
 from edgepose.pipeline.added_sensors import AddedSensors
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.place_stage import PlaceStage
-from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
+from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline, drift_corrector
 from edgepose.pose import PoseFrame
 from edgepose.sinks.base import Sink
 from edgepose.skeleton import DEFAULT_HEIGHT, default_body
@@ -57,6 +57,7 @@ class Pipeline:
         height: float | None = None,
         leg_length: float | None = None,
         place: bool = True,
+        drift_correction: bool = True,
     ) -> None:
         """Load the model.
 
@@ -68,6 +69,7 @@ class Pipeline:
             leg_length: length of the wearer's thigh and shank, hip joint to ankle, metres; None for the
                 average at this height.
             place: follow the wearer through the room; otherwise poses have no translation.
+            drift_correction: correct the headings of sensors without a common north while they drift.
 
         Raises:
             ModelError: the archive cannot be loaded.
@@ -75,7 +77,7 @@ class Pipeline:
         """
         from edgepose.inference.model import Model
 
-        self._calibration, self._follow = calibration, place
+        self._calibration, self._follow, self._correct_drift = calibration, place, drift_correction
         if height is None:
             height = calibration.height_m or DEFAULT_HEIGHT
         self._body = default_body(height, leg_length_m=leg_length)
@@ -104,6 +106,7 @@ class Pipeline:
             place=PlaceStage(self._body, without=calibration.without) if self._follow else None,
             added=AddedSensors(added) if added else None,
             without=calibration.without,
+            drift=drift_corrector(calibration) if self._correct_drift else None,
         )
         self.summary = pipeline.summary
         failure: EdgeposeError | None = None

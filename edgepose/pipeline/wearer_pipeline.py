@@ -12,7 +12,7 @@ from itertools import compress
 import numpy as np
 from numpy.typing import NDArray
 
-from edgepose.calibration import apply_calibration
+from edgepose.calibration import POSES, Calibration, apply_calibration
 from edgepose.calibration.misfit import MisfitDetector
 from edgepose.calibration.rezero import HeadingRezero
 from edgepose.calibration.sensor_to_segment import added_bones
@@ -21,6 +21,7 @@ from edgepose.diagnostics.rig_monitor import RigMonitor
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuFrame, ImuSample
 from edgepose.inference.engine import EngineInput, EngineOutput, check_finite
+from edgepose.orientation.drift import DriftCorrector
 from edgepose.pipeline.added_sensors import AddedSensors
 from edgepose.pipeline.dropout import assumed_bones, extrapolate_dropouts
 from edgepose.pipeline.dropout_monitor import DropoutMonitor
@@ -28,7 +29,7 @@ from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.place_stage import PlaceStage
 from edgepose.pipeline.pose_resampler import PoseResampler
 from edgepose.pipeline.pose_writer import PoseWriter
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import PLACEMENTS, ROOT
 from edgepose.pose import PoseFrame
 from edgepose.sinks.base import Sink
 from edgepose.sinks.group import SinkGroup
@@ -53,6 +54,8 @@ class RunSummary:
         latencies_s: latencies of the newest LATENCIES poses, in no order, seconds.
         slips: sensors that have turned on their limbs, as far as found.
         way_m: way walked, metres, see `PlaceStage`; None if the place is not followed.
+        corrections_deg: angles by which headings are turned back at present, degrees, in the order of
+            PLACEMENTS; None if drift is not corrected.
         error: the error that ended the run early, if any.
     """
 
@@ -66,6 +69,7 @@ class RunSummary:
     latencies_s: array[float] = field(default_factory=lambda: array("f"), repr=False)
     slips: list[Slip] = field(default_factory=list)
     way_m: float | None = None
+    corrections_deg: list[float] | None = None
     error: EdgeposeError | None = None
 
     def sent(self, latency_s: float) -> None:
@@ -94,6 +98,11 @@ def pose_frame(output: EngineOutput, without: Sequence[str] = ()) -> PoseFrame:
     return PoseFrame(frame.index, frame.time_s, output.rotations, output.std, None, held, output.warming_up)
 
 
+def drift_corrector(calibration: Calibration) -> DriftCorrector | None:
+    """Return the correction of a rig's heading drift; None if its sensors share a north."""
+    return None if calibration.north else DriftCorrector(POSES["straight"], PLACEMENTS, ROOT)
+
+
 class WearerPipeline:
     """One wearer's pipeline from samples to sinks, without the network, which may serve several wearers.
 
@@ -119,6 +128,7 @@ class WearerPipeline:
         resampler: PoseResampler | None = None,
         added: AddedSensors | None = None,
         without: Sequence[str] = (),
+        drift: DriftCorrector | None = None,
     ) -> None:
         """Join the stages.
 
@@ -139,6 +149,7 @@ class WearerPipeline:
             resampler: changes the rate of the poses that are written; None keeps that of the frames.
             added: measured bones besides those of the six sensors, if the rig has them.
             without: those of the six sensors that the rig lacks.
+            drift: corrects the headings of sensors that share no north; None leaves them as they are.
         """
         self.summary, self.clock = RunSummary(), clock
         self.arrived = self._started = time.perf_counter()
@@ -151,6 +162,7 @@ class WearerPipeline:
         self._added, self._without = added, without
         self._dropouts = DropoutMonitor([] if added is None else added.names, without)
         self._reported_unused = 0
+        self._drift = drift
         self._source_s = 0.0  # time on the source's clock at 0 of the clock of `arrived`
         self._bones: NDArray[np.float64] | None = None  # those of the previous frame
 
@@ -232,12 +244,17 @@ class WearerPipeline:
         for frame in frames:
             for line in self._dropouts.update(frame):
                 self._notify(line)
+            if self._drift is not None:
+                frame = self._drift.correct(frame)
             calibration = self._headings.calibration_for(frame)
             if calibration is not None:
                 bones, acceleration = apply_calibration(calibration, frame.orientation, frame.force)
                 if self._misfits is not None:
                     for line in self._misfits.update(frame, bones):
                         self._warn(line)
+                if self._drift is not None:
+                    self._drift.observe(bones, calibration.heading_offset)
+                    self.summary.corrections_deg = np.degrees(self._drift.corrections).tolist()
                 if self._bones is None and self._without:
                     self._bones = assumed_bones(bones, calibration.missing)
                 if self._dropouts.any_held:

@@ -165,6 +165,9 @@ def _progress(network: Network) -> Callable[[RunSummary], None]:
         if now_s - shown_s >= every_s:
             rate = (summary.poses - poses) / (now_s - shown_s)
             shown_s, poses = now_s, summary.poses
-            status(f"{poses} poses, {rate:.0f} a second, {summary.held} with a held sensor")
+            line = f"{poses} poses, {rate:.0f} a second, {summary.held} with a held sensor"
+            if summary.corrections_deg is not None:
+                line += f", headings corrected up to {max(map(abs, summary.corrections_deg)):.0f} deg"
+            status(line)
 
     return show

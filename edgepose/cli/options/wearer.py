@@ -42,6 +42,11 @@ def _required_without_rig(ctx: click.Context, param: click.Parameter, value: Pat
     help="Do not follow the wearer through the room: the pelvis stays above one point of the ground.",
 )
 @click.option(
+    "--no-drift-correction",
+    is_flag=True,
+    help="Leave the headings of sensors without a common north as they are, while they drift.",
+)
+@click.option(
     "--control",
     callback=address,
     metavar="HOST:PORT",
