@@ -112,7 +112,7 @@ class DriftCorrector:
     def _take_rezero(self) -> None:
         """Learn from a re-zero: the headings of the pose were wrong by what it changed."""
         wrong = self.corrections - self._reset
-        self._estimator.rezero(wrong - wrong[self._root], self.corrections)
+        self._estimator.rezero(wrong - wrong[self._root], self.corrections, self._frames[-1].held)
         self._target = self.corrections
         self._reset = np.zeros(len(self._reset))
         self._keep_last()

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edgepose.orientation.drift.evidence import Array, Block
+from edgepose.orientation.drift.evidence import Array, Block, Flags
 from edgepose.orientation.drift.headings import Gyroscopes, Habit, HeadingFilter
 from edgepose.orientation.drift.rest import STILL, Rests
 
@@ -34,6 +34,7 @@ UPRIGHT_PELVIS = math.cos(math.radians(41.0))
 STRAIGHT_ON = math.radians(30.0)
 """Turning rate of the pelvis from which on the wearer does not face one way, rad/s."""
 _SPREAD = 0.1
+"""Largest spread of a heading in a block, see `Block`."""
 _SIGMA = math.radians(3.0)
 """Standard deviation of a heading beside the habit, rad."""
 _POSE_TILT = math.cos(math.radians(12.0))
@@ -115,21 +116,22 @@ class DriftEstimator:
         self._turning = turning
         self._take_pose(block)
 
-    def rezero(self, headings: Array, errors: Array) -> None:
+    def rezero(self, headings: Array, errors: Array, held: Flags) -> None:
         """Learn from a re-zero.
 
         Args:
             headings: (S,) headings of the bones against the pelvis that it revealed, as measured, rad.
             errors: (S,) heading errors from now on, rad.
+            held: (S,) sensors that revealed nothing, such as those that the rig lacks.
         """
         for each in self._filters:
-            for i in self._others(np.zeros(len(errors), bool)):
+            for i in self._others(held):
                 each.heading(i, headings[i], _REZERO_SIGMA, habit=False)
             each.rezero(errors)
 
-    def _others(self, without: np.ndarray) -> list[int]:
-        """Return the sensors that are not the pelvis' and not among some."""
-        return [i for i in range(len(self._roles)) if i != self._root and not without[i]]
+    def _others(self, held: Flags) -> list[int]:
+        """Return the sensors except the pelvis' and the held ones."""
+        return [i for i in range(len(self._roles)) if i != self._root and not held[i]]
 
     def _take_rests(self, block: Block) -> None:
         for i, rests in enumerate(self._rests):
@@ -147,8 +149,8 @@ class DriftEstimator:
 
     def _take_pose(self, block: Block) -> None:
         """Take the straight pose, once each time it is held."""
-        held = bool(block.held.any() or block.upright.min() < _POSE_TILT or block.moved.max() > 2.0 * STILL)
-        before, self._posed_s = self._posed_s, 0.0 if held else self._posed_s + block.seconds
+        other = bool(block.held.any() or block.upright.min() < _POSE_TILT or block.moved.max() > 2.0 * STILL)
+        before, self._posed_s = self._posed_s, 0.0 if other else self._posed_s + block.seconds
         if before < _POSE_S <= self._posed_s:
             for i in self._others(block.held):
                 for each in self._filters:

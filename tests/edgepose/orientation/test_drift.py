@@ -141,7 +141,7 @@ def test_a_rezero_reveals_scale_errors():
     for _ in range(4 * MINUTE):
         estimator.update(block({}, turned=turned, upright=np.zeros(6)))
     scale = np.array([0.004, -0.005, 0.003, -0.004, 0.005, 0.0])
-    estimator.rezero(scale * turned * 4 * MINUTE, np.zeros(6))
+    estimator.rezero(scale * turned * 4 * MINUTE, np.zeros(6), np.zeros(6, bool))
     assert not estimator.error.any()
     for _ in range(MINUTE):
         estimator.update(block({}, turned=turned, upright=np.zeros(6)))
@@ -176,6 +176,12 @@ class Stand:
             self.bones.append(rot.Z_UP_TO_T @ rot.quat_to_matrix(fixed))
             self.corrector.observe(self.bones[-1], self.offset)
             self.corrections.append(self.corrector.corrections)
+
+    def rezero(self, offset: np.ndarray, held: np.ndarray | None = None) -> None:
+        """Let a re-zero go on for a second, to heading offsets (6,)."""
+        for share in np.linspace(0.0, 1.0, RATE)[1:]:
+            self.offset = share * offset
+            self.go(1.0 / RATE, held)
 
     @property
     def headings_deg(self) -> np.ndarray:
@@ -218,14 +224,23 @@ def test_a_rezero_is_kept_and_not_undone():
     stand = Stand(np.zeros(6))
     stand.go(3.0)
     found = np.array([12.0, -20.0, 15.0, 5.0, -9.0, 40.0]) * DEG
-    for share in np.linspace(0.0, 1.0, RATE)[1:]:
-        stand.offset = share * found
-        stand.go(1.0 / RATE)
+    stand.rezero(found)
     before = stand.headings_deg
     stand.error = -found
     stand.go(10.0)
     assert abs(stand.headings_deg).max() < 1.0
     assert abs(before).max() > 20.0
+
+
+def test_a_wearer_who_re_zeroes_facing_another_way_shows_no_drift_of_a_sensor_that_the_rig_lacks():
+    lacking, drifts = np.arange(6) < 2, []
+    for angle in (0.01, 40.0):
+        stand = Stand(np.zeros(6))
+        stand.go(15.0, lacking)
+        stand.rezero(np.where(lacking, 0.0, angle * DEG), lacking)
+        stand.go(1.0, lacking)
+        drifts.append(stand.corrector._estimator.drifts)
+    assert drifts[0] == pytest.approx(drifts[1], rel=1e-3)
 
 
 # --- in a run -----------------------------------------------------------------------------------------------
