@@ -110,7 +110,9 @@ def _stands(sensors: Hold) -> Iterator[tuple[float, float]]:
     grid = np.arange(first, last - _TURN_S, _GRID_S)
     still = np.ones(len(grid), bool)
     for name, s in zip(PLACEMENTS, sensors, strict=True):
-        one, other = (s.quat[np.searchsorted(s.time_s, times)] for times in (grid, grid + _TURN_S))
+        # Rounded sums may lie after the last sample.
+        rows = [np.searchsorted(s.time_s, t).clip(max=len(s.time_s) - 1) for t in (grid, grid + _TURN_S)]
+        one, other = s.quat[rows[0]], s.quat[rows[1]]
         turned = 2.0 * np.arccos(np.clip(np.abs(np.sum(one * other, axis=1)), 0.0, 1.0))
         still &= np.degrees(turned) < (_HEAD_STILL_DEG if name == "head" else _STILL_DEG)
     edges = np.flatnonzero(np.diff(still.astype(int), prepend=0, append=0)).reshape(-1, 2)
@@ -123,13 +125,20 @@ def _stands(sensors: Hold) -> Iterator[tuple[float, float]]:
 
 
 def _walk(sensors: Hold, start_s: float, end_s: float, stops: bool) -> Walk:
-    gaps = [np.diff(s.time_s[(s.time_s >= start_s) & (s.time_s <= end_s)]).max(initial=0.0) for s in sensors]
+    gaps = [_longest_gap(s.time_s, start_s, end_s) for s in sensors]
     if lossy := [f"{n} for {gap:.2f} s" for n, gap in zip(PLACEMENTS, gaps, strict=True) if gap > _GAP_S]:
         raise CalibrationError(
             f"silent during the steps: {', '.join(lossy)}; check power and link, and repeat"
         )
     ways = [_way(sensor, start_s, end_s, stops) for sensor in sensors]
     return Walk(start_s, end_s, stops, np.array(ways))
+
+
+def _longest_gap(time_s: Array, start_s: float, end_s: float) -> float:
+    """Return the longest time between samples of a walk, the last before and the first after it, seconds."""
+    begin = max(int(np.searchsorted(time_s, start_s, side="right")) - 1, 0)
+    end = int(np.searchsorted(time_s, end_s)) + 1
+    return float(np.diff(time_s[begin:end]).max(initial=0.0))
 
 
 def _way(sensor: SensorHold, start_s: float, end_s: float, stops: bool) -> Array:

@@ -75,6 +75,28 @@ def test_refused_steps(wearer, text):
         cal.headings_from_steps(moving, upright(walker()))
 
 
+@pytest.mark.parametrize(
+    "silent_s", [(1.8, 5.2), (0.5, 6.5), (0.3, 1.99), (5.05, 6.9)], ids=["walk", "most", "stand", "end"]
+)
+def test_a_sensor_that_is_silent_beyond_an_edge_of_the_steps_is_refused(silent_s):
+    moving = walker()
+    sends = (moving[3].time_s < silent_s[0]) | (moving[3].time_s > silent_s[1])
+    upright_before = upright(moving)
+    moving[3] = SensorHold(*(column[sends] for column in moving[3][:-1]), moving[3].name)
+    with pytest.raises(CalibrationError, match="silent during the steps: right_lower_leg for"):
+        cal.headings_from_steps(moving, upright_before)
+
+
+def test_rounded_times_do_not_reach_beyond_the_samples():
+    """The end of this recording is a rounding error before that of the last interval looked at."""
+    moving = [
+        SensorHold(*(column[:208] for column in s._replace(time_s=0.1 + s.time_s)[:-1]), s.name)
+        for s in walker()
+    ]
+    with pytest.raises(WeakMotionError, match=r"the way of 0\.0 m is too short"):
+        cal.headings_from_steps(moving, upright(moving))
+
+
 def test_lost_samples_are_refused():
     moving = walker()
     during = moving[3].time_s < 2.0 + WALK_S / 2
