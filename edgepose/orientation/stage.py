@@ -87,7 +87,7 @@ class OrientationStage:
         """Return the samples, oriented; leave out those without orientation from oriented sensors."""
         if self._orienter is None:
             return samples
-        if len(self._with_north) < len(self.names):
+        if self._fieldless:
             self._with_north.update(sample.sensor for sample in samples if sample.mag is not None)
         oriented = self._orienter.orient(samples)
         self._oriented.update(sample.sensor for sample in oriented if sample.quat is not None)

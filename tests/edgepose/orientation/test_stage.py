@@ -35,6 +35,14 @@ def test_some_with_a_magnetometer_and_some_without() -> None:
     assert not OrientationStage("kalman", magnetometer=False).mixed
 
 
+def test_fields_of_sensors_that_the_calibration_lacks_do_not_count() -> None:
+    orient = OrientationStage("kalman", magnetometer=True)
+    for sensor in (6, 7, *range(6)):
+        orient([raw(sensor, 0, mag=(20.0, 0.0, -40.0))])
+    assert orient.north
+    assert orient.without_field == []
+
+
 def test_gaps_are_told_at_the_end() -> None:
     orient = OrientationStage("kalman", magnetometer=False)
     orient([raw(2, k) for k in [*range(100), *range(150, 250)]])
