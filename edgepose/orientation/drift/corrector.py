@@ -53,16 +53,12 @@ class DriftCorrector:
         self._offset: Array | None = None  # headings of the calibration
         self._reset = np.zeros(len(placements))  # by a re-zero that goes on
 
-    @property
-    def rates(self) -> Array:
-        """(S,) estimated rates at which the headings of sensors drift, rad/s."""
-        return self._estimator.bias
-
     def correct(self, frame: ImuFrame) -> ImuFrame:
         """Return a frame with corrected headings."""
         passed_s = 0.0 if self._time_s is None else frame.time_s - self._time_s
         if passed_s > GAP_S:
             self._frames, self._bones = [], []
+            self._estimator.pass_over(passed_s)
         self._time_s, self._frame = frame.time_s, frame
         self._target = self._target + self._estimator.bias * passed_s
         step = FASTEST * min(passed_s, BLOCK_S)

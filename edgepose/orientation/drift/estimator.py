@@ -116,6 +116,11 @@ class DriftEstimator:
         self._turning = turning
         self._take_pose(block)
 
+    def pass_over(self, seconds: float) -> None:
+        """Let the errors grow for a time in which nothing was measured, seconds."""
+        for each in self._filters:
+            each.predict(seconds, np.zeros(len(self._roles)))
+
     def rezero(self, headings: Array, errors: Array, held: Flags) -> None:
         """Learn from a re-zero.
 

@@ -153,22 +153,23 @@ def test_a_rezero_reveals_scale_errors():
 
 
 class Stand:
-    """A wearer who stands straight, and whose sensors drift."""
+    """A wearer who stands straight or lies, and whose sensors drift."""
 
-    def __init__(self, rates_deg_min: np.ndarray) -> None:
+    def __init__(self, rates_deg_min: np.ndarray, lying: bool = False) -> None:
         self.corrector = DriftCorrector(STRAIGHT, PLACEMENTS, ROOT)
         self.rates, self.error, self.offset = rates_deg_min * DEG / 60.0, np.zeros(6), np.zeros(6)
         self.index = 0
+        leant = rot.rotation_about_axis("x", -np.pi / 2.0) if lying else np.eye(3)
+        self.quats = rot.matrix_to_quat(IN_INERTIAL @ leant @ STRAIGHT)
         self.corrections: list[np.ndarray] = []
         self.bones: list[np.ndarray] = []
 
     def go(self, seconds: float, held: np.ndarray | None = None) -> None:
-        straight = rot.matrix_to_quat(IN_INERTIAL @ STRAIGHT)
         held = np.zeros(6, bool) if held is None else held
         for _ in range(round(seconds * RATE)):
             self.index += 1
             self.error = self.error + self.rates / RATE
-            quats = rot.quat_multiply(rot.quat_about_z(self.error), straight)
+            quats = rot.quat_multiply(rot.quat_about_z(self.error), self.quats)
             force = np.tile([0.0, 0.0, GRAVITY], (6, 1))
             time_s = self.index / RATE
             frame = self.corrector.correct(ImuFrame(self.index, time_s, quats, force, held, time_s))
@@ -218,6 +219,17 @@ def test_the_correction_of_a_silent_sensor_stands_still():
     assert np.ptp(last[:, HEAD]) > 0.0
     stand.go(1.0, held=np.arange(6) == ROOT)
     assert np.ptp(np.array(stand.corrections[-RATE:]), axis=0).max() == 0.0
+
+
+def test_known_drift_goes_on_while_nothing_is_received():
+    """For a minute and a half; the sensors lie, so that nothing shows their headings before or after."""
+    stand = Stand(RATES, lying=True)
+    stand.go(30.0)
+    before = stand.headings_deg
+    stand.index += 90 * RATE
+    stand.error = stand.error + 90.0 * stand.rates
+    stand.go(40.0)
+    assert abs(stand.headings_deg - before).max() < 2.0
 
 
 def test_a_rezero_is_kept_and_not_undone():
