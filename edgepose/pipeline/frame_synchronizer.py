@@ -1,21 +1,21 @@
 """Resampling of a rig's sensors, each at its own rate, to frames at one fixed rate.
 
 Frames depend only on the samples' own times, so a recording yields the same frames whether it is read at once
-or bit by bit. Plain floats are used on purpose: at six sensors of 100 Hz and more, numpy on four numbers at a
-time costs ten times as much.
+or bit by bit.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Sequence
-from math import asin, ceil, inf, sin, sqrt
-from typing import Literal, NamedTuple
+from math import ceil, inf
+from typing import Literal
 
 import numpy as np
 
 from edgepose.errors import EdgeposeError
-from edgepose.imu import GAP_S, AddedFrame, ImuFrame, ImuSample, Quaternion, Vector3
+from edgepose.imu import GAP_S, AddedFrame, ImuFrame, ImuSample
+from edgepose.pipeline.sensor_samples import Entry, SensorSamples, mean_force, slerp
 from edgepose.placements import PLACEMENTS, SENSORS
 
 START_TIMEOUT_S = 3.0
@@ -25,67 +25,9 @@ STALE_S = 0.5
 """Longest silence of a sensor that is still waited for, seconds."""
 
 _HOLD_PERIODS = 2.5  # age of a sensor's last sample, in its periods, at which the sensor is held
-_WAIT_PERIODS, _WAIT_S = 1.5, 0.010  # see `_Sensor.wait_s`
-_PERIOD_RANGE_S = (0.001, 0.2)
-_PERIOD_MEMORY = 20  # samples
 _IDENTITY, _NO_FORCE = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 
 Interpolation = Literal["slerp", "hold"]
-
-
-class _Entry(NamedTuple):
-    time_s: float
-    quat: Quaternion
-    force: Vector3  # specific force in the inertial frame
-    arrival_s: float
-
-
-class _Sensor:
-    """One sensor's samples that are needed for future ticks."""
-
-    __slots__ = ("intervals", "last", "newest_s", "pending", "period_s")
-
-    def __init__(self) -> None:
-        self.last: _Entry | None = None  # newest sample at or before the last tick
-        self.pending: deque[_Entry] = deque()  # samples after it, oldest first
-        self.newest_s = -inf
-        self.intervals = 0  # number of intervals averaged in period_s
-        self.period_s = _PERIOD_RANGE_S[1]
-
-    def add(self, entry: _Entry) -> bool:
-        """Insert an entry in time order; return False, and drop it, if its time is taken."""
-        if entry.time_s > self.newest_s:
-            self.newest_s = entry.time_s
-            self.pending.append(entry)
-            return True
-        index = len(self.pending)
-        while index and self.pending[index - 1].time_s > entry.time_s:
-            index -= 1
-        before = self.pending[index - 1] if index else self.last
-        if before is not None and before.time_s >= entry.time_s:
-            return False
-        self.pending.insert(index, entry)
-        return True
-
-    def take(self) -> _Entry:
-        """Move the oldest pending entry to `last`, update the period, and return the entry."""
-        entry = self.pending.popleft()
-        # Updated here and not in `add`: the period must not depend on how far samples run ahead of the ticks.
-        if self.last is not None:
-            interval = entry.time_s - self.last.time_s
-            if self.intervals:
-                # A moving average in which a single gap has little weight.
-                change = min(interval, 4.0 * self.period_s) - self.period_s
-                interval = self.period_s + change / min(self.intervals + 1, _PERIOD_MEMORY)
-            self.intervals += 1
-            self.period_s = min(max(interval, _PERIOD_RANGE_S[0]), _PERIOD_RANGE_S[1])
-        self.last = entry
-        return entry
-
-    @property
-    def wait_s(self) -> float:
-        """Longest time after a tick for which this sensor's next sample is waited for, seconds."""
-        return _WAIT_PERIODS * self.period_s + _WAIT_S
 
 
 class FrameSynchronizer:
@@ -132,9 +74,9 @@ class FrameSynchronizer:
         self._rate = rate
         self._slerp = interpolation == "slerp"
         self._grid = grid
-        self._sensors = [_Sensor() for _ in PLACEMENTS]
+        self._sensors = [SensorSamples() for _ in PLACEMENTS]
         self._missing = [name in without for name in PLACEMENTS]
-        self._added = {SENSORS.index(name): _Sensor() for name in added}
+        self._added = {SENSORS.index(name): SensorSamples() for name in added}
         worn = [s for s, missing in zip(self._sensors, self._missing, strict=True) if not missing]
         self._awaited = [*worn, *self._added.values()]
         self._index = 0
@@ -159,19 +101,24 @@ class FrameSynchronizer:
         if self._first_arrival_s is None:
             self._first_arrival_s = arrival_s
         for sample in samples:
-            if self._after_gap or self._is_after_gap(sample):
-                # Only the six restart the ticks.
-                if self._after_gap or sample.sensor < len(PLACEMENTS):
-                    self._after_gap.append((sample, arrival_s))
+            if self._after_gap or self._restarts_ticks(sample):
+                self._after_gap.append((sample, arrival_s))
             else:
                 self._take(sample, arrival_s)
+
+    def _restarts_ticks(self, sample: ImuSample) -> bool:
+        """Whether a sample ends a gap: only the six that the rig has do, as there are no frames without."""
+        return self._is_after_gap(sample) and self._is_one_of_six(sample.sensor)
 
     def _is_after_gap(self, sample: ImuSample) -> bool:
         return -inf < self._newest_s < sample.time_s - GAP_S
 
+    def _is_one_of_six(self, sensor: int) -> bool:
+        return sensor < len(PLACEMENTS) and not self._missing[sensor]
+
     def _take(self, sample: ImuSample, arrival_s: float) -> None:
         sensor, time_s, quat, acc, _, _ = sample
-        if sensor >= len(PLACEMENTS) or self._missing[sensor]:
+        if not self._is_one_of_six(sensor):
             self._take_added(sample, arrival_s)
             return
         if quat is None:
@@ -191,7 +138,7 @@ class FrameSynchronizer:
         # v + 2 w (u x v) + 2 u x (u x v)
         tx, ty, tz = 2.0 * (y * az - z * ay), 2.0 * (z * ax - x * az), 2.0 * (x * ay - y * ax)
         force = (ax + w * tx + y * tz - z * ty, ay + w * ty + z * tx - x * tz, az + w * tz + x * ty - y * tx)
-        if not self._sensors[sensor].add(_Entry(time_s, quat, force, arrival_s)):
+        if not self._sensors[sensor].add(Entry(time_s, quat, force, arrival_s)):
             self.dropped += 1
         elif time_s > self._newest_s:
             self._newest_s = time_s
@@ -202,8 +149,10 @@ class FrameSynchronizer:
             unknown = "the calibration does not have them; calibrate again to use them"
             raw = "they have no orientation; let them send quaternions, or calibrate with --filter kalman"
             self.unused.setdefault(SENSORS[sample.sensor], unknown if sensor is None else raw)
+        elif self._is_after_gap(sample):
+            pass  # there are no frames until the six are back
         elif sample.time_s <= self._last_tick_s or not sensor.add(
-            _Entry(sample.time_s, sample.quat, _NO_FORCE, arrival_s)
+            Entry(sample.time_s, sample.quat, _NO_FORCE, arrival_s)
         ):
             self.dropped += 1
 
@@ -276,7 +225,7 @@ class FrameSynchronizer:
         queue = self._after_gap
         self._t0, self._tick, self._newest_s = self._first_tick(queue[0][0].time_s), 0, -inf
         self.restarts += 1
-        while queue and not self._is_after_gap(queue[0][0]):
+        while queue and not self._restarts_ticks(queue[0][0]):
             self._take(*queue.popleft())
 
     def _until(self, now_s: float) -> list[ImuFrame]:
@@ -331,12 +280,12 @@ class FrameSynchronizer:
                     following = pending[0]
                     ready_s = max(ready_s, following.arrival_s)
                     if self._slerp:
-                        quat = _slerp(quat, following.quat, age_s / (following.time_s - last.time_s))
+                        quat = slerp(quat, following.quat, age_s / (following.time_s - last.time_s))
                     inside.append(following)
                 if before is not None and inside and inside[0].time_s - before.time_s <= longest_s:
                     inside.insert(0, before)
                 if inside:
-                    mean = _mean_force(inside, start_s, tick_s)
+                    mean = mean_force(inside, start_s, tick_s)
             orientation.append(quat)
             force.append(mean)
             held.append(is_held)
@@ -364,52 +313,7 @@ class FrameSynchronizer:
                 if not is_held and self._slerp and age_s > 0.0 and pending:
                     following = pending[0]
                     if following.time_s - tick_s <= sensor.wait_s:
-                        quat = _slerp(quat, following.quat, age_s / (following.time_s - last.time_s))
+                        quat = slerp(quat, following.quat, age_s / (following.time_s - last.time_s))
             orientation.append(quat)
             held.append(is_held)
         return AddedFrame(np.array(orientation), np.array(held))
-
-
-def _mean_force(entries: list[_Entry], start_s: float, end_s: float) -> Vector3:
-    """Mean over the time from start to end of a force that is linear between entries and constant beyond.
-
-    It is a mean over time, not over samples: with 5 samples in 3 frames, the mean over samples would jitter
-    by a fraction of a period.
-    """
-    x = y = z = 0.0
-    t0 = start_s
-    left = entries[0]
-    for right in entries:
-        t1 = right.time_s if right.time_s < end_s else end_s
-        if t1 > t0:
-            span = right.time_s - left.time_s
-            # Force in the middle of [t0, t1]; constant before the first entry, where left is right.
-            share = (0.5 * (t0 + t1) - left.time_s) / span if span > 0.0 else 0.0
-            (ax, ay, az), (bx, by, bz) = left.force, right.force
-            weight = t1 - t0
-            x += weight * (ax + share * (bx - ax))
-            y += weight * (ay + share * (by - ay))
-            z += weight * (az + share * (bz - az))
-            t0 = t1
-        left = right
-    weight = end_s - t0  # after the last entry
-    fx, fy, fz = left.force
-    total = end_s - start_s
-    return ((x + weight * fx) / total, (y + weight * fy) / total, (z + weight * fz) / total)
-
-
-def _slerp(p: Quaternion, q: Quaternion, share: float) -> Quaternion:
-    """Unit quaternion on the shorter arc from p (share 0) to q (share 1)."""
-    pw, px, py, pz = p
-    qw, qx, qy, qz = q
-    if pw * qw + px * qx + py * qy + pz * qz < 0.0:
-        qw, qx, qy, qz = -qw, -qx, -qy, -qz
-    # The chord keeps its precision where the arc is short; arccos of the scalar product does not.
-    angle = 2.0 * asin(
-        min(1.0, 0.5 * sqrt((qw - pw) ** 2 + (qx - px) ** 2 + (qy - py) ** 2 + (qz - pz) ** 2))
-    )
-    if angle < 1e-8:
-        return p
-    sine = sin(angle)
-    a, b = sin((1.0 - share) * angle) / sine, sin(share * angle) / sine
-    return (a * pw + b * qw, a * px + b * qx, a * py + b * qy, a * pz + b * qz)

@@ -157,9 +157,8 @@ def open_source(
             nothing has come, for callers that read several sources.
         listen: addresses of this machine to receive datagrams on, HOST:PORT, separated by commas.
         connect: devices to connect to over TCP, HOST:PORT, separated by commas.
-        wanted: returns the time on the source's clock before which a caller has no use for more samples of
-            live lines, seconds: those that come until then are delivered together. By default a thread reads
-            each line, and all samples are delivered as they come.
+        wanted: returns the time on the source's clock, seconds, until which samples of live lines may be
+            gathered into one batch; by default they are delivered as they come.
         without: sensors that the rig lacks and that recordings need not hold.
 
     Raises:

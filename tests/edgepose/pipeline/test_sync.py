@@ -12,6 +12,7 @@ from edgepose.formats.recordings.base import iter_samples
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import ImuSample
 from edgepose.pipeline.frame_synchronizer import STALE_S, FrameSynchronizer
+from edgepose.placements import SENSORS
 from edgepose.placements import PLACEMENTS
 
 REAL = Path(__file__).parents[2] / "data" / "imu" / "six-sites-3s.npz"
@@ -309,6 +310,19 @@ def test_many_gaps_at_once():
     frames = clock.flush()
     assert clock.restarts == 2999
     assert [f.index for f in frames] == list(range(3000))
+
+
+def test_sensors_that_are_not_needed_do_not_end_a_gap():
+    """Of a rig without a head sensor, while chest (added) and head (not calibrated) go on alone."""
+    clock = FrameSynchronizer(added=["chest"], without=["head"])
+    six = sorted((s for x in rig(seconds=1) for s in x), key=lambda s: s.time_s)
+    others = [s._replace(sensor=sensor) for s in six[::6] for sensor in (4, SENSORS.index("chest"))]
+    clock.push([s for s in six if s.sensor != 4], 1.0)
+    clock.push([s._replace(time_s=s.time_s + 100.0 * k) for k in range(1, 5) for s in others], 500.0)
+    clock.push([s._replace(time_s=s.time_s + 900.0) for s in six if s.sensor != 4], 901.0)
+    frames = clock.flush()
+    assert clock.restarts == 1
+    assert 110 < sum(not f.held[:4].any() for f in frames) <= len(frames) < 122
 
 
 def test_missing_sensors_are_named():
