@@ -48,7 +48,8 @@ def unlike_six(calibration: Calibration) -> str | None:
     """Return a line on the sensors that a rig has besides the six, or lacks; None if it has just these."""
     parts = []
     if calibration.added.names:
-        parts.append(f"{', '.join(calibration.added.names)} measured besides the six")
+        drift = "" if calibration.north else ", whose headings are not corrected for drift"
+        parts.append(f"{', '.join(calibration.added.names)} measured besides the six{drift}")
     if calibration.without:
         parts.append(f"{', '.join(calibration.without)} not measured: poses are less accurate")
     return f"sensors  {len(calibration.sensors)}; {'; '.join(parts)}" if parts else None

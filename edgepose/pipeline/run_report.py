@@ -113,9 +113,10 @@ class RunReport:
             lines.append(f"slipped  {slip.placement} by about {slip.angle_deg:.0f} deg")
         if summary.way_m is not None:
             lines.append(f"way      {summary.way_m:.1f} m walked")
-        if summary.corrections_deg is not None:
+        if summary.corrections_deg is not None and any(summary.corrections_deg):
             angles = zip(PLACEMENTS, summary.corrections_deg, strict=True)
-            named = ", ".join(f"{name} {angle:+.1f}" for name, angle in angles)
+            # Those of sensors that the rig lacks are 0.
+            named = ", ".join(f"{name} {angle:+.1f}" for name, angle in angles if angle)
             lines.append(f"drift    {named} deg corrected")
         if self.latency is not None:
             ahead = self.latency.look_ahead

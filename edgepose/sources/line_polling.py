@@ -67,7 +67,11 @@ class LinePoller:
         files = self.files
         if not files:  # as long as all lines are being emptied or reopened
             time.sleep(min(seconds, LOOK_S))
-        return select.select(files, (), (), seconds)[0] if files else ()
+            return ()
+        try:
+            return select.select(files, (), (), seconds)[0]
+        except OSError:  # meanwhile a thread has found a line disconnected, and closed it
+            return ()
 
     def poll(self, readable: Sequence[int] | None = None) -> list[Arrival]:
         """Return everything that has come since the last call, and reports of lines that nothing came over.
