@@ -12,8 +12,7 @@ from edgepose.formats.recordings.base import iter_samples
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import ImuSample
 from edgepose.pipeline.frame_synchronizer import STALE_S, FrameSynchronizer
-from edgepose.placements import SENSORS
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import PLACEMENTS, SENSORS
 
 REAL = Path(__file__).parents[2] / "data" / "imu" / "six-sites-3s.npz"
 TURN = np.array([0.3, -1.0, 2.0])  # rad/s
