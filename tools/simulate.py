@@ -1,4 +1,4 @@
-"""Plays an IMU recording or a motion-capture clip as six devices in real time, in any wire format.
+"""Plays an IMU recording or a motion-capture clip as devices in real time, in any wire format.
 
 \b
     simulate.py recording.npz                         play native packets, then rest
@@ -619,9 +619,7 @@ def simulate(
     metavar="MS",
     help="Delay packets at random by up to this time.",
 )
-@click.option(
-    "--drift", type=float, default=0.0, metavar="PPM", help="Let the six clocks drift by -PPM to PPM."
-)
+@click.option("--drift", type=float, default=0.0, metavar="PPM", help="Let the clocks drift by -PPM to PPM.")
 @click.option(
     "--kill",
     multiple=True,

@@ -83,10 +83,10 @@ def live_cost(model: Path, seconds: float = MEASURED_S) -> LiveCost | None:
         us = 1e6 * (_processor_s(run.pid) - before_s) / max(poses, 1)
         waits = (_waits(run.pid) - waits_before) / max(poses, 1)
         run.send_signal(signal.SIGTERM)
-        _, said = run.communicate()
-    latency = re.search(rb"latency +([0-9.]+) ms median, ([0-9.]+) ms p99", said)
+        _, messages = run.communicate()
+    latency = re.search(rb"latency +([0-9.]+) ms median, ([0-9.]+) ms p99", messages)
     if latency is None or not poses:
-        raise EdgeposeError(f"a live run failed: {said.decode()[-200:].strip()}")
+        raise EdgeposeError(f"a live run failed: {messages.decode()[-200:].strip()}")
     return LiveCost(us, waits, float(latency[1]), float(latency[2]), poses)
 
 
