@@ -48,7 +48,7 @@ def unlike_six(calibration: Calibration) -> str | None:
     """Return a line on the sensors that a rig has besides the six, or lacks; None if it has just these."""
     parts = []
     if calibration.added.names:
-        drift = "" if calibration.north else ", whose headings are not corrected for drift"
+        drift = "" if calibration.north else ", without drift correction"
         parts.append(f"{', '.join(calibration.added.names)} measured besides the six{drift}")
     if calibration.without:
         parts.append(f"{', '.join(calibration.without)} not measured: poses are less accurate")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -22,6 +23,7 @@ from edgepose.imu import AddedFrame, ImuFrame, Recording, SensorData
 from edgepose.inference.model import Model
 from edgepose.pipeline.added_sensors import RATE, AddedSensors
 from edgepose.pipeline.dropout import assumed_bones
+from edgepose.pipeline.rig_comparison import unlike_six
 from edgepose.placements import PLACEMENTS, ROOT, SENSORS, SITES
 from edgepose.pose import PoseFrame
 from edgepose.sip.measurements import mounts_from_hold, orientation_at
@@ -184,6 +186,7 @@ def test_headings_of_added_sensors_are_re_zeroed_one_by_one() -> None:
     np.testing.assert_allclose(found.added.heading_offset[:3], -drift[:3], atol=0.03)
     assert math.isnan(found.added.heading_offset[3])  # it moved: its bone is predicted until the next hold
     assert "moved: right_upper_leg; the others are re-zeroed" in lines
+    assert str(unlike_six(replace(calibration, north=False))).endswith(" the six, without drift correction")
 
 
 def test_a_rig_without_a_head_runs_and_is_not_reported_as_lost(six: Walk) -> None:
@@ -195,6 +198,9 @@ def test_a_rig_without_a_head_runs_and_is_not_reported_as_lost(six: Walk) -> Non
     assert {pose.status for pose in lacking.poses} == {"ok"}
     measured = [SITES[name] for name in worn]
     assert apart_deg(lacking.bones[:, measured], six.bones[:60, measured]).max() < 0.01
+    drifting = walk(replace(calibration, north=False), recording, 2.0).pipeline.summary.corrections_deg
+    assert drifting is not None
+    assert [name for name, angle in zip(PLACEMENTS, drifting, strict=True) if angle] == worn
     with pytest.raises(EdgeposeError, match="this rig has no head sensor"):
         cal.calibrate(
             cal.check_hold(cal.trim(cal.hold_from_recording(recording, worn), *HOLD)),
