@@ -19,6 +19,7 @@ from edgepose.pose import RATES
 from edgepose.sinks.output_files import check_output
 from edgepose.sinks.registry import SINKS
 from edgepose.skeleton import DEFAULT_HEIGHT, Body, default_body
+from edgepose.sources.protocol_detection import checked_protocol
 from edgepose.utils.output_targets import is_stream
 from edgepose.utils.similar_names import choices
 from edgepose.utils.sockets import parse_host_and_port
@@ -393,16 +394,3 @@ def _text(key: str, value: str, folder: Path) -> Any:
         return parse[key](value)
     except EdgeposeError as error:
         raise ConfigError(f"{key}: {error}") from None
-
-
-def checked_protocol(name: str) -> str:
-    """Return a name if it is "auto", that of a wire format, or that of a TOML file, which is read later.
-
-    Raises:
-        ConfigError: there is no such wire format.
-    """
-    from firmware_protocols.registry import PROTOCOLS
-
-    if name == "auto" or name.endswith(".toml") or name in PROTOCOLS:
-        return name
-    raise ConfigError(f"unknown protocol {name!r}; {choices(name, ['auto', *PROTOCOLS])}")

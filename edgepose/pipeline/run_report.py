@@ -148,6 +148,9 @@ class RunReport:
             "restarts": self.restarts,
             "slips": [{"placement": slip.placement, "angle_deg": slip.angle_deg} for slip in summary.slips],
             "way_m": summary.way_m,
+            "corrections_deg": None
+            if summary.corrections_deg is None
+            else dict(zip(PLACEMENTS, summary.corrections_deg, strict=True)),
             "latency_ms": None if self.latency is None else self.latency._asdict(),
             "notes": list(self.notes),
         }

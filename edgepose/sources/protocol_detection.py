@@ -63,8 +63,23 @@ def protocol_named(name: str) -> Protocol:
     if name.endswith(".toml"):
         return _text_lines(Path(name))
     if name not in PROTOCOLS:
-        raise ConfigError(f"unknown protocol {name!r}; {choices(name, ['auto', *PROTOCOLS])}")
+        raise _unknown(name)
     return PROTOCOLS[name]
+
+
+def checked_protocol(name: str) -> str:
+    """Return a name if it is "auto", that of a protocol, or that of a TOML file, which is read later.
+
+    Raises:
+        ConfigError: there is no such protocol.
+    """
+    if name == "auto" or name.endswith(".toml") or name in PROTOCOLS:
+        return name
+    raise _unknown(name)
+
+
+def _unknown(name: str) -> ConfigError:
+    return ConfigError(f"unknown protocol {name!r}; {choices(name, ['auto', *PROTOCOLS])}")
 
 
 def candidate_protocols(name: str, transport: Transport, live: bool) -> list[Protocol]:

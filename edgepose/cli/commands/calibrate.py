@@ -222,11 +222,7 @@ def calibrate(
         check_files([("--out", out)], files)
         _check_writable(out, overwrite)
     sensor_map = None if source.sensors is None else read_map(source.sensors)
-    plan = dataclasses.replace(plan, names=_names(sensor_map, without))
-    if lacking := lacking_sensors(plan.names):
-        terminal.say(lacking)
-    if plan.heading_reset == "mounting":
-        plan = dataclasses.replace(plan, mounting=_all_mountings(sensor_map))
+    plan = _for_rig(plan, sensor_map, without)
     job = CalibrationJob(source, plan, filter, not no_mag, height_m, sensor_map)
     if inputs:
         from edgepose.cli.calibrate_recordings import calibrate_recordings
@@ -321,10 +317,23 @@ def _check_use(source: SourceConfig, plan: CalibrationPlan, page: tuple[str, int
         )
 
 
-def _names(sensor_map: SensorMap | None, without: Sequence[str]) -> list[str]:
-    """Return the sensors of the rig: those of the map, or the six, but for those that it is without."""
+def _for_rig(plan: CalibrationPlan, sensor_map: SensorMap | None, without: Sequence[str]) -> CalibrationPlan:
+    """Return the plan with the sensors of the rig and their mountings; say which of the six it lacks.
+
+    Args:
+        plan: the plan.
+        sensor_map: map that names the sensors; None for the six.
+        without: sensors that the rig lacks.
+
+    Raises:
+        EdgeposeError: the heading reset needs mountings, and the map does not have all of them.
+    """
     stated = PLACEMENTS if sensor_map is None else sensor_map.devices
-    return [name for name in stated if name not in without]
+    names = [name for name in stated if name not in without]
+    if lacking := lacking_sensors(names):
+        terminal.say(lacking)
+    mounting = _all_mountings(sensor_map) if plan.heading_reset == "mounting" else {}
+    return dataclasses.replace(plan, names=names, mounting=mounting)
 
 
 def _all_mountings(sensor_map: SensorMap | None) -> dict[str, str]:

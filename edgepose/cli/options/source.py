@@ -9,11 +9,12 @@ from typing import Any
 import click
 
 from edgepose.cli.options.gathered import gathered
-from edgepose.config import SourceConfig, checked_protocol
+from edgepose.config import SourceConfig
 from edgepose.errors import ConfigError
 from edgepose.formats.recordings.registry import READERS
 from edgepose.imu import FILTERS
 from edgepose.placements import LACKING, PLACEMENTS
+from edgepose.sources.protocol_detection import checked_protocol
 from edgepose.utils.similar_names import choices
 from firmware_protocols.registry import protocol_names
 

@@ -15,17 +15,22 @@ class Results:
     def __init__(self, as_json: bool) -> None:
         """Start without results; `as_json` keeps them for `end`."""
         self._as_json = as_json
-        kinds = ("tables", "contacts", "heat_maps", "reliability")
-        self._values: dict[str, list[Mapping[str, Any]]] = {kind: [] for kind in kinds}
+        parts = ("tables", "contacts", "heat_maps", "reliability")
+        self._values: dict[str, list[Mapping[str, Any]]] = {part: [] for part in parts}
 
     def show(self, text: str) -> None:
         """Show a text for people."""
         if not self._as_json:
             show(text)
 
-    def add(self, kind: str, **values: Any) -> None:
-        """Keep a result for scripts; docs/reference/scripts.md describes the kinds and their keys."""
-        self._values[kind].append(values)
+    def add(self, part: str, /, **values: Any) -> None:
+        """Keep a result for scripts.
+
+        Args:
+            part: key of the document whose list gets the result.
+            **values: the result; docs/reference/scripts.md describes the keys.
+        """
+        self._values[part].append(values)
 
     def end(self) -> None:
         """Write the document, if it is wanted."""

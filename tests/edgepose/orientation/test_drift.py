@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -310,14 +311,17 @@ def test_the_run_says_what_it_corrected_unless_it_is_not_to(command, wearer, tmp
     text = wearer.calibration.read_text(encoding="utf-8")
     calibration.write_text(text.replace('"north": true', '"north": false'), encoding="utf-8")
     assert calibration.read_text(encoding="utf-8") != text
-    told = {}
+    told, corrections = {}, {}
     for flags in ((), ("--no-drift-correction",)):
         result = command(
             *("run", "--file", wearer.short, "--calibration", calibration, "--model", "rnn", "--runtime"),
-            *("numpy", "--csv", tmp_path / "poses.csv", "--overwrite", *flags),
+            *("numpy", "--csv", tmp_path / "poses.csv", "--overwrite", "--json", *flags),
         )
         assert result.returncode == 0, result.stderr
+        corrections[flags] = json.loads(result.stdout)["runs"][0]["corrections_deg"]
         told[flags] = [line for line in result.stderr.splitlines() if line.startswith("drift ")]
     assert told["--no-drift-correction",] == []
+    assert corrections["--no-drift-correction",] is None
     (line,) = told[()]
-    assert all(f"{name} " in line for name in PLACEMENTS)
+    assert list(corrections[()]) == list(PLACEMENTS)
+    assert all(f"{name} {angle:+.1f}" in line for name, angle in corrections[()].items())

@@ -31,6 +31,7 @@ from edgepose.pipeline.wearer_pipeline import WearerPipeline
 from edgepose.placements import PLACEMENTS
 from edgepose.sinks.csv import CsvSink
 from edgepose.sources import open_source
+from edgepose.utils.output_targets import FileTarget
 from edgepose_export.networks.shape import NetworkShape
 from tests.support import processes
 from tests.support.datagrams import Listener
@@ -73,7 +74,10 @@ def test_files_are_named_against_the_folder_of_the_rig_file(rig, tmp_path):
     assert flags.source.sensors == Path("/map.toml")
     assert flags.source.protocol == str(tmp_path / "mine.toml")
     assert flags.calibration == tmp_path / "../calib.json"
-    assert flags.outputs.targets == (("csv", ("-", "")), ("npz", (str(tmp_path / "out/a.npz"), "24")))
+    assert flags.outputs.targets == (
+        ("csv", FileTarget("-", (("rotations", ""),))),
+        ("npz", FileTarget(str(tmp_path / "out/a.npz"), (("joints", "24"),))),
+    )
     assert (flags.outputs.height, flags.outputs.std, flags.no_mag) == (2.0, True, True)
     assert (flags.outputs.leg_length, flags.outputs.body.leg_length_m, flags.no_place) == (1.0, 1.0, True)
     # What is not there is as on the command line.
@@ -293,7 +297,7 @@ def test_the_example_of_a_rig_file_is_one(tmp_path):
     (tmp_path / "example.toml").write_text(example)
     (flags,) = read_rigs([tmp_path / "example.toml"])
     assert (flags.name, flags.source.port, flags.control) == ("anna", "/dev/ttyUSB0", ("127.0.0.1", 9101))
-    assert ("csv", (str(tmp_path / "anna.csv"), "")) in flags.outputs.targets
+    assert ("csv", FileTarget(str(tmp_path / "anna.csv"), (("rotations", ""),))) in flags.outputs.targets
 
 
 # --- recordings ---------------------------------------------------------------------------------------------

@@ -3,11 +3,10 @@
 import pytest
 
 from edgepose.calibration.body_frame import check_body_frame
-from edgepose.config import checked_protocol
 from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.inference.archive import find_archive
-from edgepose.sources.protocol_detection import protocol_named
+from edgepose.sources.protocol_detection import checked_protocol, protocol_named
 from edgepose.sources.sensor_map import read_map
 from edgepose.utils.similar_names import choices
 
