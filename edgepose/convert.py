@@ -250,5 +250,5 @@ def outcome(result: Result) -> str:
     """Return the outcome of a conversion in a few words."""
     if result.skipped:
         return "skipped, already exists"
-    few = not result.skipped and result.samples and result.sensors < len(PLACEMENTS)
+    few = result.samples and result.sensors < len(PLACEMENTS)
     return state(result) + (f", {result.sensors} of {len(PLACEMENTS)} sensors" if few else "")

@@ -17,6 +17,7 @@ from edgepose.cli.calibration_verdict import values, values_of_failed
 from edgepose.cli.many_files import Outcome, raise_failures, text_table, with_progress
 from edgepose.cli.options.json_result import show_json
 from edgepose.cli.terminal.messages import show, warnings_to
+from edgepose.cli.terminal.stop_signal import StopSignal
 from edgepose.errors import EdgeposeError, as_edgepose_error
 from edgepose.orientation.stage import OrientationStage
 from edgepose.sources.input_files import expand, recordings
@@ -60,9 +61,13 @@ def calibrate_recordings(
         check_free((task.out for task in tasks), "add --overwrite, or choose another --out")
     results: dict[_Task, _Result] = {}
     try:
-        work = run_jobs(partial(_calibrate, job=job, overwrite=overwrite), tasks, workers, _killed)
-        for result in with_progress(work, len(tasks), "Calibrating", _outcome):
-            results[result.task] = result
+        with StopSignal() as stop:
+            work = partial(_calibrate, job=job, overwrite=overwrite)
+            found = run_jobs(work, tasks, workers, _killed, lambda: stop.asked)
+            for result in with_progress(found, len(tasks), "Calibrating", _outcome):
+                results[result.task] = result
+            if stop.asked:
+                raise KeyboardInterrupt
     finally:
         _show([results[task] for task in tasks if task in results], len(tasks), as_json)
     failed = sum(result.values["problem"] is not None for result in results.values())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -70,15 +70,16 @@ def run_recordings(
     shown: set[str] = set()
     try:
         with StopSignal() as stop:
-            runs = run_jobs(partial(_run, settings=network.config), jobs, workers, _killed)
-            if workers == 1:
-                runs = _until(runs, lambda: stop.asked)
+            work = partial(_run, settings=network.config)
+            runs = run_jobs(work, jobs, workers, _killed, lambda: stop.asked)
             for result in with_progress(runs, len(jobs), "Running", _outcome):
                 results[result.job] = result
                 for line in result.about_network:
                     if line not in shown:
                         say(line)
                         shown.add(line)
+            if stop.asked:
+                raise KeyboardInterrupt
     finally:
         _show([results[job] for job in jobs if job in results], network, len(jobs), as_json)
     failed = sum(result.report.error is not None for result in results.values())
@@ -139,8 +140,9 @@ def _check(jobs: Sequence[Job], network: Network) -> None:
     outputs = [job.wearer.outputs for job in jobs]
     written = [Path(name) for each in outputs for _, name in target_texts(each.targets)]
     inputs = {path.resolve() for job in jobs for path in (job.source, job.wearer.calibration)}
+    inputs.add(network.info.path.resolve())
     for path in written:
-        if path.resolve() in inputs | {network.info.path.resolve()}:
+        if path.resolve() in inputs:
             raise EdgeposeError(f"{path} would be written over an input; name another folder")
     if not outputs[0].overwrite:
         check_free(written, "add --overwrite, or name other folders")
@@ -188,14 +190,6 @@ def _run(job: Job, settings: NetworkConfig) -> Result:
 
 def _killed(job: Job, reason: str) -> Result:
     return Result(job, RunReport.of_failed(job.wearer, EdgeposeError(reason)))
-
-
-def _until(results: Iterable[Result], stopped: Callable[[], bool]) -> Iterator[Result]:
-    """Yield results; after a stop signal raise KeyboardInterrupt once the recording in progress is done."""
-    for result in results:
-        yield result
-        if stopped():
-            raise KeyboardInterrupt
 
 
 # --- results ------------------------------------------------------------------------------------------------

@@ -96,7 +96,8 @@ def _expand(source: Path, outs: Collection[Path], kind: Kind) -> Iterator[InputF
     elif source.exists():
         if not source.is_file():
             raise EdgeposeError(
-                f"{source}: not a regular file; convert its output from standard input: convert - < {source}"
+                f"{source}: not a regular file; give its content as standard input: convert - or --file -, "
+                f"with < {source}"
             )
         yield InputFile(source, Path(source.stem))
     elif any(mark in str(source) for mark in "*?["):

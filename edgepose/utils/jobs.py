@@ -18,6 +18,7 @@ def run_jobs(
     jobs: Sequence[JobT],
     workers: int,
     failed: Callable[[JobT, str], ResultT],
+    stopped: Callable[[], bool] = lambda: False,
 ) -> Iterator[ResultT]:
     """Do jobs, and yield their results as they finish.
 
@@ -26,9 +27,13 @@ def run_jobs(
         jobs: the jobs.
         workers: number of processes; 1 works in this process.
         failed: returns the result of a job whose process was killed, given the reason.
+        stopped: whether no further jobs are to begin; those in progress are finished. Asked after each.
     """
     if workers == 1 or len(jobs) < 2:
-        yield from map(work, jobs)
+        for job in jobs:
+            yield work(job)
+            if stopped():
+                return
         return
     # Forking a process with threads may hang; spawned processes behave alike on every system.
     context = multiprocessing.get_context("spawn")
@@ -41,11 +46,16 @@ def run_jobs(
             signal.signal(signal.SIGINT, before)
         try:
             for future in as_completed(futures):
+                if future.cancelled():
+                    continue
                 try:
                     yield future.result()
                 except BrokenProcessPool:
                     reason = "its process was killed, perhaps for lack of memory; use fewer --jobs"
                     yield failed(futures[future], reason)
+                if stopped():
+                    for other in futures:
+                        other.cancel()
         finally:
             # After an interrupt, jobs in progress are finished, so that no file is left incomplete.
             pool.shutdown(cancel_futures=True)

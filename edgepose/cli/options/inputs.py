@@ -11,12 +11,16 @@ import click
 
 _SOURCES = ("file", "port", "can", "listen", "connect")
 
+_ARGUMENT: dict[str, Any] = {
+    "nargs": -1,
+    "metavar": "[IN]...",
+    "type": click.Path(path_type=Path, allow_dash=True),
+}
+
 
 def inputs_argument() -> click.Argument:
     """Return the argument, which the command gets as `inputs: tuple[Path, ...]`."""
-    return click.Argument(
-        ["inputs"], nargs=-1, metavar="[IN]...", type=click.Path(path_type=Path, allow_dash=True)
-    )
+    return click.Argument(["inputs"], **_ARGUMENT)
 
 
 def with_first(inputs: tuple[Path, ...], values: Mapping[str, Any]) -> dict[str, Any]:
@@ -39,7 +43,4 @@ def recordings_or_source(command: Callable[..., Any]) -> Callable[..., Any]:
     def with_inputs(inputs: tuple[Path, ...], **values: Any) -> Any:
         return command(inputs=inputs, **with_first(inputs, values))
 
-    argument = inputs_argument()
-    return click.argument(
-        str(argument.name), nargs=argument.nargs, metavar=argument.metavar, type=argument.type
-    )(with_inputs)
+    return click.argument("inputs", **_ARGUMENT)(with_inputs)

@@ -430,7 +430,7 @@ def test_a_named_pipe_is_refused(command, tmp_path):
     os.mkfifo(tmp_path / "a.csv")
     result = command("convert", tmp_path / "a.csv", "--to", "npz", "--out", tmp_path / "out")
     assert result.returncode == 1
-    assert result.stderr.startswith(f"edgepose: {tmp_path / 'a.csv'}: not a regular file; convert its output")
+    assert result.stderr.startswith(f"edgepose: {tmp_path / 'a.csv'}: not a regular file; give its content")
 
 
 def test_names_that_are_no_text_and_a_pipe(command, tmp_path):

@@ -158,12 +158,24 @@ def test_wrong_use(command, wearer, takes, words, says):
     assert sorted(path.name for path in takes.parent.iterdir()) == ["takes"]
 
 
-def test_ctrl_c_between_two_recordings(wearer, tmp_path):
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_ctrl_c_between_two_recordings(wearer, tmp_path, jobs):
     """What was begun is whole, and the table has what was done."""
     (tmp_path / "takes").mkdir()
     for i in range(20):
         (tmp_path / "takes" / f"{i:02}.npz").write_bytes(wearer.recording.read_bytes())
-    words = ("run", "takes", "--calibration", wearer.calibration, "--csv", "p", *RNN, "--json")
+    words = (
+        "run",
+        "takes",
+        "--calibration",
+        wearer.calibration,
+        "--csv",
+        "p",
+        *RNN,
+        "--jobs",
+        jobs,
+        "--json",
+    )
     process = processes.Popen(
         [sys.executable, "-m", "edgepose", *map(str, words)],
         cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
