@@ -1,5 +1,6 @@
 """`edgepose evaluate --place`, and the paths of `evaluate --real`."""
 
+import json
 import re
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from edgepose_export.evaluation.real_wearers import FOLDER
 from edgepose_export.mocap import read_motion, resample
 from edgepose_export.synthesis.virtual_imus import recording_arrays, virtual_imus
 from edgepose_export.training.dataset import Take, read_take
+from tests.support.documented_keys import documented
 
 WALK = Path(__file__).parents[1] / "data" / "mocap" / "dataset-2_walk_normal_001.bvh"
 FRAMES = 721
@@ -158,6 +160,27 @@ def test_the_command_shows_rows_kinds_and_a_picture(folder, tmp_path):
     for row in (*ROWS, "truth", "count"):
         assert re.search(rf"^{row} +[\d-]", result.output, re.MULTILINE), row
     assert picture.stat().st_size > 10_000
+
+
+def test_json_has_the_tables(folder, arrays):
+    found = []
+    for words in ([], ["--place"]):
+        result = invoke("evaluate", "--data", folder, "--model", "rnn", *words, "--json")
+        assert result.exit_code == 0, result.output
+        found.append(json.loads(result.stdout))
+        assert set(found[-1]) == {"command", *documented("evaluate")}
+    poses, place = found
+    (table,) = poses["tables"]
+    assert (table["kind"], table["title"]) == ("poses", "cmu-walk-run")
+    assert table["rows"]["offline, whole take"]["sip_error_deg"]["frames"] == len(arrays["poses"])
+    assert 2.0 < table["rows"]["offline, whole take"]["sip_error_deg"]["mean"] < 20.0
+    (contacts,) = poses["contacts"]
+    assert (contacts["part"], contacts["model"]) == ("cmu-walk-run", "rnn")
+    assert 0.5 < contacts["contact"] <= 1.0
+    assert [table["kind"] for table in place["tables"]] == ["place", "place by motion"]
+    rows = place["tables"][0]["rows"]
+    assert rows["no heads"]["1 m"]["mean"] > 0.0
+    assert rows["no heads"]["10 s"]["mean"] is None  # a way that is too short
 
 
 @pytest.mark.parametrize(

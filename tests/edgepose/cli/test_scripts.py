@@ -16,18 +16,10 @@ from edgepose.formats.poses.registry import read_poses
 from edgepose.formats.recordings.csv import write_csv
 from edgepose.formats.recordings.registry import read_recording
 from tests.support import processes
+from tests.support.documented_keys import SCRIPTS, documented
 
-DOCS = Path(__file__).parents[3] / "docs" / "reference" / "scripts.md"
 RNN = ("--model", "rnn", "--runtime", "numpy")
 BASICS = ("--body-frame", "heading:0", "--hold", 0.3)
-
-
-def documented(command: str, part: str = "") -> set[str]:
-    """The keys in a table of the documentation: of a command's document, or of each of a part."""
-    section = DOCS.read_text().split(f"\n### {command}\n")[1].split("\n### ")[0]
-    table = section.split(f"\nEach of `{part}`:\n")[1] if part else section.split("\nEach of ")[0]
-    firsts = re.findall(r"^\| (`.*?) \|", table, re.MULTILINE)
-    return {key for first in firsts for key in re.findall(r"`(\w+)`", first)}
 
 
 def document(result, command: str) -> dict:
@@ -39,7 +31,7 @@ def document(result, command: str) -> dict:
 
 
 def test_exit_codes_are_documented():
-    rows = re.findall(r"^\| (\d+) \| (.*) \|$", DOCS.read_text(), re.MULTILINE)
+    rows = re.findall(r"^\| (\d+) \| (.*) \|$", SCRIPTS.read_text(), re.MULTILINE)
     assert {int(code): meaning for code, meaning in rows} == MEANINGS
 
 
@@ -209,7 +201,7 @@ def test_conversions(command, takes, tmp_path):
     assert result.returncode == 1
     files = document(result, "convert")["files"]
     assert [each["result"] for each in files] == ["ok", "ok", "failed"]
-    section = DOCS.read_text().split("\n### convert\n")[1].split("\n### ")[0]
+    section = SCRIPTS.read_text().split("\n### convert\n")[1].split("\n### ")[0]
     assert all(f"`{key}`" in section for key in files[0])
 
 
