@@ -81,8 +81,6 @@ def _plan(inputs: Sequence[Path], out: str) -> list[_Task]:
         )
     tasks: dict[Path, _Task] = {}
     for file in expand(inputs, [Path(out)], recordings()):
-        if str(file.path) == "-":
-            raise click.UsageError("- is standard input, which is one recording: use --file -")
         task = _Task(file.path, Path(out) / file.name.parent / f"{file.name.name}.json")
         other = tasks.setdefault(task.out, task)
         if other.source != file.path:

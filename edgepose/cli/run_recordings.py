@@ -100,8 +100,6 @@ def _plan(inputs: Sequence[Path], wearer: WearerConfig) -> list[Job]:
         if name not in SINKS or not SINKS[name].suffix:
             flags = ", ".join(f"--{name}" for name, output in SINKS.items() if output.suffix)
             raise click.UsageError(f"--{name} is for one source; recordings named as IN take {flags}")
-    if wearer.source.realtime:
-        raise click.UsageError("--realtime is for one --file; leave it out with recordings named as IN")
     folders = [Path(folder) for _, folder in target_texts(wearer.outputs.targets)]
     for folder in folders:
         if str(folder) == "-" or is_stream(folder) or folder.is_file():
@@ -110,8 +108,6 @@ def _plan(inputs: Sequence[Path], wearer: WearerConfig) -> list[Job]:
             )
     jobs: dict[Path, Job] = {}
     for file in expand(inputs, folders, recordings()):
-        if str(file.path) == "-":
-            raise click.UsageError("- is standard input, which is one recording: use --file -")
         other = jobs.setdefault(file.name, _job(file, wearer))
         if other.source != file.path:
             raise EdgeposeError(

@@ -27,12 +27,16 @@ def with_first(inputs: tuple[Path, ...], values: Mapping[str, Any]) -> dict[str,
     """Return the values of the flags of a source, which is the first input if there are inputs.
 
     Raises:
-        click.UsageError: inputs and a source are given.
+        click.UsageError: inputs and a source are given, or an input is not read at once from a file.
     """
     if not inputs:
         return dict(values)
     if flags := [name for name in _SOURCES if values[name] is not None]:
         raise click.UsageError(f"give either recordings as IN or a source with --{flags[0]}, not both")
+    if values["realtime"]:
+        raise click.UsageError("--realtime is for one --file; leave it out with recordings named as IN")
+    if any(str(path) == "-" for path in inputs):
+        raise click.UsageError("- is standard input, which is one recording: use --file -")
     return {**values, "file": inputs[0]}
 
 

@@ -135,6 +135,8 @@ def test_calibrations_and_then_runs_with_them_in_two_processes(command, takes, t
         ("run takes --csv p --udp 127.0.0.1:9", "--udp is for one source; recordings named as IN take --csv"),
         ("run takes --csv -", "recordings named as IN take a folder for each output"),
         ("run takes --csv p --realtime", "--realtime is for one --file"),
+        ("calibrate takes --out c --realtime", "--realtime is for one --file"),
+        ("calibrate - --out c", "- is standard input, which is one recording: use --file -"),
         ("run --file a.npz --csv - --json", "--csv and --json both write to standard output"),
         ("calibrate takes", "recordings named as IN take a folder, such as --out calibrations"),
         ("calibrate --file a.npz --out - --json", "--out - and --json both write to standard output"),
