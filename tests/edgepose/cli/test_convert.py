@@ -199,7 +199,7 @@ def check_xio(file: Path, written: list[ImuSample], left_out: int = 0) -> None:
 def test_an_xio_session(command, tmp_path):
     names = [f"{name.replace('_', ' ').title()} 64F0000{i} (UDP)" for i, name in enumerate(PLACEMENTS)]
     written = xio_session(tmp_path / "walk.1", names)
-    shutil.copytree(tmp_path / "walk.1" / names[0], tmp_path / "walk.1" / "Left Foot 64F0000A (UDP)")
+    shutil.copytree(tmp_path / "walk.1" / names[0], tmp_path / "walk.1" / "Spare 64F0000A (UDP)")
     result = command("convert", tmp_path, "--to", "npz", "--out", tmp_path / "out")
     assert result.returncode == 0, result.stderr
     assert table(result) == {"walk.1": ["600", "1.0", "ok"]}
@@ -251,7 +251,8 @@ def test_a_damaged_xio_session(tmp_path):
         ("RightForearm", "right_forearm"),
         ("right-lower-leg", "right_lower_leg"),
         ("Headset", None),
-        ("Left Foot 64F0EBCE (UDP)", None),
+        ("Left Foot 64F0EBCE (UDP)", "left_foot"),
+        ("Left Toe 64F0EBCE (UDP)", None),
     ],
 )
 def test_placements_in_names_of_folders(name, placement):
