@@ -11,7 +11,7 @@ import numpy as np
 from edgepose.config import WearerConfig
 from edgepose.errors import EdgeposeError
 from edgepose.pipeline.wearer_pipeline import RunSummary
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import PLACEMENTS, SENSORS
 from edgepose.sinks.registry import described
 from edgepose.sources import SourceCounters
 
@@ -107,8 +107,10 @@ class RunReport:
                 "after all sensors were silent for a minute or more"
             )
         if summary.held:
-            worst = summary.held_by_sensor.most_common()
-            lines.append("held     " + ", ".join(f"{name} in {count} frames" for name, count in worst))
+            counted = dict.fromkeys(SENSORS, 0) | summary.held_by_sensor
+            worst = sorted(counted.items(), key=lambda item: -item[1])  # equal counts in the usual order
+            named = ", ".join(f"{name} in {count} frames" for name, count in worst if count)
+            lines.append(f"held     {named}")
         for slip in summary.slips:
             lines.append(f"slipped  {slip.placement} by about {slip.angle_deg:.0f} deg")
         if summary.way_m is not None:
