@@ -11,9 +11,9 @@ from edgepose.utils.output_targets import find_target
 
 OTHER_ENDINGS = (
     *(".json", ".html", ".htm", ".png", ".pdf", ".svg", ".pt", ".md", ".toml", ".asf", ".amc", ".py"),
-    *(".bin", ".raw", ".times", ".asc", ".blf", ".log", ".mf4", ".trc", ".db"),
+    *(".bin", ".raw", ".times", ".asc", ".blf", ".log", ".mf4", ".trc", ".db", ".gltf"),
 )
-"""Endings of the files that edgepose reads or writes besides recordings and poses."""
+"""Endings of the files that edgepose reads or writes besides recordings and poses, and of glTF as text."""
 
 
 def known_endings() -> frozenset[str]:

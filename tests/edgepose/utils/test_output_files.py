@@ -115,7 +115,7 @@ def test_endings_of_files_that_are_read_or_written():
     assert {output.suffix for output in SINKS.values()} - {""} <= known_endings()
 
 
-@pytest.mark.parametrize("ending", [".mvnx", ".sensors", ".log", ".json", ".PKL"])
+@pytest.mark.parametrize("ending", [".mvnx", ".sensors", ".log", ".json", ".PKL", ".gltf"])
 def test_no_output_replaces_a_file_of_another_kind(tmp_path, ending):
     other = tmp_path / f"walk{ending}"
     other.write_bytes(OLD)
