@@ -24,8 +24,12 @@ class RigComparison:
     """Sensors that are all at rest: side by side, or on a wearer who stands in the pose of a calibration."""
 
     def __init__(self, calibration: Calibration | None) -> None:
-        """Create the comparison; without a calibration only sensors that lie side by side are compared."""
-        self._worn = None if calibration is None else WornComparison(calibration)
+        """Create the comparison.
+
+        Without a calibration of all six, only sensors that lie side by side are compared.
+        """
+        whole = None if calibration is None or calibration.without else calibration
+        self._worn = None if whole is None else WornComparison(whole)
         self._table_deg: Array | None = None
 
     def update(self, sensors: Sequence[Sensor]) -> None:

@@ -252,6 +252,19 @@ def test_a_map_gives_ids_to_more_or_fewer_sensors(tmp_path: Path, command) -> No
     assert "5 of 5 sensors fine" in checked.stdout
 
 
+def test_a_sensor_that_the_calibration_lacks_is_not_compared_with_it(tmp_path: Path, command) -> None:
+    write_csv(tmp_path / "walk.csv", rig(*PLACEMENTS))
+    line = ("--file", tmp_path / "walk.csv")
+    made = command(
+        *("calibrate", *line, "--without", "head", "--hold", 3, "--from", "+0.3"),
+        *("--body-frame", "heading:28", "--out", tmp_path / "calib.json"),
+    )
+    assert made.returncode == 0, made.stderr
+    checked = command("check", *line, "--calibration", tmp_path / "calib.json")
+    assert checked.returncode == 0, checked.stdout
+    assert "6 of 6 sensors fine" in checked.stdout
+
+
 def test_a_recording_names_its_further_sensors(tmp_path: Path) -> None:
     whole = Recording(
         {name: cut(data, data.time_s < 0.5) for name, data in rig(*SENSORS).sensors.items()}, {}
