@@ -10,7 +10,7 @@ from edgepose.formats.recordings.base import ReadOptions, RecordingFormat
 from edgepose.formats.recordings.time_checks import check_times, find_clocks_apart
 from edgepose.formats.registered import Reader, all_formats, built_in_format
 from edgepose.imu import Recording
-from edgepose.placements import PLACEMENTS
+from edgepose.placements import LACKING, PLACEMENTS
 
 READERS = {
     "csv": Reader("edgepose.formats.recordings.csv:FORMAT", ".csv"),
@@ -51,8 +51,10 @@ def read_recording(
     missing = [name for name in missing_sensors(recording) if name not in without]
     if missing:
         damage = f" ({recording.damage})" if recording.damage else ""
+        lacking = f"; if the rig lacks them: calibrate --without {','.join(missing)}"
         raise FileFormatError(
-            f"{path}: no samples of {', '.join(missing)}; a recording needs all six sensors{damage}"
+            f"{path}: no samples of {', '.join(missing)}; a recording needs all six sensors"
+            f"{lacking if LACKING.issuperset(missing) else ''}{damage}"
         )
     apart = find_clocks_apart(recording, str(path))
     if apart:

@@ -217,7 +217,9 @@ def test_good_frames_of_a_damaged_file(files, wearer, tmp_path):
 def test_five_sensors_are_too_few(files, tmp_path):
     shutil.copytree(files["xio-session"], tmp_path / "walk")
     shutil.rmtree(tmp_path / "walk" / "head")
-    with pytest.raises(EdgeposeError, match="no samples of head; a recording needs all six sensors"):
+    with pytest.raises(
+        EdgeposeError, match=r"no samples of head; a recording needs all six .*--without head$"
+    ):
         read_recording(tmp_path / "walk")
     assert len(salvage_recording(tmp_path / "walk").sensors) == 5
 
