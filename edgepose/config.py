@@ -173,8 +173,10 @@ class OutputConfig:
             )
         if rate is not None and not RATES[0] <= rate <= RATES[1]:
             raise ConfigError(f"rate: {rate:g} is not from {RATES[0]:g} to {RATES[1]:g} poses per second")
-        if page_port is not None and not (1 <= page_port <= 65535 and "view" in dict(pairs)):
-            raise ConfigError(f"--page-port {page_port}: give a port up to 65535, for the page of --view")
+        if page_port is not None and "view" not in dict(pairs):
+            raise ConfigError(f"--page-port {page_port} is that of the page of --view: give --view as well")
+        if page_port is not None and not 1 <= page_port <= 65535:
+            raise ConfigError(f"--page-port {page_port} is not from 1 to 65535")
         values = (tuple(pairs), rotations, std, height, leg_length, overwrite, rate, page_port)
         for each, value in zip(dataclasses.fields(self), values, strict=True):
             object.__setattr__(self, each.name, value)

@@ -30,9 +30,10 @@ def check_body_frame(text: str) -> str:
         name in PLACEMENTS and len(value.lstrip("+-")) == 1 and value[-1] in "xyz" and len(value) <= 2
     )
     if text != "head" and not axis_given and (name != "heading" or _finite(value) is None):
+        hint = "" if name in (*PLACEMENTS, "heading") else f"; {choices(name, PLACEMENTS, 'sensors are')}"
         raise CalibrationError(
             f"body frame {text!r} is none of: head, heading:DEG, SENSOR:AXIS "
-            f"(such as pelvis:-z); {choices(name, [*PLACEMENTS, 'heading'], 'sensors are')}"
+            f"(such as heading:90, pelvis:-z){hint}"
         )
     return text
 

@@ -188,7 +188,8 @@ class DatagramSink(Sink):
         try:
             family, address = resolve(host, port, socket.SOCK_DGRAM)
         except (OSError, UnicodeError) as error:
-            raise EdgeposeError(f"cannot find host {host!r} to send poses to: {error}") from error
+            reason = getattr(error, "strerror", None) or error
+            raise EdgeposeError(f"cannot find host {host!r} to send poses to: {reason}") from error
         if ip_address(address[0].partition("%")[0]).is_multicast and cast != "multicast":
             raise EdgeposeError(_many_machines(host, port, "multicast"))
         self._socket = socket.socket(family, socket.SOCK_DGRAM)

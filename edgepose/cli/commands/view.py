@@ -74,7 +74,8 @@ def view(
       edgepose view --udp 0.0.0.0:9000 --host 0.0.0.0
     """
     if (poses is None) == (udp is None):
-        raise click.UsageError("give a file of POSES, or --udp HOST:PORT")
+        both = "" if poses is None else ", not both"
+        raise click.UsageError(f"give a file of POSES, or --udp HOST:PORT{both}")
     if reference is not None and poses is None:
         raise click.UsageError("--reference needs a file of POSES")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -245,6 +246,14 @@ def test_an_axis_near_the_vertical_gives_no_forward(axis: str) -> None:
 )  # fmt: skip
 def test_a_body_frame_that_is_none_is_refused(text: str) -> None:
     with pytest.raises(EdgeposeError, match=r"is none of: head, heading:DEG, SENSOR:AXIS"):
+        cal.check_body_frame(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "hint"), [("heading:x", ""), ("head:w", ""), ("pelvs:z", "; did you mean 'pelvis'?")]
+)
+def test_a_wrong_body_frame_names_sensors_only_if_that_is_wrong(text: str, hint: str) -> None:
+    with pytest.raises(EdgeposeError, match=rf"\(such as heading:90, pelvis:-z\){re.escape(hint)}$"):
         cal.check_body_frame(text)
 
 

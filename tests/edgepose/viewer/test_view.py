@@ -487,7 +487,7 @@ def test_a_viewer_ends_with_a_run_that_is_killed(wearer, tmp_path):
     ("words", "code", "says"),
     [
         ("", 2, "give a file of POSES, or --udp HOST:PORT"),
-        ("poses.csv --udp 127.0.0.1:9000", 2, "give a file of POSES, or --udp HOST:PORT"),
+        ("poses.csv --udp 127.0.0.1:9000", 2, "give a file of POSES, or --udp HOST:PORT, not both"),
         ("--udp 127.0.0.1:9000 --reference poses.csv", 2, "--reference needs a file of POSES"),
         ("nothing.csv", 1, "cannot read poses from nothing.csv"),
         ("poses.csv --reference notes.md", 1, "notes.md is not a file of poses"),
@@ -604,8 +604,10 @@ def test_the_page_of_a_run_is_where_it_is_wanted_or_nowhere(caplog):
         port = taken.getsockname()[1]
         with pytest.raises(EdgeposeError, match=rf"port {port}: Address already in use.*another --page-port"):
             open_outputs(stack, OutputConfig(view=True, page_port=port))
-    with pytest.raises(ConfigError, match=r"--page-port 8081: give a port .* for the page of --view"):
+    with pytest.raises(ConfigError, match="--page-port 8081 is that of the page of --view: give --view"):
         OutputConfig(csv="a.csv", page_port=8081)
+    with pytest.raises(ConfigError, match="--page-port 0 is not from 1 to 65535"):
+        OutputConfig(view=True, page_port=0)
 
 
 def test_two_wearers_want_one_port(command, wearer, tmp_path):
