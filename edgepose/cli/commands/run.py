@@ -141,7 +141,7 @@ def _headline(network: Network, precision: str, wearers: list[WearerConfig], has
     mode = "window" if network.windowed else "stream"
     hint = ", r re-zeroes headings" if has_keys else ""
     if has_keys and not all(wearer.no_place for wearer in wearers):
-        hint += ", o resets the place"
+        hint += ", o goes back to the origin"
     return (
         f"running {count}{network.config.model} ({network.kind}, {mode}) in {precision}; "
         f"Ctrl-C ends the run{hint}"

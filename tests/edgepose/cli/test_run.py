@@ -558,7 +558,9 @@ def test_the_place_is_reset_by_key_text_and_osc(wearer, tmp_path):
                 ask()
             screen += rest_of(outside)
             assert process.wait(60) == 0
-    assert b"Ctrl-C ends the run, r re-zeroes headings, o resets the place" in b" ".join(screen.split())
+    assert b"Ctrl-C ends the run, r re-zeroes headings, o goes back to the origin" in b" ".join(
+        screen.split()
+    )
     assert b"datagrams without" not in screen
     path = read_poses(file).translation[:, [0, 2]]
     assert (path == 0.0).all(axis=1).sum() == 4  # the start, and after each request
