@@ -74,6 +74,8 @@ class SourceConfig:
         lines = any(name is not None for name in self.lines)
         if (self.file is not None and lines) or not (lines or self.file or self.sensors):
             raise ConfigError(ONE_SOURCE)
+        if self.realtime and self.file is None:
+            raise ConfigError("--realtime is for a --file: live sensors have their own pace")
 
     @property
     def live(self) -> bool:

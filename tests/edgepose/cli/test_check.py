@@ -294,6 +294,7 @@ def test_warnings_are_on_the_page_and_stay(tmp_path):
     ("words", "code", "says"),
     [
         ("", 2, "give one source"),
+        ("--port x --realtime", 2, "--realtime is for a --file: live sensors have their own pace"),
         ("--file REAL --port x", 2, "give one source"),
         ("--file REAL --seconds 0", 2, "--seconds"),
         ("--file nowhere.npz", 1, "cannot read it"),

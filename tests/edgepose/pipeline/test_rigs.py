@@ -129,6 +129,7 @@ def test_addresses_and_lines_are_read_as_flags(rig):
         ({"udp": "127.0.0.1"}, "udp: no port in '127.0.0.1'"),
         ({"calibration": None}, "calibration is missing"),
         ({"file": None}, "give one source: port PORT"),
+        ({"file": None, "port": "a", "realtime": True}, "realtime is for a file: live sensors have"),
         ({"port": "/dev/ttyUSB0"}, "give one source: port PORT"),
         ({"csv": None}, "give at least one output, such as csv FILE"),
         ({"control": "127.0.0.1:9"}, "control needs live sensors, or realtime"),
