@@ -233,7 +233,7 @@ def _check_six(plan: CalibrationPlan, names: Sequence[str]) -> None:
     flag = "--heading-reset steps" if plan.heading_reset == "steps" else f"--pose {plan.pose}"
     if (plan.heading_reset == "steps" or plan.pose == TWO_POSES) and list(names) != list(PLACEMENTS):
         raise EdgeposeError(
-            f"{flag} works with the six sensors only, and this rig has {len(names)}: use another one"
+            f"{flag} works with the six sensors only, and this rig has {len(names)}: choose another way"
         )
 
 

@@ -11,7 +11,7 @@ from edgepose.cli.guide.guide import Guide, start_stage
 from edgepose.cli.guide.stage import COUNTDOWN, HOLD, MOVE, Stage
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
-from edgepose.placements import PLACEMENTS, SENSORS
+from edgepose.placements import LACKING, PLACEMENTS, SENSORS
 from edgepose.sources import Batch
 
 REPEATS = 3
@@ -66,8 +66,10 @@ def wait_for_all_sensors(batches: Iterator[Batch], guide: Guide, names: Sequence
             guide(f"Waiting for {_names(missing)}.")
         if passed_s > ALL_REPORT_S:
             break
+    silent = [SENSORS[i] for i in sorted(missing)]
+    lacking = f"; if the rig lacks them: --without {','.join(silent)}" if LACKING.issuperset(silent) else ""
     raise EdgeposeError(
-        f"nothing from {_names(missing)} in {passed_s:.0f} s: check power, link and id of each"
+        f"nothing from {_names(missing)} in {passed_s:.0f} s: check power, link and id of each{lacking}"
     )
 
 

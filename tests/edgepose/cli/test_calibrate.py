@@ -375,6 +375,7 @@ def test_missing_sensors_are_waited_for_and_then_named(
     result = run("--port", wearer.port, "--out", tmp_path / "calib.json")
     assert "Waiting for right_forearm, head." in result.output
     assert error_of(result).startswith("nothing from right_forearm, head in 1 s: check power, link and id")
+    assert error_of(result).endswith("; if the rig lacks them: --without right_forearm,head")
 
 
 def test_headings_from_guided_motion(wearer: Wearer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
