@@ -129,7 +129,7 @@ def convert(
       edgepose convert walk.npz --to csv --out .
       edgepose convert sessions/ "more/*.bin" --to npz --out recordings --jobs 4
       edgepose convert raw.csv --to npz --out oriented --filter smoother
-      edgepose convert poses/ --to bvh,names=mixamo --out for-blender --jobs 2 --height 1.68
+      edgepose convert poses/ --to bvh,names=mixamo --out blender --height 1.68
       edgepose convert poses.csv --to npz,joints=52 --out amass --rate 30
       edgepose run ... --csv - | edgepose convert - --to bvh --out .
     """

@@ -63,7 +63,7 @@ def run(
     \b
     Examples:
       edgepose run --port /dev/ttyUSB0 --calibration calib.json --csv poses.csv
-      edgepose run --port COM3 --calibration calib.json --udp 10.0.0.5:9000 --udp 10.0.0.6:9000
+      edgepose run --port COM3 --calibration c.json --udp pc:9000 --udp pi:9000
       edgepose run --can socketcan:can0 --calibration calib.json --npz walk.npz
       edgepose run --sensors rig.toml --calibration calib.json --model rnn --view
       edgepose run --port COM3 --filter kalman --calibration calib.json --view
