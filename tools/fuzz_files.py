@@ -1,7 +1,7 @@
 """Damages files of every kind that edgepose reads, and runs the commands that read them.
 
 Each case damages a whole file at random and runs one command on it in a process with limits: 10 s and 1 GB of
-memory. Whatever the file holds, a command must end with exit code 0, or with 1 or 2 and a message. It must
+memory. Whatever the file holds, a command must end with exit code 0, or with 1, 2 or 3 and a message. It must
 not write NaN or infinity, and not leave samples out without a message.
 """
 
@@ -106,7 +106,7 @@ def judge(ended: Ended, out: Path, whole: int | None) -> tuple[str, str]:
         )
     if warned := re.search(r".*:\d+: \w*Warning: .*", ended.errors):
         return "warning of Python", warned[0]
-    if ended.code not in (0, 1, 2):
+    if ended.code not in (0, 1, 2, 3):
         return "other exit code", f"{ended.code}: {message}"
     if ended.code and not (message or ended.out):
         return "no message", ""
