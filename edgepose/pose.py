@@ -23,6 +23,9 @@ CONTACTS = (
 RATES = (1.0, 1000.0)
 """Lowest and highest rate of poses that can be asked for, Hz."""
 
+LONGEST_GAP_S = 1.0
+"""Longest time between two poses that another rate fills, seconds: beyond it all sensors were silent."""
+
 _ORDER = {name: i for i, name in enumerate(SITES)}
 
 

@@ -6,10 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from edgepose.pose import PoseFrame
+from edgepose.pose import LONGEST_GAP_S, PoseFrame
 from edgepose.rotations import matrix_to_quat, quat_to_matrix, slerp
 
-_GAP_S = 1.0  # longer gaps are not filled: all sensors were silent for a minute
 _SAME = 1e-3  # share of the time between two poses that counts as none
 
 
@@ -36,7 +35,7 @@ class PoseResampler:
     def add(self, pose: PoseFrame) -> list[PoseFrame]:
         """Return the poses at the times up to that of the next pose, numbered from 0."""
         before, self._before = self._before, pose
-        if before is None or not 0.0 < pose.time_s - before.time_s <= _GAP_S:
+        if before is None or not 0.0 < pose.time_s - before.time_s <= LONGEST_GAP_S:
             before = pose
             # Wearers on one grid of frames stay on one grid.
             self._offset_s = pose.time_s - round(pose.time_s * self._input_rate) / self._input_rate

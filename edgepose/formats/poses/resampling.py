@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edgepose.pose import PoseSequence
+from edgepose.pose import LONGEST_GAP_S, PoseSequence
 from edgepose.rotations import Array, matrix_to_quat, quat_to_matrix, slerp
 
 
@@ -46,21 +46,28 @@ def interpolate(poses: PoseSequence, before: NDArray[np.int64], share: Array) ->
 
 
 def resample(poses: PoseSequence, rate: float) -> PoseSequence:
-    """Return poses at another rate, numbered from 0, without extrapolation.
+    """Return poses at another rate, numbered from 0, without extrapolation; each part begins with its own.
 
     Args:
-        poses: poses whose frame numbers have equal steps.
+        poses: poses whose frame numbers have equal steps; parts lie more than `LONGEST_GAP_S` apart.
         rate: poses per second.
     """
     step = poses.rate / rate
-    count = int((len(poses.frames) - 1) / step + 1e-6) + 1
-    places = np.minimum(np.arange(count) * step, len(poses.frames) - 1)
+    gaps = np.diff(poses.time_s) > max(LONGEST_GAP_S, 1.5 / poses.rate)
+    starts = np.concatenate([[0], np.flatnonzero(gaps) + 1])
+    lasts = np.concatenate([starts[1:], [len(poses.frames)]]) - 1
+    places = np.concatenate(
+        [
+            np.minimum(start + step * np.arange(int((last - start) / step + 1e-6) + 1), last)
+            for start, last in zip(starts.tolist(), lasts.tolist(), strict=True)
+        ]
+    )
     nearest = np.round(places).astype(np.int64)
     places = np.where(np.abs(places - nearest) < 1e-6, nearest, places)
     before = places.astype(np.int64)
     found = interpolate(poses, before, places - before)
     return found._replace(
-        frames=np.arange(count),
+        frames=np.arange(len(places)),
         held=[poses.held[i] for i in nearest],
         warming_up=[poses.warming_up[i] for i in nearest],
         contacts=None if poses.contacts is None else poses.contacts[nearest],

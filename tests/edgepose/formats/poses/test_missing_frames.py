@@ -142,6 +142,21 @@ def test_another_rate(tmp_path, step, rate):
     assert read_poses(tmp_path / "b.csv").held[0] == frozenset()
 
 
+@pytest.mark.parametrize("rate", [7.0, 30.0, 100.0])
+def test_another_rate_about_a_pause(tmp_path, rate):
+    """All sensors were silent for long, so frame numbers go on; no pose is made up in between."""
+    with CsvSink(tmp_path / "a.csv") as sink:
+        for i in range(COUNT):
+            time_s = i / 60.0 + (90.0 if i >= 31 else 0.0)
+            sink.write(PoseFrame(i, time_s, np.tile(np.eye(3), (24, 1, 1)), np.zeros(24)))
+    result = convert(Job(tmp_path / "a.csv", tmp_path / "b.csv"), Options(rate=rate))
+    assert result.problem is None
+    times = read_poses(tmp_path / "b.csv").time_s
+    wanted = [np.arange(int(30 / 60 * rate + 1e-6) + 1) / rate]
+    wanted += [90.0 + 31 / 60 + np.arange(int((COUNT - 32) / 60 * rate + 1e-6) + 1) / rate]
+    np.testing.assert_allclose(times, np.concatenate(wanted), atol=2e-6)
+
+
 def test_a_recording_has_no_rate_of_poses(tmp_path):
     result = convert(Job(REAL, tmp_path / "a.csv"), Options(rate=30.0))
     assert result.problem.endswith("--rate is for poses, not for recordings; leave it out")
