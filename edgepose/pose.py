@@ -90,6 +90,11 @@ def held_sensors(held: Sequence[Set[str]], names: Sequence[str] = PLACEMENTS) ->
     return np.array(flags, bool).reshape(-1, len(names))
 
 
+def held_bits(held: Set[str]) -> int:
+    """Return the `held` of a pose as a number with bit i for PLACEMENTS[i]; other sensors have none."""
+    return sum(1 << PLACEMENTS.index(name) for name in held if name in PLACEMENTS)
+
+
 def known_sensors(held: Sequence[Set[str]]) -> list[str]:
     """Return the sensors of which poses tell something: the six, and others that were ever held."""
     return [*PLACEMENTS, *(name for name in ADDED if any(name in silent for silent in held))]
@@ -111,6 +116,16 @@ def pelvis_position(pose: PoseFrame, offsets: Array) -> Array:
     if pose.translation is not None:
         return pose.translation
     return grounded_pelvis_position(pose.rotations, offsets)
+
+
+def pelvis_positions(poses: Sequence[PoseFrame], offsets: Array) -> Array:
+    """Return the positions (T, 3) of the pelvis in T poses, see `pelvis_position`."""
+    known = [pose.translation for pose in poses if pose.translation is not None]
+    if len(known) == len(poses):
+        return np.stack(known)
+    positions = grounded_pelvis_position(np.stack([pose.rotations for pose in poses]), offsets)
+    positions[[pose.translation is not None for pose in poses]] = np.reshape(known, (-1, 3))
+    return positions
 
 
 class PoseSequence(NamedTuple):

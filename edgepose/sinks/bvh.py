@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edgepose.formats.bvh_names import BVH_NAMES
-from edgepose.pose import PoseFrame
+from edgepose.pose import PoseFrame, pelvis_positions
 from edgepose.rotations import matrix_to_euler_zxy
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.sinks.row_file import COUNT, RowFileSink
@@ -20,7 +20,6 @@ from edgepose.skeleton import (
     TIPS,
     Body,
     default_body,
-    grounded_pelvis_position,
     standing_pelvis_position,
 )
 from edgepose.utils.output_targets import FileTarget
@@ -124,10 +123,7 @@ class BvhSink(RowFileSink):
 
     def _lines(self, poses: Sequence[PoseFrame]) -> bytes:
         rotations = np.stack([pose.rotations for pose in poses])
-        positions = grounded_pelvis_position(rotations, self._offsets)
-        for i, pose in enumerate(poses):
-            if pose.translation is not None:
-                positions[i] = pose.translation
+        positions = pelvis_positions(poses, self._offsets)
         if self._needs_t_pose:
             self._needs_t_pose = False
             standing = standing_pelvis_position(self._offsets)

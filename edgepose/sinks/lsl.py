@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.csv_columns import pose_columns
-from edgepose.placements import PLACEMENTS
-from edgepose.pose import PoseFrame
+from edgepose.pose import PoseFrame, held_bits
 from edgepose.rotations import matrix_to_quat, quat_near
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.skeleton import JOINTS
@@ -111,8 +110,9 @@ class LslSink(Sink):
             if pose.contacts is None:
                 raise ValueError(f"pose {pose.index} has no contacts")
             values += pose.contacts.tolist()
-        held = sum(1 << i for i, name in enumerate(PLACEMENTS) if name in pose.held)
-        self._outlet.push_sample([*values, held, pose.warming_up], pose.time_s + self._ahead_s)
+        self._outlet.push_sample(
+            [*values, held_bits(pose.held), pose.warming_up], pose.time_s + self._ahead_s
+        )
 
     def close(self) -> None:
         """Close the stream; a second call does nothing."""

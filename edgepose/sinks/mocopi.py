@@ -6,6 +6,7 @@ known from other programs that read and write them.
 
 from __future__ import annotations
 
+import socket
 import struct
 from collections.abc import Iterable, Sequence
 
@@ -103,8 +104,10 @@ class MocopiSink(DatagramSink):
         """
         super().__init__(host, port, cast)
         self._offsets = (body or default_body()).offsets
-        own = self._socket.getsockname()[0].split(".")
-        address = struct.pack("<4H", *map(int, own)) if len(own) == 4 else bytes(8)
+        own = bytes(4)
+        if self._socket.family == socket.AF_INET:
+            own = socket.inet_aton(self._socket.getsockname()[0])
+        address = struct.pack("<4H", *own)
         self._start = _chunk(
             b"head", _chunk(b"ftyp", b"sony motion format"), _chunk(b"vrsn", b"\x01")
         ) + _chunk(b"sndf", _chunk(b"ipad", address), _chunk(b"rcvp", struct.pack("<H", port)))

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.formats.opensim import BODIES, Coordinates, body_orientations
-from edgepose.pose import PoseFrame
+from edgepose.pose import PoseFrame, pelvis_positions
 from edgepose.rotations import matrix_to_quat
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.sinks.row_file import COUNT, RowFileSink
 from edgepose.sinks.spooled import open_file_sink
-from edgepose.skeleton import Body, default_body, grounded_pelvis_position
+from edgepose.skeleton import Body, default_body
 from edgepose.utils.output_targets import FileTarget
 
 
@@ -91,10 +91,7 @@ class MotSink(_TableSink):
 
     def _lines(self, poses: Sequence[PoseFrame]) -> bytes:
         rotations = np.stack([pose.rotations for pose in poses]).astype(float)
-        positions = grounded_pelvis_position(rotations, self._offsets)
-        for i, pose in enumerate(poses):
-            if pose.translation is not None:
-                positions[i] = pose.translation
+        positions = pelvis_positions(poses, self._offsets)
         return self._table(poses, self._coordinates.add(rotations, positions))
 
 

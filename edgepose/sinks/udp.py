@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from edgepose.errors import EdgeposeError
 from edgepose.formats.joint_tree import LARGEST
 from edgepose.placements import PLACEMENTS
-from edgepose.pose import CONTACTS, PoseFrame, format_status, parse_status
+from edgepose.pose import CONTACTS, PoseFrame, format_status, held_bits, parse_status
 from edgepose.rotations import matrix_to_quat, matrix_to_rotvec, quat_to_matrix, rotvec_to_matrix
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.skeleton import JOINTS
@@ -66,7 +66,6 @@ def encode_binary(pose: PoseFrame, newest: int = 2) -> bytes:
         newest: highest version that the receiver reads.
     """
     flags = _FILLING_WINDOW if pose.warming_up else 0
-    held = sum(1 << PLACEMENTS.index(name) for name in pose.held if name in PLACEMENTS)
     place = b""
     if pose.translation is not None and newest > 1:
         flags |= 0 if pose.contacts is None else _CONTACTS
@@ -74,7 +73,7 @@ def encode_binary(pose: PoseFrame, newest: int = 2) -> bytes:
         place = _PLACE.pack(*pose.translation.tolist(), *contacts.tolist())
     quats = matrix_to_quat(pose.rotations).ravel().tolist()
     index = pose.index & 0xFFFFFFFF  # wraps after two years at 60 Hz
-    version = 2 if place else 1
+    version, held = 2 if place else 1, held_bits(pose.held)
     return _BINARY.pack(MAGIC, version, flags, held, len(JOINTS), pose.time_s, index, *quats) + place
 
 

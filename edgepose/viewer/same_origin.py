@@ -2,7 +2,8 @@
 
 viser accepts WebSockets from any web page, so a foreign page that is open in the same browser could read the
 wearer's poses and press buttons. A page whose name has been bent to this machine is foreign, too, though its
-requests name it as their host.
+requests name it as their host. One that shows the view in a frame could lead the user's click to a button, so
+browsers are told to show it in none.
 """
 
 from __future__ import annotations
@@ -44,10 +45,13 @@ def _refusing(handler: Callable[[Any, Any], Any] | None, host: str) -> Callable[
 
     def handle(connection: Any, request: Any) -> Any:
         origin, named = request.headers.get("Origin"), request.headers.get("Host", "")
-        foreign = origin is not None and urlsplit(origin).netloc != named
+        foreign = origin is not None and origin.partition("://")[2] != named
         if foreign or not _is_own_name(named, host):
             return connection.respond(HTTPStatus.FORBIDDEN, "this page may not read the view\n")
-        return None if handler is None else handler(connection, request)
+        response = None if handler is None else handler(connection, request)
+        if response is not None:
+            response.headers["Content-Security-Policy"] = "frame-ancestors 'none'"
+        return response
 
     return handle
 

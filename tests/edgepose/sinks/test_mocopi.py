@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from edgepose.sinks.mocopi import BONES, MocopiSink
@@ -97,3 +98,10 @@ def test_the_skeleton_comes_again_every_second_and_signs_do_not_change():
     quats = np.array([bones(dict(one["fram"])["btrs"])[0, :4] for one in found if "fram" in one])
     assert (np.abs(np.diff(quats, axis=0)) < 0.2).all()
     assert quats[0, 3] == -1.0
+
+
+@pytest.mark.parametrize("host", ["::1", "::ffff:127.0.0.1"])
+def test_over_ipv6_the_sender_has_no_address(host):
+    with MocopiSink(host, 12351) as sink:
+        skeleton, _ = sink.encode(pose())
+    assert dict(dict(chunks(skeleton))["sndf"])["ipad"] == bytes(8)

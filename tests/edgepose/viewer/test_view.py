@@ -592,7 +592,10 @@ def test_a_name_that_was_bent_to_this_machine_sees_nothing():
             line = http.client.HTTPConnection("127.0.0.1", viewer.port, timeout=60)
             with contextlib.closing(line):
                 line.request("GET", "/", headers={"Host": f"{name}:{viewer.port}"})
-                assert line.getresponse().status == status
+                answer = line.getresponse()
+                assert answer.status == status
+                if status == 200:  # nor does another page show it in a frame, for clicks meant for that page
+                    assert answer.headers["Content-Security-Policy"] == "frame-ancestors 'none'"
 
 
 def test_the_page_of_a_run_is_where_it_is_wanted_or_nowhere(caplog):
