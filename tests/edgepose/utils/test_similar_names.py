@@ -35,8 +35,9 @@ def test_similar_names_or_all_of_them():
         ),
         (lambda: protocol_named("vectornv"), "'vectornv'; did you mean 'vectornav' or 'vectornav-ascii'"),
         (lambda: find_archive("brinn"), "brinn: no such model; did you mean 'birnn'"),
-        (lambda: check_body_frame("pelvs:-z"), "such as pelvis:-z.; did you mean 'pelvis'"),
-        (lambda: check_body_frame("pelvis:w"), "such as pelvis:-z.; sensors are left_forearm, "),
+        (lambda: check_body_frame("pelvs:-z"), "pelvis:-z.; did you mean 'pelvis'"),
+        (lambda: check_body_frame("pelvis:w"), "such as heading:90, pelvis:-z.$"),
+        (lambda: check_body_frame("navel:z"), "pelvis:-z.; sensors are left_forearm, "),
     ],
 )
 def test_flags(use, says):
