@@ -107,20 +107,13 @@ def plan(inputs: Sequence[Path], to: str, out: Path) -> list[Job]:
     Raises:
         EdgeposeError: an input is missing or empty, or a file would be written twice or over an input.
     """
-    jobs: dict[Path, Job] = {}
-    for source, name in expand(inputs, [out], recordings_and_poses()):
-        job = Job(source, out / name.parent / f"{name.name}.{to}")
-        other = jobs.setdefault(job.target, job)
-        if other.source != source:
-            raise EdgeposeError(
-                f"{other.source} and {source} would both become {job.target}; convert them separately, "
-                "each with its own --out"
-            )
-    sources = {job.source.resolve() for job in jobs.values()}
-    for job in jobs.values():
+    files = expand(inputs, [out], recordings_and_poses())
+    jobs = [Job(source, out / name.parent / f"{name.name}.{to}") for source, name in files]
+    sources = {job.source.resolve() for job in jobs}
+    for job in jobs:
         if job.target.resolve() in sources:
             raise EdgeposeError(f"{job.target} would be written over an input; choose another --out")
-    return list(jobs.values())
+    return jobs
 
 
 def convert(job: Job, options: Options = _DEFAULTS) -> Result:

@@ -18,7 +18,7 @@ from edgepose.cli.many_files import Outcome, raise_failures, text_table, with_pr
 from edgepose.cli.options.json_result import show_json
 from edgepose.cli.terminal.messages import show, warnings_to
 from edgepose.cli.terminal.stop_signal import StopSignal
-from edgepose.errors import EdgeposeError, as_edgepose_error
+from edgepose.errors import as_edgepose_error
 from edgepose.orientation.stage import OrientationStage
 from edgepose.sources.input_files import expand, recordings
 from edgepose.utils.durable_files import make_folder
@@ -79,16 +79,10 @@ def _plan(inputs: Sequence[Path], out: str) -> list[_Task]:
         raise click.UsageError(
             f"--out {out}: recordings named as IN take a folder, such as --out calibrations"
         )
-    tasks: dict[Path, _Task] = {}
-    for file in expand(inputs, [Path(out)], recordings()):
-        task = _Task(file.path, Path(out) / file.name.parent / f"{file.name.name}.json")
-        other = tasks.setdefault(task.out, task)
-        if other.source != file.path:
-            raise EdgeposeError(
-                f"{other.source} and {file.path} would both become {task.out}; calibrate them separately, "
-                "each with its own --out"
-            )
-    return list(tasks.values())
+    return [
+        _Task(file.path, Path(out) / file.name.parent / f"{file.name.name}.json")
+        for file in expand(inputs, [Path(out)], recordings())
+    ]
 
 
 def _calibrate(task: _Task, job: CalibrationJob, overwrite: bool) -> _Result:

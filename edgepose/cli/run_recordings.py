@@ -106,15 +106,7 @@ def _plan(inputs: Sequence[Path], wearer: WearerConfig) -> list[Job]:
             raise click.UsageError(
                 f"{folder}: recordings named as IN take a folder for each output, such as --csv poses"
             )
-    jobs: dict[Path, Job] = {}
-    for file in expand(inputs, folders, recordings()):
-        other = jobs.setdefault(file.name, _job(file, wearer))
-        if other.source != file.path:
-            raise EdgeposeError(
-                f"{other.source} and {file.path} would both become {file.name}; run them separately, each "
-                "with its own folder"
-            )
-    return list(jobs.values())
+    return [_job(file, wearer) for file in expand(inputs, folders, recordings())]
 
 
 def _job(file: InputFile, wearer: WearerConfig) -> Job:

@@ -57,7 +57,7 @@ def recordings() -> Kind:
 
 
 def expand(inputs: Sequence[Path], outs: Collection[Path], kind: Kind) -> list[InputFile]:
-    """Return the files that a user's inputs stand for, each once.
+    """Return the files that a user's inputs stand for, each once, with names that are all different.
 
     Args:
         inputs: files ("-" is standard input), folders that hold them at any depth, and sessions; a name with
@@ -66,10 +66,18 @@ def expand(inputs: Sequence[Path], outs: Collection[Path], kind: Kind) -> list[I
         kind: what to look for in folders. Files that are named are not judged.
 
     Raises:
-        EdgeposeError: an input is missing or empty.
+        EdgeposeError: an input is missing or empty, or two files have the same name.
     """
     resolved = {out.resolve() for out in outs}
-    return list(dict.fromkeys(file for source in inputs for file in _expand(source, resolved, kind)))
+    files: dict[Path, InputFile] = {}
+    for file in (file for source in inputs for file in _expand(source, resolved, kind)):
+        other = files.setdefault(file.name, file)
+        if other.path != file.path:
+            raise EdgeposeError(
+                f"{other.path} and {file.path} would both become {file.name}; give them to separate "
+                "commands, each with a folder of its own for the results"
+            )
+    return list(files.values())
 
 
 def _expand(source: Path, outs: Collection[Path], kind: Kind) -> Iterator[InputFile]:

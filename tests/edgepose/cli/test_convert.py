@@ -471,9 +471,9 @@ def test_no_place_to_write_and_no_standard_input(command, tmp_path):
         (["nothing.csv"], "out", "nothing.csv: no such file or folder"),
         (["no*.csv"], "out", "no*.csv: no file matches this pattern"),
         (["empty"], "out", "empty: no recording in this folder; names end in .csv, .npz, .bin"),
-        (["a.csv", "a.npz"], "out", "a.csv and a.npz would both become out/a.csv; convert them separately"),
+        (["a.csv", "a.npz"], "out", "a.csv and a.npz would both become a; give them to separate commands"),
         (["a.csv"], ".", "a.csv would be written over an input; choose another --out"),
-        (["a.npz", "b/../a.csv"], "b/..", "convert them separately"),
+        (["a.npz", "b/../a.csv"], "b/..", "give them to separate commands"),
     ],
 )
 def test_impossible_plans(tmp_path, monkeypatch, inputs, out, says):
