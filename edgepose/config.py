@@ -67,11 +67,13 @@ class SourceConfig:
         for name in ("file", "sensors"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, Path(getattr(self, name)))
-        for name in ("baud", "bitrate"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ConfigError(f"{name}: {value} is not in the range x>=1")
         lines = any(name is not None for name in self.lines)
+        for name, line in (("baud", "port"), ("bitrate", "can"), ("fd", "can")):
+            value = getattr(self, name)
+            if name != "fd" and value is not None and value < 1:
+                raise ConfigError(f"{name}: {value} is not in the range x>=1")
+            if value and getattr(self, line) is None and (lines or self.file is not None):
+                raise ConfigError(f"--{name} is for --{line}")
         if (self.file is not None and lines) or not (lines or self.file or self.sensors):
             raise ConfigError(ONE_SOURCE)
         if self.realtime and self.file is None:
@@ -290,9 +292,7 @@ class WearerConfig:
         if not isinstance(name, str) or not name.isprintable() or not name.strip():
             raise ConfigError(f"{path}: name must be text in quotes on one line, not {name!r}")
         try:
-            values = {
-                key.replace("-", "_"): _value(key, value, path.parent) for key, value in content.items()
-            }
+            values = {key.replace("-", "_"): _value(key, v, path.parent) for key, v in content.items()}
             return cls.from_values(values, name=name, path=path)
         except EdgeposeError as error:
             # Messages name flags; the keys of the file are the flags without hyphens.
@@ -322,8 +322,7 @@ class WearerConfig:
 _TEXT, _SWITCH, _WHOLE, _NUMBER = "text in quotes", "true or false", "a whole number", "a number"
 _TEXTS = "text in quotes or a list of such texts"
 
-_TYPES: dict[str, Any] = dict.fromkeys((_TEXT, _TEXTS), (str,))
-_TYPES |= {_SWITCH: (bool,), _WHOLE: (int,), _NUMBER: (int, float)}
+_TYPES: dict[str, Any] = {_SWITCH: (bool,), _WHOLE: (int,), _NUMBER: (int, float)}  # others are text
 
 _FILES = ("file", "sensors", "calibration", *(name for name, output in SINKS.items() if output.suffix))
 """Keys whose values are files, relative to the TOML file; that of `protocol` may be one too."""
@@ -370,7 +369,7 @@ def _value(key: str, value: object, folder: Path) -> Any:
         return [_value(key, item, folder) for item in value]
     if what is None:
         raise ConfigError(f"unknown key {key!r}; {choices(key, ['name', *_KEYS, 'sinks'], 'keys are')}")
-    if type(value) not in _TYPES[what]:  # not isinstance, to which a bool is an int
+    if type(value) not in _TYPES.get(what, (str,)):  # not isinstance, to which a bool is an int
         raise ConfigError(f"{key} must be {what}, not {value!r}")
     if not isinstance(value, str):
         return float(value) if what == _NUMBER and isinstance(value, int | float) else value

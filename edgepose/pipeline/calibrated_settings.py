@@ -40,7 +40,9 @@ def check_settings(
             f"the calibration was made with --filter {calibration.filter}, and this run has --filter "
             f"{filter}: headings would differ; leave --filter out, or calibrate again"
         )
-    if no_mag and calibration.filter != "none" and calibration.north:
+    if no_mag and calibration.filter == "none":
+        raise CalibrationError("--no-mag is for a --filter, and the calibration was made without one")
+    if no_mag and calibration.north:
         raise CalibrationError(
             "the calibration was made with magnetometers: leave --no-mag out, or calibrate again with it"
         )

@@ -215,6 +215,8 @@ def calibrate(
       edgepose calibrate takes/ --out calibrations --jobs 2
     """
     _check_use(source, plan, page)
+    if no_mag and filter == "none":
+        raise click.UsageError("--no-mag is for a --filter")
     if as_json and out == "-":
         raise click.UsageError("--out - and --json both write to standard output; name a file")
     files = {"--file": source.file, "--sensors": source.sensors, "--heading-reset": plan.side_by_side}

@@ -255,6 +255,7 @@ def test_recordings_that_do_not_do(arguments: list[object], message: str) -> Non
         ),
         (["--file", REAL, "--heading-reset", "motion", "--pose", "t-pose"], "starts with hanging arms"),
         (["--file", REAL, "--heading-reset", "steps", "--pose", "t-pose"], "steps starts with hanging arms"),
+        (["--file", REAL, "--no-mag"], "--no-mag is for a --filter"),
         (["--file", REAL, "--heading-reset", "mounting:up"], "an axis is x, y or z"),
         (["--file", REAL, "--filter", "madgwick"], "'madgwick' is not one of 'none', 'kalman', 'vqf'"),
         (["--file", REAL, "--hold", -1], "-1"),

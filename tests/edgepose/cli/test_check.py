@@ -295,6 +295,8 @@ def test_warnings_are_on_the_page_and_stay(tmp_path):
     [
         ("", 2, "give one source"),
         ("--port x --realtime", 2, "--realtime is for a --file: live sensors have their own pace"),
+        ("--file REAL --baud 9600", 2, "--baud is for --port"),
+        ("--port x --fd", 2, "--fd is for --can"),
         ("--file REAL --port x", 2, "give one source"),
         ("--file REAL --seconds 0", 2, "--seconds"),
         ("--file nowhere.npz", 1, "cannot read it"),
