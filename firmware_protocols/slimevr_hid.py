@@ -7,6 +7,7 @@ little-endian; there is no time and no angular rate.
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from math import cos, pi, sin, sqrt
 
 from firmware_protocols import rotation
@@ -14,9 +15,6 @@ from firmware_protocols._numbers import int16
 from firmware_protocols._stream import Receiver
 from firmware_protocols.base import Protocol, uncounted
 from firmware_protocols.sample import STANDARD_G, Quaternion, Sample, Vector3, unit_quaternion
-
-VENDOR, RECEIVER, TRACKER = 0x1209, 0x7690, 0x7692
-"""USB ids of the vendor, of the receiver, and of a tracker on a cable."""
 
 SIZE = 16
 """Length of a report, bytes."""
@@ -34,10 +32,16 @@ _UT_STEP = 100.0 / 1024.0  # 1024 to a gauss
 class SlimevrHidDecoder(Receiver):
     """Decoder for the transfers of one receiver; `sensor` is the number that it gave to a tracker.
 
-    Samples have the orientation, and the acceleration with gravity added back.
+    Samples have the orientation, and the acceleration with gravity added back. Now and then a
+    report with a magnetic field replaces one with an acceleration; its sample repeats the tracker's last one.
     """
 
     WRAP_US = 1 << 64
+
+    def __init__(self) -> None:
+        """Create the decoder."""
+        super().__init__()
+        self._last_acc: dict[int, Vector3] = {}  # without gravity, by tracker
 
     def feed(self, data: bytes) -> list[Sample]:
         """Return the samples of a transfer."""
@@ -50,32 +54,35 @@ class SlimevrHidDecoder(Receiver):
             if report[0] in _SKIPPED:
                 self.counters.skipped += 1
                 continue
-            sample = _sample(report)
-            if sample is None:
+            kind, tracker = report[:2]
+            quat, (a, b, c) = _quat_and_shorts(report)
+            if quat is None:
                 self._count_bad()
+                continue
+            self._count_good()
+            mag: Vector3 | None = None
+            if kind == _MAGNETIC:
+                mag = (a * _UT_STEP, b * _UT_STEP, c * _UT_STEP)
             else:
-                self._count_good()
-                self._emit(sample, samples)
+                self._last_acc[tracker] = (a * _ACC_STEP, b * _ACC_STEP, c * _ACC_STEP)
+            acc = self._last_acc.get(tracker)
+            if acc is None:
+                self.counters.skipped += 1
+            else:
+                self._emit(Sample(tracker, None, quat, _force(quat, acc), mag=mag), samples)
         return samples
 
 
-def _sample(report: bytes) -> Sample | None:
-    """Return the sample of a report; None if it is bad."""
-    kind, tracker = report[:2]
+def _quat_and_shorts(report: bytes) -> tuple[Quaternion | None, Sequence[int]]:
+    """Return the orientation in a report, None if it is bad, and the three numbers after it."""
+    kind = report[0]
     if kind in (_FULL, _MAGNETIC):
         x, y, z, w, *shorts = _SHORTS.unpack_from(report, 2)
-        quat = unit_quaternion(w * _Q15, x * _Q15, y * _Q15, z * _Q15)
-    elif kind in (_REDUCED, _BUTTON):
+        return unit_quaternion(w * _Q15, x * _Q15, y * _Q15, z * _Q15), shorts
+    if kind in (_REDUCED, _BUTTON):
         bits, *shorts = _EXPONENTIAL.unpack_from(report, _EXPONENTIAL_AT)
-        quat = _from_exponential(bits)
-    else:
-        return None
-    if quat is None:
-        return None
-    a, b, c = shorts
-    if kind == _MAGNETIC:
-        return Sample(tracker, None, quat, mag=(a * _UT_STEP, b * _UT_STEP, c * _UT_STEP))
-    return Sample(tracker, None, quat, _force(quat, (a * _ACC_STEP, b * _ACC_STEP, c * _ACC_STEP)))
+        return _from_exponential(bits), shorts
+    return None, (0, 0, 0)
 
 
 def _force(quat: Quaternion, acc: Vector3) -> Vector3:

@@ -52,9 +52,15 @@ def test_reduced_reports(kind, vector):
 
 
 def test_magnetic_field():
-    (sample,) = SlimevrHidDecoder().feed(full(0, (0, 0, 0, 1), (512, 0, -1024), kind=4))
+    """It replaces an acceleration, without which a run would end; the last one is repeated."""
+    decoder = SlimevrHidDecoder()
+    with_field = full(0, (0, 0, 0, 1), (512, 0, -1024), kind=4)
+    assert decoder.feed(with_field) == []
+    assert (decoder.counters.skipped, decoder.counters.bad) == (1, 0)
+    _, _, sample = decoder.feed(full(0, (0, 0, 0, 1), (128, 0, 0)) + full(1, (0, 0, 0, 1)) + with_field)
+    assert sample.sensor == 0
     assert sample.mag == pytest.approx((50.0, 0.0, -100.0))
-    assert sample.acc is None
+    assert sample.acc == pytest.approx((1.0, 0.0, STANDARD_G))
 
 
 def test_other_reports_are_skipped_and_wrong_ones_counted():
