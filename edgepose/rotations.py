@@ -107,6 +107,13 @@ def yaw_of_quat(q: ArrayLike) -> Array:
     return 2.0 * np.arctan2(q[..., 3], q[..., 0])
 
 
+def tilt_of_quat(q: ArrayLike) -> Array:
+    """Angle (...), from 0 to pi, by which unit quaternions (..., 4) tilt Z, up."""
+    q = np.asarray(q, float)
+    tilt: Array = 2.0 * np.arctan2(np.hypot(q[..., 1], q[..., 2]), np.hypot(q[..., 0], q[..., 3]))
+    return tilt
+
+
 def yaw_of_matrix(r: ArrayLike) -> Array:
     """Angle (...), radians, of the rotation about Y, up in T, in rotation matrices (..., 3, 3)."""
     r = np.asarray(r, float)
@@ -119,6 +126,12 @@ def quat_about_z(angle: ArrayLike) -> Array:
     half = np.asarray(angle, float) / 2.0
     zero = np.zeros_like(half)
     return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)
+
+
+def wrapped(angle: ArrayLike) -> Array:
+    """Angles (...) from -pi to pi that differ from the given ones by whole turns."""
+    result: Array = np.arctan2(np.sin(angle), np.cos(angle))
+    return result
 
 
 # --- conversions --------------------------------------------------------------------------------------------

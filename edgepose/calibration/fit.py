@@ -100,10 +100,7 @@ def fit_pose(calibration: Calibration, orientation: Array) -> PoseFit:
     )
     # [placement, sensor]: rotation from a sensor's orientation to the one calibrated at the placement.
     between = rot.quat_multiply(wanted[:, None], rot.quat_conjugate(orientation)[None])
-    tilt = np.degrees(
-        2.0
-        * np.arctan2(np.hypot(between[..., 1], between[..., 2]), np.hypot(between[..., 0], between[..., 3]))
-    )
+    tilt = np.degrees(rot.tilt_of_quat(between))
     north = calibration.compares_headings
     yaw = rot.yaw_of_quat(between) - calibration.heading_offset[:, None]
     placements = np.arange(len(PLACEMENTS))
@@ -135,6 +132,6 @@ def _other_order(
 
 def from_median(angles: Array) -> Array:
     """Return angles (n,), radians, relative to their median direction, in degrees from -180 to 180."""
-    apart = np.angle(np.exp(1j * (angles[:, None] - angles)))
+    apart = rot.wrapped(angles[:, None] - angles)
     middle = angles[int(np.argmin(np.abs(apart).sum(axis=1)))]
-    return np.degrees(np.angle(np.exp(1j * (angles - middle))))
+    return np.degrees(rot.wrapped(angles - middle))

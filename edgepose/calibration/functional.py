@@ -49,7 +49,6 @@ _MORE = (
 EXERCISE_S = 4.0
 """Time for each exercise, seconds."""
 
-
 _BACK = tuple(
     f"{side}_{part}" for side in ("left", "right") for part in ("forearm", "upper_arm", "hand", "upper_leg")
 )
@@ -130,12 +129,12 @@ def _wrong_order(names: Sequence[str], times: Sequence[Array], leans: Sequence[A
 
     That only shows if the limbs moved one after the other; in walking they move together.
     """
+    if any(name in names for exercise in _MORE for name in exercise.sensors):
+        return []  # arms and legs move in two exercises each
     active = {}
     for name, time_s, lean in zip(names, times, leans, strict=True):
         size = np.linalg.norm(lean, axis=-1)
         active[name] = np.unique(np.floor(time_s[size > 0.5 * size.max()] / _STEP_S))
-    if any(name in names for exercise in _MORE for name in exercise.sensors):
-        return []  # arms and legs move in two exercises each
     exercises = [exercise.sensors[0] for exercise in ROUTINE if len(exercise.sensors) == 1]
     limbs = [name for name in exercises if name in names]
     for i, name in enumerate(limbs):

@@ -52,9 +52,7 @@ class HeadingReset(NamedTuple):
 def turn_about_z(measured: Array, wanted: Array) -> HeadingReset:
     """Return the rotations about Z that bring orientations (N, 4) nearest to wanted ones (N, 4) or (4,)."""
     between = rot.quat_multiply(wanted, rot.quat_conjugate(measured))
-    yaw = rot.yaw_of_quat(between)
-    tilt = 2.0 * np.arctan2(np.hypot(between[:, 1], between[:, 2]), np.hypot(between[:, 0], between[:, 3]))
-    return HeadingReset(np.arctan2(np.sin(yaw), np.cos(yaw)), np.degrees(tilt))
+    return HeadingReset(rot.wrapped(rot.yaw_of_quat(between)), np.degrees(rot.tilt_of_quat(between)))
 
 
 def headings_side_by_side(still: Hold) -> HeadingReset:

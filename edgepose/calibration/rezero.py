@@ -128,7 +128,9 @@ class HeadingRezero:
             self._old = _headings(self._calibration)
             self._new = np.where(np.isnan(found.offset), self._old, found.offset)
             self._blend_from_s = frame.time_s
-            turned = np.where(np.isnan(found.error_deg), np.nan, np.degrees(_wrapped(self._new - self._old)))
+            turned = np.where(
+                np.isnan(found.error_deg), np.nan, np.degrees(rot.wrapped(self._new - self._old))
+            )
             for line in found.warnings:
                 self._notify(line)
             self._notify(
@@ -148,7 +150,7 @@ class HeadingRezero:
         if self._old is not self._new:
             share = min(max((time_s - self._blend_from_s) / BLEND_S, 0.0), 1.0)
             smooth = share * share * (3.0 - 2.0 * share)
-            offset = self._old + smooth * _wrapped(self._new - self._old)
+            offset = self._old + smooth * rot.wrapped(self._new - self._old)
             # One that was unknown until now has nothing to turn from.
             offset = np.where(np.isnan(self._old), self._new, offset)
             self._calibration = _with_headings(self._calibration, offset)
@@ -241,8 +243,3 @@ def _names(wrong: Array | np.ndarray, angle_deg: Array | None = None) -> str:
         PLACEMENTS[i] if angle_deg is None else f"{PLACEMENTS[i]} {angle_deg[i]:.0f} deg"
         for i in np.flatnonzero(wrong)
     )
-
-
-def _wrapped(angle: Array) -> Array:
-    """Wrap angles to -pi .. pi."""
-    return np.arctan2(np.sin(angle), np.cos(angle))

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from edgepose import rotations as rot
 from edgepose.calibration.sensor_to_segment import POSES
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
@@ -154,7 +155,6 @@ def _tilts_deg(mean: Array) -> Array:
 
 def _headings_deg(mean: Array) -> Array:
     """Return the headings (6,) of mean rotations (6, 3, 3) against those of the others of trunk and legs."""
-    turn = mean @ np.swapaxes(_STRAIGHT, 1, 2)
-    heading = np.exp(1j * np.arctan2(turn[:, 0, 2] - turn[:, 2, 0], turn[:, 0, 0] + turn[:, 2, 2]))
+    heading = np.exp(1j * rot.yaw_of_matrix(mean @ rot.transpose(_STRAIGHT)))
     others = [sum(heading[j] for j in _FORWARD_SHOWN_BY if j != i) for i in range(len(PLACEMENTS))]
     return np.asarray(np.degrees(np.angle(heading / np.array(others))))

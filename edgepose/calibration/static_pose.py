@@ -15,6 +15,9 @@ from edgepose.rotations import Array
 
 MIN_SAMPLES = 10
 
+TENTH_S = 0.1
+"""Step of the search for a pose, seconds."""
+
 
 class SensorHold(NamedTuple):
     """Samples of one sensor while it was held still.
@@ -98,9 +101,8 @@ def stillest_start(hold: Hold, seconds: float) -> float:
     """
     check_reported(hold)
     first, last = max(s.time_s.min() for s in hold), min(s.time_s.max() for s in hold)
-    # Only tenths of a second with samples: the clock may have jumped.
-    starts = first + 0.1 * np.unique(np.floor((hold[root_of(sensor_names(hold))].time_s - first) / 0.1))
-    starts = starts[(starts >= first) & (starts + seconds <= last + 0.1)]
+    starts = tenths_with_samples(hold, first, last)
+    starts = starts[starts + seconds <= last + 0.1]
     spread = np.zeros(len(starts))
     for s in hold:
         order = np.argsort(s.time_s, kind="stable")
@@ -119,6 +121,16 @@ def stillest_start(hold: Hold, seconds: float) -> float:
             f"they overlap for {max(last - first, 0.0):.1f} s from {first:.1f} s"
         )
     return float(starts[np.argmax(spread <= spread.min() + math.radians(0.5))])
+
+
+def tenths_with_samples(hold: Hold, first_s: float, last_s: float) -> Array:
+    """Return the times (n,) from first to last, a tenth of a second apart, in which the pelvis has samples.
+
+    Others are left out, because the clock may have jumped by years. All are on the source's clock, seconds.
+    """
+    time_s = hold[root_of(sensor_names(hold))].time_s
+    times: Array = first_s + TENTH_S * np.unique(np.floor((time_s - first_s) / TENTH_S))
+    return times[(times >= first_s) & (times <= last_s)]
 
 
 def sensor_names(hold: Hold) -> list[str]:

@@ -62,12 +62,12 @@ def _check_end(end: Hold, upright: Array) -> None:
     """
     now = np.stack([rot.mean_rotation(s.quat[: max(1, len(s.quat) // 2)]) for s in end])
     between = rot.quat_multiply(now, rot.quat_conjugate(upright))
-    turned = float(np.degrees(np.median(np.angle(np.exp(1j * rot.yaw_of_quat(between))))))
+    turned = float(np.degrees(np.median(rot.wrapped(rot.yaw_of_quat(between)))))
     if abs(turned) > TURN_LIMIT_DEG:
         raise WeakMotionError(
             f"no heading from these steps: the wearer turned by {abs(turned):.0f} deg; {ADVICE}"
         )
-    tilt = np.degrees(2.0 * np.arcsin(np.clip(np.hypot(between[:, 1], between[:, 2]), 0.0, 1.0)))
+    tilt = np.degrees(rot.tilt_of_quat(between))
     if other := over(tilt, POSE_LIMIT_DEG):
         raise WeakMotionError(f"no heading from these steps: another pose after them: {other}; {ADVICE}")
 

@@ -14,7 +14,14 @@ from edgepose import rotations as rot
 from edgepose.calibration.checks import HoldError
 from edgepose.calibration.heading_reset import HeadingReset, over
 from edgepose.calibration.sensor_to_segment import POSES, Calibration
-from edgepose.calibration.static_pose import Hold, stillest_start, trim, unit_or_zero
+from edgepose.calibration.static_pose import (
+    TENTH_S,
+    Hold,
+    stillest_start,
+    tenths_with_samples,
+    trim,
+    unit_or_zero,
+)
 from edgepose.errors import CalibrationError
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
@@ -39,7 +46,6 @@ OFFSET_WARNING_DEG, OFFSET_LIMIT_DEG = 25.0, 45.0
 
 _ARM_ERROR_DEG = 8.0  # of the direction of an arm that a wearer stretches to their side
 _ARMS = [PLACEMENTS.index("left_forearm"), PLACEMENTS.index("right_forearm")]
-_STEP_S = 0.1
 
 
 def forward_of_raised_arms(straight: Array, t_pose: Array) -> Array:
@@ -108,7 +114,7 @@ def with_raised_arms(reset: HeadingReset, arms: Array) -> HeadingReset:
     offset, error_deg = reset.offset.copy(), reset.error_deg.copy()
     apart_deg = np.zeros(len(PLACEMENTS))
     for i, angle in zip(_ARMS, arms, strict=True):
-        between = float(np.angle(np.exp(1j * (-angle - offset[i]))))
+        between = float(rot.wrapped(-angle - offset[i]))
         apart_deg[i] = abs(np.degrees(between))
         share = error_deg[i] ** 2 / (error_deg[i] ** 2 + _ARM_ERROR_DEG**2)
         offset[i] += share * between
@@ -118,7 +124,7 @@ def with_raised_arms(reset: HeadingReset, arms: Array) -> HeadingReset:
             f"the raised arms contradict the heading reset: {wrong}; stretch both arms out to the sides, and "
             "repeat both"
         )
-    return reset._replace(offset=np.arctan2(np.sin(offset), np.cos(offset)), error_deg=error_deg)
+    return reset._replace(offset=rot.wrapped(offset), error_deg=error_deg)
 
 
 def with_t_pose(calibration: Calibration, t_pose: Array) -> tuple[Calibration, list[str]]:
@@ -166,7 +172,7 @@ def t_pose_start(everything: Hold, straight: Array, after_s: float, seconds: flo
         CalibrationError: there is none.
     """
     last_s = min(sensor.time_s.max() for sensor in everything)
-    times = np.arange(after_s, last_s, _STEP_S)
+    times = tenths_with_samples(everything, after_s, last_s)
     raised = np.ones(len(times), bool)
     for i in _ARMS:
         order = np.argsort(everything[i].time_s, kind="stable")
@@ -175,9 +181,9 @@ def t_pose_start(everything: Hold, straight: Array, after_s: float, seconds: flo
         raised &= np.abs(np.degrees(np.arccos(np.clip(up[:, 2], -1.0, 1.0))) - 90.0) < 20.0
     edges = np.flatnonzero(np.diff(raised.astype(int), prepend=0, append=0)).reshape(-1, 2)
     for begin, end in edges:
-        if (end - begin) * _STEP_S > seconds + _STEP_S:
-            start_s = float(times[begin])
-            return stillest_start(trim(everything, start_s, start_s + (end - begin) * _STEP_S), seconds)
+        start_s, end_s = float(times[begin]), float(times[end - 1]) + TENTH_S
+        if end_s - start_s > seconds + TENTH_S:
+            return stillest_start(trim(everything, start_s, end_s), seconds)
     raise CalibrationError(
         f"no T-pose of {seconds:g} s after the straight pose: the arms were not raised to the sides; "
         "record again, or use --pose straight"

@@ -9,6 +9,7 @@ from edgepose import calibration as cal
 from edgepose import rotations as rot
 from edgepose.calibration.heading_reset import HeadingReset
 from edgepose.errors import CalibrationError
+from edgepose.placements import PLACEMENTS
 
 FACING_DEG = 70.0
 R_TI = cal.body_from_inertial(np.tile([1.0, 0, 0, 0], (6, 1)), f"heading:{FACING_DEG}")
@@ -87,3 +88,14 @@ def test_bone_offsets_are_those_of_both_poses():
     ]
     with pytest.raises(CalibrationError, match=r"contradict each other: right_forearm .90 deg."):
         cal.with_t_pose(made, worn("t-pose", about("x", 0.0, 90.0)))
+
+
+def test_a_t_pose_after_a_clock_that_jumped_by_years_is_found():
+    times = np.concatenate([np.arange(300) / 60.0, 1.7e9 + np.arange(300) / 60.0])
+    quats = np.stack([worn("straight")] * 330 + [worn("t-pose")] * 270)
+    unknown = np.full((len(times), 3), np.nan)
+    everything = [
+        cal.SensorHold(times, quats[:, i], unknown, unknown, name) for i, name in enumerate(PLACEMENTS)
+    ]
+    start_s = cal.t_pose_start(everything, worn("straight"), after_s=3.0, seconds=3.0)
+    assert start_s == pytest.approx(1.7e9 + 0.5, abs=0.11)
