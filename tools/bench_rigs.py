@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from edgepose.analysis.metrics import joint_angle_error, sip_error
 from edgepose.imu import AddedFrame
 from edgepose.inference import archive
-from edgepose.pipeline.added_sensors import AddedSensors
+from edgepose.pipeline.added_sensors import AddedSensorStage
 from edgepose.pipeline.dropout import assumed_bones, extrapolate_dropouts
 from edgepose.placements import PLACEMENTS, SITES
 from edgepose.pose import PoseFrame
@@ -73,12 +73,12 @@ def lacking(take: Take, names: Sequence[str]) -> Take:
 
 def with_added(local: Array, take: Take, names: Sequence[str]) -> Array:
     """Return poses (T, 24, 3, 3) of a take with the true bones of further sensors."""
-    station, joints = AddedSensors(names), [SITES[name] for name in names]
+    stage, joints = AddedSensorStage(names), [SITES[name] for name in names]
     true, _ = forward_kinematics(take.pose, np.zeros((24, 3)))
     quats, held = np.zeros((len(names), 4)), np.zeros(len(names), bool)
     return np.stack(
         [
-            station.correct(
+            stage.correct(
                 PoseFrame(t, t / RATE, pose, np.zeros(24, np.float32)),
                 AddedFrame(quats, held, true[t, joints]),
             ).rotations

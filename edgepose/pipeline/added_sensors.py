@@ -1,4 +1,4 @@
-"""The station after the network at which sensors besides the six replace its prediction for their bones.
+"""The stage after the network in which sensors besides the six replace its prediction for their bones.
 
 A bone's correction is the rotation from its prediction to its measurement, in the bone's own frame, or none
 while its sensor is silent. When a sensor falls silent or comes back, the change of its correction is added to
@@ -40,7 +40,7 @@ _SPINE = {JOINTS.index("spine1"): 1.0 / 3.0, JOINTS.index("spine2"): 2.0 / 3.0}
 _NO_OFFSETS = np.zeros((len(JOINTS), 3))
 
 
-class AddedSensors:
+class AddedSensorStage:
     """Measured bones of one wearer, besides those of the six sensors.
 
     Attributes:

@@ -17,7 +17,7 @@ from edgepose.config import WearerConfig
 from edgepose.diagnostics.rig_monitor import RigMonitor
 from edgepose.errors import FileFormatError, prefix_errors
 from edgepose.orientation.stage import OrientationStage
-from edgepose.pipeline.added_sensors import AddedSensors
+from edgepose.pipeline.added_sensors import AddedSensorStage
 from edgepose.pipeline.calibrated_settings import age_days, check_settings, with_calibrated_settings
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.network import Network
@@ -25,7 +25,7 @@ from edgepose.pipeline.place_stage import PlaceStage
 from edgepose.pipeline.pose_resampler import PoseResampler
 from edgepose.pipeline.remote_control import Request, Requests
 from edgepose.pipeline.rig_comparison import changes, missing_heading_reset, missing_quantities, unlike_six
-from edgepose.pipeline.run_report import RunReport, about, latency
+from edgepose.pipeline.run_report import RunReport, known_before, latency
 from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline, drift_corrector
 from edgepose.sinks.open import open_outputs
 from edgepose.sources import open_source
@@ -164,7 +164,7 @@ class OpenWearer:
             future / rate if source.live else None,
             place,
             None if outputs.rate is None else PoseResampler(outputs.rate, rate),
-            AddedSensors(added) if added else None,
+            AddedSensorStage(added) if added else None,
             without,
             None if self._config.no_drift_correction else drift_corrector(self._calibration),
         )
@@ -196,14 +196,14 @@ class OpenWearer:
             notes.insert(0, f"rate     written at {config.outputs.rate:g} poses per second")
         damage = FileFormatError(self.source.damage) if self.source.damage else None
         return RunReport(
-            **about(config),
+            **known_before(config),
             summary=summary,
             packets=self.source.counters,
             late=pipeline.clock.dropped,
             skipped=pipeline.skipped,
             restarts=pipeline.clock.restarts,
             latency=latency(summary, future / rate) if config.source.live else None,
-            frames=future,
+            look_ahead_frames=future,
             notes=(*notes, *self._requests.summary_lines()),
             error=summary.error or damage,
         )

@@ -11,7 +11,7 @@ from edgepose.calibration.rezero import HeadingRezero
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
 from edgepose.orientation.stage import OrientationStage
-from edgepose.pipeline.added_sensors import AddedSensors
+from edgepose.pipeline.added_sensors import AddedSensorStage
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.place_stage import PlaceStage
 from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline, drift_corrector
@@ -104,7 +104,7 @@ class Pipeline:
             [buffer],
             orient,
             place=PlaceStage(self._body, without=calibration.without) if self._follow else None,
-            added=AddedSensors(added) if added else None,
+            added=AddedSensorStage(added) if added else None,
             without=calibration.without,
             drift=drift_corrector(calibration) if self._correct_drift else None,
         )

@@ -33,7 +33,7 @@ def latency(summary: RunSummary, look_ahead_s: float) -> Latency | None:
     return Latency(float(median), float(p99), float(most), look_ahead_s * 1e3)
 
 
-def about(config: WearerConfig) -> dict[str, Any]:
+def known_before(config: WearerConfig) -> dict[str, Any]:
     """Return the fields of a report that are known before the run."""
     return {
         "wearer": config.name,
@@ -58,7 +58,7 @@ class RunReport:
         skipped: poses that were too old for live outputs.
         restarts: restarts of the clock after a silence of all sensors.
         latency: of a live run; None for others.
-        frames: the network's look-ahead, frames.
+        look_ahead_frames: the network's look-ahead.
         notes: lines of filter, outputs and remote control.
         error: the error that ended the run, or the damage of the source; None if nothing was lost.
     """
@@ -73,14 +73,14 @@ class RunReport:
     skipped: int = 0
     restarts: int = 0
     latency: Latency | None = None
-    frames: int = 0
+    look_ahead_frames: int = 0
     notes: tuple[str, ...] = ()
     error: EdgeposeError | None = None
 
     @classmethod
     def of_failed(cls, config: WearerConfig, error: EdgeposeError) -> RunReport:
         """Return the report on a run that did not begin."""
-        return cls(**about(config), error=error)
+        return cls(**known_before(config), error=error)
 
     @property
     def result(self) -> str:
@@ -125,7 +125,7 @@ class RunReport:
             lines.append(
                 f"latency  {self.latency.median:.1f} ms median, {self.latency.p99:.1f} ms p99, "
                 f"{self.latency.max:.1f} ms max from last packet to pose sent"
-                + (f" plus {self.frames} frames of look-ahead, {ahead:.0f} ms" if self.frames else "")
+                + (f" plus {self.look_ahead_frames} frames of look-ahead, {ahead:.0f} ms" if ahead else "")
             )
         return [*lines, *self.notes]
 

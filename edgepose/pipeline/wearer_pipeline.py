@@ -22,7 +22,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuFrame, ImuSample
 from edgepose.inference.engine import EngineInput, EngineOutput, check_finite
 from edgepose.orientation.drift import DriftCorrector
-from edgepose.pipeline.added_sensors import AddedSensors
+from edgepose.pipeline.added_sensors import AddedSensorStage
 from edgepose.pipeline.dropout import assumed_bones, extrapolate_dropouts
 from edgepose.pipeline.dropout_monitor import DropoutMonitor
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
@@ -126,7 +126,7 @@ class WearerPipeline:
         look_ahead_s: float | None = None,
         place: PlaceStage | None = None,
         resampler: PoseResampler | None = None,
-        added: AddedSensors | None = None,
+        added: AddedSensorStage | None = None,
         without: Sequence[str] = (),
         drift: DriftCorrector | None = None,
     ) -> None:

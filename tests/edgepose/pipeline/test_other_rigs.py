@@ -21,7 +21,7 @@ from edgepose.formats.recordings.csv import write_csv
 from edgepose.formats.recordings.registry import read_recording, read_sensors
 from edgepose.imu import AddedFrame, ImuFrame, Recording, SensorData
 from edgepose.inference.model import Model
-from edgepose.pipeline.added_sensors import RATE, AddedSensors
+from edgepose.pipeline.added_sensors import RATE, AddedSensorStage
 from edgepose.pipeline.dropout import assumed_bones
 from edgepose.pipeline.rig_comparison import unlike_six
 from edgepose.placements import PLACEMENTS, ROOT, SENSORS, SITES
@@ -157,7 +157,7 @@ def test_neck_collars_and_spine_go_with_a_measured_chest() -> None:
     turn = rot.rotvec_to_matrix([0.3, 0.1, -0.2])
     chest = SITES["chest"]
     measured = AddedFrame(np.zeros((1, 4)), np.array([False]), (bones[chest] @ turn)[None])
-    pose = AddedSensors(["chest"]).correct(PoseFrame(0, 0.0, local, np.ones(24)), measured)
+    pose = AddedSensorStage(["chest"]).correct(PoseFrame(0, 0.0, local, np.ones(24)), measured)
     found, _ = forward_kinematics(pose.rotations, np.zeros((24, 3)))
     turned = {chest, *map(JOINTS.index, ("neck", "left_collar", "right_collar", "spine1", "spine2"))}
     for joint in set(range(24)) - turned:
