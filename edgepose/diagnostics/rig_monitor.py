@@ -61,10 +61,10 @@ class RigMonitor:
             return []
         lines = []
         for sensor in self._health.report(self._now_s):
-            finding = diagnose(sensor)
-            key = (sensor.placement, finding.name)
             if sensor.placement not in self._names:
                 continue
+            finding = diagnose(sensor)
+            key = (sensor.placement, finding.name)
             if finding.name in MAKE_POSES_WRONG and key not in self._reported:
                 self._reported.add(key)
                 lines.append(f"warning: {sensor.placement}: {finding.advice}")
