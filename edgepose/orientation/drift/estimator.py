@@ -38,9 +38,11 @@ _SPREAD = 0.1
 _SIGMA = math.radians(3.0)
 """Standard deviation of a heading beside the habit, rad."""
 _POSE_TILT = math.cos(math.radians(12.0))
+"""Lower bound of the bones' cosines to the vertical in the recognised straight pose."""
 _POSE_S = 1.5
-"""Largest tilt of bones in the recognised straight pose, and its least time, seconds."""
+"""Time after which it is recognised, seconds."""
 _REZERO_SIGMA = math.radians(3.0)
+"""Standard deviation of a heading in the pose of a re-zero, rad."""
 
 
 class Role(NamedTuple):
