@@ -147,7 +147,7 @@ def _without(document: dict[str, Any], fail: _Fail) -> list[str]:
     """Return the sensors of the six that the rig lacks."""
     without = document.get("without", [])
     if not isinstance(without, list) or not set(map(str, without)) <= LACKING:
-        raise fail(f"'without' may only list {', '.join(sorted(LACKING))}")
+        raise fail(f"'without' may only list {', '.join(sorted(LACKING))}; calibrate again")
     return [name for name in PLACEMENTS if name in without]
 
 

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from edgepose import rotations as rot
 from edgepose.imu import ImuFrame
 from edgepose.orientation.drift.estimator import DriftEstimator
 from edgepose.orientation.drift.evidence import block_of
@@ -62,7 +63,8 @@ class DriftCorrector:
         self._time_s, self._frame = frame.time_s, frame
         self._target = self._target + self._estimator.bias * passed_s
         step = FASTEST * min(passed_s, BLOCK_S)
-        change = np.clip(self._target - self.corrections, -step, step)
+        # After a long pause, a whole turn more or less makes no difference.
+        change = np.clip(rot.wrapped(self._target - self.corrections), -step, step)
         still = frame.held | frame.held[self._root]
         self.corrections = self.corrections + np.where(still, 0.0, change)
         return turned_back(frame, self.corrections)

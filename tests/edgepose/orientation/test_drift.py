@@ -233,6 +233,17 @@ def test_known_drift_goes_on_while_nothing_is_received():
     assert abs(stand.headings_deg - before).max() < 2.0
 
 
+def test_after_a_long_pause_a_correction_takes_the_shorter_way():
+    """The forearm has drifted by nearly a whole turn, which would take eleven minutes to correct."""
+    stand = Stand(RATES, lying=True)
+    stand.go(30.0)
+    pause_s = 35 * 60
+    stand.index += pause_s * RATE
+    stand.error = stand.error + pause_s * stand.rates
+    stand.go(60.0)
+    assert -40.0 < np.degrees(stand.corrector.corrections[FOREARM]) < 0.0
+
+
 def test_a_rezero_is_kept_and_not_undone():
     stand = Stand(np.zeros(6))
     stand.go(3.0)
