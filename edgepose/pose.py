@@ -106,6 +106,24 @@ def longest_holds(held: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.array([np.max(np.flatnonzero(e < 0) - np.flatnonzero(e > 0), initial=0) for e in edges])
 
 
+def place_values(pose: PoseFrame, translation: bool, contacts: bool) -> list[float]:
+    """Return the translation (3), metres, and the contacts (7) of a pose, each if it is asked for.
+
+    Raises:
+        ValueError: the pose lacks what is asked for.
+    """
+    values: list[float] = []
+    if translation:
+        if pose.translation is None:
+            raise ValueError(f"pose {pose.index} has no translation")
+        values += pose.translation.tolist()
+    if contacts:
+        if pose.contacts is None:
+            raise ValueError(f"pose {pose.index} has no contacts")
+        values += pose.contacts.tolist()
+    return values
+
+
 def pelvis_position(pose: PoseFrame, offsets: Array) -> Array:
     """Return the position (3,) of the pelvis in T, metres; above the origin if it is unknown.
 

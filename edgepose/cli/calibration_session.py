@@ -140,9 +140,8 @@ def measure_live(
         check_hold, pose = calibration.check_hold, plan.first_pose
         summary = record_hold(batches, pose, plan.countdown_s, plan.hold_s, guide, check_hold, names)
         _check_north(orient, plan, opened.devices)
-        t_pose = None
+        t_pose, straight = None, summary.orientation
         if plan.pose == TWO_POSES:
-            straight = summary.orientation
             wait_s = min(plan.countdown_s, MOVE_COUNTDOWN_S)
             t_pose = record_hold(
                 *(batches, "t-pose", wait_s, plan.hold_s, guide),
@@ -150,21 +149,19 @@ def measure_live(
                 at_once=True,
             )
         if plan.heading_reset == "motion":
-            upright = summary.orientation
             reset = record_motion(
                 batches,
                 plan.countdown_s,
                 guide,
-                lambda moving: calibration.headings_from_motion(moving, upright),
+                lambda moving: calibration.headings_from_motion(moving, straight),
                 names,
             )
         elif plan.heading_reset == "steps":
-            upright = summary.orientation
             reset = record_steps(
                 batches,
                 plan.countdown_s,
                 guide,
-                lambda moving: calibration.headings_from_steps(moving, upright),
+                lambda moving: calibration.headings_from_steps(moving, straight),
             )
     reset = _reset_of(names, reset or _mounted(plan, summary))
     return Measured(summary, reset, None, opened.devices, damaged, t_pose)

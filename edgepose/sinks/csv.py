@@ -7,7 +7,7 @@ from pathlib import Path
 
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.csv_columns import ROTATION_FORMATS, numbers, pose_columns
-from edgepose.pose import PoseFrame, format_status
+from edgepose.pose import PoseFrame, format_status, place_values
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.sinks.pose_file import PoseFileSink
 from edgepose.utils.growing_files import GrowingFile
@@ -66,14 +66,7 @@ class CsvSink(PoseFileSink):
         values = numbers(self._rotations, pose.rotations).ravel().tolist()
         if self._std:
             values += pose.std.tolist()
-        if self._translation:
-            if pose.translation is None:
-                raise ValueError(f"pose {pose.index} has no translation")
-            values += pose.translation.tolist()
-        if self._contacts:
-            if pose.contacts is None:
-                raise ValueError(f"pose {pose.index} has no contacts")
-            values += pose.contacts.tolist()
+        values += place_values(pose, self._translation, self._contacts)
         status = format_status(pose.held, pose.warming_up)
         self._rows.append(self._format % (pose.index, pose.time_s, status, *values))
         return not self._output.regular

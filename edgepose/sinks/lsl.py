@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.csv_columns import pose_columns
-from edgepose.pose import PoseFrame, held_bits
+from edgepose.pose import PoseFrame, held_bits, place_values
 from edgepose.rotations import matrix_to_quat, quat_near
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.skeleton import JOINTS
@@ -102,14 +102,7 @@ class LslSink(Sink):
         # Receivers that interpolate the numbers would turn a joint round where signs change.
         self._quats = quat_near(matrix_to_quat(pose.rotations), self._quats)
         values = self._quats.ravel().tolist()
-        if self._translation:
-            if pose.translation is None:
-                raise ValueError(f"pose {pose.index} has no translation")
-            values += pose.translation.tolist()
-        if self._contacts:
-            if pose.contacts is None:
-                raise ValueError(f"pose {pose.index} has no contacts")
-            values += pose.contacts.tolist()
+        values += place_values(pose, self._translation, self._contacts)
         self._outlet.push_sample(
             [*values, held_bits(pose.held), pose.warming_up], pose.time_s + self._ahead_s
         )

@@ -7,9 +7,9 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from queue import SimpleQueue
-from types import TracebackType
 
 from edgepose.sources.line_reader import Arrival, LineReader
+from edgepose.utils.background import Background
 
 KEPT_S = 0.05
 """Time after which a thread reads the lines in place of a caller who is busy, seconds.
@@ -22,7 +22,7 @@ LOOK_S = 0.005
 """Time between two looks at lines that cannot be waited for yet, seconds."""
 
 
-class LinePoller:
+class LinePoller(Background):
     """Polls lines, and waits for data on any of them.
 
     While nobody polls, such as while an output is stuck, a thread collects what comes, so that nothing is
@@ -39,23 +39,10 @@ class LinePoller:
             queue: the arrivals from threads.
             now: the source's clock, seconds.
         """
+        super().__init__("keeper")
         self.polled_s = now()
         self._lines, self._queue, self._now = lines, queue, now
         self._lock = threading.Lock()
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._keep, daemon=True, name="keeper")
-
-    def __enter__(self) -> LinePoller:
-        """Start the thread."""
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Stop the thread."""
-        self._stop.set()
-        self._thread.join()
 
     @property
     def files(self) -> list[int]:
@@ -88,7 +75,7 @@ class LinePoller:
                     arrivals.append(arrival)
         return arrivals
 
-    def _keep(self) -> None:
+    def _work(self) -> None:
         while not self._stop.wait(KEPT_S):
             with self._lock:
                 now_s = self._now()

@@ -2,35 +2,22 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections import deque
-from types import TracebackType
+
+from edgepose.utils.background import Background
 
 _STEP_S = 0.02
 _KEPT = 500  # of the last 10 s
 
 
-class MachineLag:
+class MachineLag(Background):
     """Measures, while it is entered, how much later than asked a thread wakes up."""
 
     def __init__(self) -> None:
         """Create the measurement; `__enter__` starts it."""
+        super().__init__("machine lag")
         self._late_s: deque[float] = deque([0.0], maxlen=_KEPT)
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-
-    def __enter__(self) -> MachineLag:
-        """Start to measure."""
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Stop."""
-        self._stop.set()
-        self._thread.join()
 
     @property
     def late_ms(self) -> float:
@@ -38,7 +25,7 @@ class MachineLag:
         late_s = sorted(self._late_s)
         return 1e3 * late_s[int(0.95 * (len(late_s) - 1))]
 
-    def _run(self) -> None:
+    def _work(self) -> None:
         while not self._stop.is_set():
             start_s = time.monotonic()
             self._stop.wait(_STEP_S)
