@@ -93,15 +93,14 @@ def _calibrate(task: _Task, job: CalibrationJob, overwrite: bool) -> _Result:
     try:
         with warnings_to(logged.append, hidden=True):
             orient = OrientationStage(job.filter, job.magnetometer)
-            said: list[str] = []
-            measured = measure_recorded(source, job.plan, orient, said.append)
-            measured, result, warnings = calibration_of(job, orient, measured, said.append)
-        damage = [line.removeprefix("warning: ") for line in said if line.startswith("warning: ")]
+            measured = measure_recorded(source, job.plan, orient, lambda line: None)
+            measured, result, warnings = calibration_of(job, orient, measured, lambda line: None)
         make_folder(task.out.parent)
         calibration.save(result, str(task.out), overwrite)
     except Exception as error:
-        return _Result(task, values_of_failed(task.source, task.out, str(as_edgepose_error(error))))
-    found = values(source, str(task.out), measured, result, [*damage, *logged, *warnings])
+        problem = str(as_edgepose_error(error))
+        return _Result(task, values_of_failed(task.source, task.out, problem, logged))
+    found = values(source, str(task.out), measured, result, [*logged, *warnings])
     return _Result(task, found)
 
 

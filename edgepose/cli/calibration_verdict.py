@@ -106,8 +106,8 @@ def values(
     }
 
 
-def values_of_failed(source: Path, out: Path, problem: str) -> dict[str, Any]:
+def values_of_failed(source: Path, out: Path, problem: str, warnings: Sequence[str] = ()) -> dict[str, Any]:
     """Return the same keys for a recording that gave no calibration."""
     unknown = dict.fromkeys(("verdict", "advice", "hold_from_s"))
     about = {"source": source, "out": out, "result": "failed", "problem": problem}
-    return {**about, **unknown, "warnings": [], "sensors": []}
+    return {**about, **unknown, "warnings": list(warnings), "sensors": []}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
@@ -18,6 +19,8 @@ from edgepose.orientation.stage import OrientationStage
 from edgepose.placements import PLACEMENTS, SENSORS
 from edgepose.sources import Device, open_source
 from edgepose.sources.replay import is_recording
+
+_log = logging.getLogger(__name__)
 
 Notify = Callable[[str], None]
 """Shows a line to the user."""
@@ -67,11 +70,11 @@ def hold_in(
 ) -> tuple[Hold, Hold, float]:
     """Return the usable sensors of a recording, their hold, and its start on the recording's clock, seconds.
 
-    A sensor besides the six that is silent during the hold is left out.
+    A sensor besides the six that is silent during the hold is left out. That, and damage, is logged.
     """
     everything, damage = read
     if damage:
-        notify(f"warning: {damage}")
+        _log.warning("%s", damage)
     first, last = extent(everything)
     six = [sensor for sensor in everything if sensor.name in PLACEMENTS]
     start = calibration.stillest_start(six, seconds) if at is None else at.on_clock(first)
@@ -90,7 +93,7 @@ def hold_in(
             calibration.check_covered([sensor], start, start + seconds)
             usable.append(sensor.name)
         except CalibrationError as error:
-            notify(f"warning: {error}; the calibration does without it")
+            _log.warning("%s; the calibration does without it", error)
     return [s for s in everything if s.name in usable], [s for s in hold if s.name in usable], start
 
 

@@ -104,10 +104,10 @@ class MocopiSink(DatagramSink):
         """
         super().__init__(host, port, cast)
         self._offsets = (body or default_body()).offsets
-        own = bytes(4)
+        sender = bytes(4)
         if self._socket.family == socket.AF_INET:
-            own = socket.inet_aton(self._socket.getsockname()[0])
-        address = struct.pack("<4H", *own)
+            sender = socket.inet_aton(self._socket.getsockname()[0])
+        address = struct.pack("<4H", *sender)
         self._start = _chunk(
             b"head", _chunk(b"ftyp", b"sony motion format"), _chunk(b"vrsn", b"\x01")
         ) + _chunk(b"sndf", _chunk(b"ipad", address), _chunk(b"rcvp", struct.pack("<H", port)))

@@ -248,12 +248,16 @@ def _repeated(
 ) -> tuple[Measured, Calibration, list[str]]:
     """Calibrate, again as often as the wearer asks for it; return what `_calibrated` returned last.
 
+    The warnings include those that were logged meanwhile.
+
     Raises:
         EdgeposeError: the last calibration failed, or cannot be written.
     """
     while True:
+        logged: list[str] = []
         try:
-            measured, result, warnings = _calibrated(job, guide)
+            with terminal.warnings_to(logged.append, hidden=False):
+                measured, result, warnings = _calibrated(job, guide)
         except EdgeposeError as error:
             if not guide.wants_repeat(end_stage("REDO", str(error), job.plan.first_pose)):
                 raise
@@ -261,6 +265,7 @@ def _repeated(
         guide.close_page()
         for warning in warnings:
             terminal.say(f"warning: {warning}")
+        warnings = [*logged, *warnings]
         if out != "-":
             calibration.save(result, out, overwrite)
             overwrite = True  # by a repetition

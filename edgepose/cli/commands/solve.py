@@ -224,8 +224,8 @@ def _settings(
     from edgepose.sip.prior import load_prior
     from edgepose.sip.solve import Settings
 
-    own = solver.statistics and solver.prior != STATISTICS
-    prior = load_prior(solver.prior if own else None)
+    from_file = solver.statistics and solver.prior != STATISTICS
+    prior = load_prior(solver.prior if from_file else None)
     if hinges:
         rig = hinge_rig(prior)
     else:

@@ -198,6 +198,33 @@ def test_a_single_calibration(command, wearer, tmp_path):
     assert "edgepose run" in result.stderr
 
 
+def test_warnings_of_a_calibration_are_in_the_document_and_shown_once(command, wearer, tmp_path):
+    """Those on a damaged recording and on a sensor that is silent in the hold, also if there is no result."""
+    recording = read_recording(wearer.short)
+    head = recording.sensors["head"]
+    chest = head._replace(**{key: v[:5] for key, v in head._asdict().items() if isinstance(v, np.ndarray)})
+    path = tmp_path / "takes" / "a.csv"
+    path.parent.mkdir()
+    write_csv(path, recording._replace(sensors={**recording.sensors, "chest": chest}))
+    with path.open("a") as file:
+        file.write("1.0,hea")
+    start = float(head.time_s[20])
+    for words, at, count in (
+        (("--file", path, "--out", tmp_path / "c.json"), start, 2),
+        ((path.parent, "--out", tmp_path / "c"), start, 2),
+        ((path.parent, "--out", tmp_path / "d"), start + 999, 1),
+    ):
+        result = command("calibrate", *words, *BASICS, "--from", at, "--json")
+        assert result.returncode == 1
+        (found,) = document(result, "calibrate")["calibrations"]
+        assert len(found["warnings"]) == count, result.stderr
+        assert "a.csv" in found["warnings"][0]
+        assert all(result.stderr.count(warning) == 1 for warning in found["warnings"])
+        assert (found["result"], found["verdict"]) == (("damaged", "FAIR") if count == 2 else ("failed", None))
+    result = command("calibrate", "--file", path, "--out", tmp_path / "e.json", *BASICS, "--from", start + 999)
+    assert result.stderr.count(found["warnings"][0]) == 1
+
+
 def test_conversions(command, takes, tmp_path):
     result = command("convert", takes, "--to", "csv", "--out", tmp_path / "c", "--json")
     assert result.returncode == 1
