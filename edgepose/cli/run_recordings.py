@@ -67,7 +67,7 @@ def run_recordings(
     jobs = _plan(inputs, wearer)
     _check(jobs, network)
     results: dict[Job, Result] = {}
-    shown: set[str] = set()
+    about_network: list[str] = []
     try:
         with StopSignal() as stop:
             work = partial(_run, settings=network.config)
@@ -75,13 +75,14 @@ def run_recordings(
             for result in with_progress(runs, len(jobs), "Running", _outcome):
                 results[result.job] = result
                 for line in result.about_network:
-                    if line not in shown:
+                    if line not in about_network:
                         say(line)
-                        shown.add(line)
+                        about_network.append(line)
             if stop.asked:
                 raise KeyboardInterrupt
     finally:
-        _show([results[job] for job in jobs if job in results], network, len(jobs), as_json)
+        finished = [results[job] for job in jobs if job in results]
+        _show(finished, network, about_network, len(jobs), as_json)
     failed = sum(result.report.error is not None for result in results.values())
     raise_failures(failed, len(jobs), "not run, or only in part")
 
@@ -189,9 +190,12 @@ def _outcome(result: Result) -> Outcome:
     return Outcome(str(result.job.source), report.result, problem, result.messages)
 
 
-def _show(results: Sequence[Result], network: Network, planned: int, as_json: bool) -> None:
+def _show(
+    results: Sequence[Result], network: Network, about_network: Sequence[str], planned: int, as_json: bool
+) -> None:
     if as_json:
-        messages = [f"{result.job.source}: {line}" for result in results for line in result.messages]
+        of_files = [f"{result.job.source}: {line}" for result in results for line in result.messages]
+        messages = [*about_network, *of_files]
         runs = [result.report.values() for result in results]
         show_json("run", {**network.values(), "messages": messages, "planned": planned, "runs": runs})
         return

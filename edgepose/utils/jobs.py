@@ -23,7 +23,8 @@ def run_jobs(
     """Do jobs, and yield their results as they finish.
 
     Args:
-        work: does a job; a function of a module, with arguments that can be pickled. An error that it raises ends the rest.
+        work: does a job; a function of a module, with arguments that can be pickled. An error that it
+            raises ends all of them.
         jobs: the jobs.
         workers: number of processes; 1 works in this process.
         failed: returns the result of a job whose process was killed, given the reason.

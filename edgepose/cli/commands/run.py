@@ -108,20 +108,25 @@ def _run(
     from edgepose.pipeline.run_wearers import open_wearers, run_wearers
 
     live = wearers[0].source.live
+
+    def notify(text: str) -> None:
+        messages.append(printable(text))
+        say(text)
+
     with ExitStack() as stack:
         stack.enter_context(warnings_to(messages.append, hidden=False))
         # Sources are opened before the model is loaded, so that a wrong port is reported at once.
         keys = Keys()
-        opened = open_wearers(stack, wearers, keys.pressed, lambda text: _say(text, messages))
+        opened = open_wearers(stack, wearers, keys.pressed, notify)
         if live:
             stack.enter_context(keys)
-        ready = network.load(all(wearer.no_place for wearer in wearers), say)
+        ready = network.load(all(wearer.no_place for wearer in wearers), notify)
         engine = ready.engine_for_all(wearers)
         stop = stack.enter_context(StopSignal())
         for each in opened:
             each.open_outputs(stack, network, lambda: stop.asked)
         say(_headline(network, ready.precision, wearers, keys.listening))
-        pipelines = run_wearers(opened, engine, network, live, lambda: stop.asked, _progress(network))
+        pipelines = run_wearers(opened, engine, network, live, lambda: stop.asked, _progress(network, notify))
     end_status()
     return opened, pipelines
 
@@ -129,11 +134,6 @@ def _run(
 def _show_json(network: Network, reports: Sequence[RunReport], messages: list[str]) -> None:
     runs = [report.values() for report in reports]
     show_json("run", {**network.values(), "messages": messages, "planned": len(runs), "runs": runs})
-
-
-def _say(text: str, messages: deque[str]) -> None:
-    messages.append(printable(text))
-    say(text)
 
 
 def _headline(network: Network, precision: str, wearers: list[WearerConfig], has_keys: bool) -> str:
@@ -148,8 +148,13 @@ def _headline(network: Network, precision: str, wearers: list[WearerConfig], has
     )
 
 
-def _progress(network: Network) -> Callable[[RunSummary], None]:
-    """Return a callback that updates one line on a terminal; elsewhere it writes a line every 10 s."""
+def _progress(network: Network, notify: Callable[[str], None]) -> Callable[[RunSummary], None]:
+    """Return a callback that updates one line on a terminal; elsewhere it writes a line every 10 s.
+
+    Args:
+        network: the network that runs.
+        notify: called with one message if this machine does not keep up.
+    """
     every_s = 1.0 if has_terminal() else 10.0
     shown_s, poses, warned = time.monotonic(), 0, False
 
@@ -158,7 +163,7 @@ def _progress(network: Network) -> Callable[[RunSummary], None]:
         now_s = time.monotonic()
         if summary.backlog_s > BEHIND_S and not warned:
             warned = True
-            say(
+            notify(
                 f"this machine does not keep up: poses are {summary.backlog_s:.1f} s late; "
                 f"{''.join(f'use {flag}, or ' for flag in network.faster)}end other programs"
             )

@@ -317,10 +317,12 @@ def test_wearers_get_the_poses_that_each_gets_alone(
         "cleo": write_part(wearer.recording, 6.2, 6.21, tmp_path / "cleo.npz"),
     }
     rigs = [rig(name, file=str(file), rotations="matrix") for name, file in files.items()]
-    result = command("run", *words(*rigs), "--model", model, "--trust", "--precision", "f32")
+    result = command("run", *words(*rigs), "--model", model, "--trust", "--precision", "f32", "--json")
     assert result.returncode == 0, result.stderr
     assert f"running 3 wearers with {model} ({kind}, stream) in f32" in result.stderr
-    assert result.stderr.count(f"{model} does not estimate contacts: the lowest foot counts as standing") == 1
+    no_contacts = f"{model} does not estimate contacts: the lowest foot counts as standing"
+    assert result.stderr.count(no_contacts) == 1
+    assert sum(no_contacts in line for line in json.loads(result.stdout)["messages"]) == 1
     lengths = []
     for name, file in files.items():
         headings = HeadingRezero(load_calibration(wearer.calibration))
