@@ -24,6 +24,7 @@ from edgepose.cli.calibration_session import (
 from edgepose.cli.calibration_verdict import DAMAGED, judge, next_command, table, values
 from edgepose.cli.guide.guide import Guide, end_stage
 from edgepose.cli.guide.phone_page import PhonePage, address_in_network
+from edgepose.cli.options.float_range import FloatRange
 from edgepose.cli.options.gathered import gathered
 from edgepose.cli.options.inputs import recordings_or_source
 from edgepose.cli.options.json_result import json_option, show_json
@@ -116,7 +117,7 @@ _PLAN_FLAGS = [
     click.option(
         "--hold",
         "hold_s",
-        type=click.FloatRange(0.2, 600),
+        type=FloatRange(0.2, 600),
         default=4.0,
         show_default=True,
         help="Length of the hold, seconds.",
@@ -132,7 +133,7 @@ _PLAN_FLAGS = [
     click.option(
         "--countdown",
         "countdown_s",
-        type=click.FloatRange(0, 600),
+        type=FloatRange(0, 600),
         default=10.0,
         show_default=True,
         help="Time before each live hold, seconds; before each movement 3 at most.",
@@ -161,7 +162,7 @@ def _plan_options(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.option(
     "--height",
     "height_m",
-    type=click.FloatRange(MIN_HEIGHT, MAX_HEIGHT),
+    type=FloatRange(MIN_HEIGHT, MAX_HEIGHT),
     help="The wearer's height, metres, which run then uses.",
 )
 @click.option(

@@ -15,6 +15,7 @@ import click
 
 from edgepose.cli.exit_codes import ATTENTION, DONE, FAILED
 from edgepose.cli.options.calibrated_run import CalibratedRun, calibration_options
+from edgepose.cli.options.float_range import FloatRange
 from edgepose.cli.options.json_result import json_option, show_json
 from edgepose.cli.options.source import lacking_sensors, source_options, without_option
 from edgepose.cli.sensor_table import State, page_lines, table_lines
@@ -45,7 +46,7 @@ DEFAULT_S = 10.0
 @without_option
 @click.option(
     "--seconds",
-    type=click.FloatRange(0, min_open=True),
+    type=FloatRange(0, min_open=True),
     help="How long to listen, seconds.  [default: until Ctrl-C on a terminal, "
     f"{DEFAULT_S:g} elsewhere; to the end of --file]",
 )

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from edgepose import __version__
+from edgepose.cli.options.float_range import FloatRange
 from edgepose.cli.options.outputs import check_files, overwrite_option
 from edgepose.cli.options.source import source_options
 from edgepose.cli.terminal.messages import end_status, has_terminal, say, status
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 @source_options
 @click.option(
     "--seconds",
-    type=click.FloatRange(0, min_open=True),
+    type=FloatRange(0, min_open=True),
     help="Length of the recording from the first sample on, seconds.  [default: until Ctrl-C or the end of "
     "--file]",
 )

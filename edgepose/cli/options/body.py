@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from edgepose.cli.options.float_range import FloatRange
 from edgepose.cli.options.gathered import add_flags
 from edgepose.skeleton import DEFAULT_HEIGHT, MAX_HEIGHT, MIN_HEIGHT, with_leg_length
 
@@ -76,7 +77,7 @@ def body_options(command: Callable[..., Any]) -> Callable[..., Any]:
         ),
         click.option(
             "--height",
-            type=click.FloatRange(MIN_HEIGHT, MAX_HEIGHT),
+            type=FloatRange(MIN_HEIGHT, MAX_HEIGHT),
             help=f"The wearer's height, metres.  [default: the calibration's, or {DEFAULT_HEIGHT}]",
         ),
         leg_length_option,
@@ -98,7 +99,7 @@ def body_options(command: Callable[..., Any]) -> Callable[..., Any]:
         ),
         click.option(
             "--scale",
-            type=click.FloatRange(0.5, 2.0),
+            type=FloatRange(0.5, 2.0),
             default=1.0,
             show_default=True,
             help="Factor on all lengths of the body (1.1: SIP-110).",

@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from edgepose.cli.options.body import leg_length_option
+from edgepose.cli.options.float_range import FloatRange
 from edgepose.cli.options.gathered import Command, gathered
 from edgepose.config import OutputConfig
 from edgepose.errors import EdgeposeError
@@ -71,7 +72,7 @@ overwrite_option = click.option("--overwrite", is_flag=True, help="Replace exist
 
 rate_option = click.option(
     "--rate",
-    type=click.FloatRange(*RATES),
+    type=FloatRange(*RATES),
     metavar="HZ",
     help="Poses per second of all outputs, interpolated.  [default: the network's, or the file's]",
 )

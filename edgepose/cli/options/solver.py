@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from edgepose.cli.options.float_range import FloatRange
 from edgepose.cli.options.gathered import gathered
 from edgepose.cli.options.recording_time import RecordingTime, RecordingTimeType
 
@@ -83,7 +84,7 @@ def solver_options(command: Callable[..., Any]) -> Callable[..., Any]:
         ),
         click.option(
             "--rate",
-            type=click.FloatRange(10, 240),
+            type=FloatRange(10, 240),
             default=60.0,
             show_default=True,
             help="Poses per second.",

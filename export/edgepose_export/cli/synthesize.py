@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from edgepose.cli.options.float_range import FloatRange
 from edgepose.cli.options.outputs import overwrite_option
 from edgepose.cli.terminal.messages import say
 from edgepose.errors import EdgeposeError
@@ -53,12 +54,10 @@ class Request(NamedTuple):
     type=click.Path(path_type=Path, file_okay=False),
     help="Folder for the recordings (.npz); needed unless there is --check.",
 )
-@click.option(
-    "--rate", type=click.FloatRange(1, 1000), default=60.0, show_default=True, help="Samples per second."
-)
+@click.option("--rate", type=FloatRange(1, 1000), default=60.0, show_default=True, help="Samples per second.")
 @click.option(
     "--height",
-    type=click.FloatRange(0.8, 2.5),
+    type=FloatRange(0.8, 2.5),
     help="Height of the default body, metres  [default: 1.75]",
 )
 @click.option(
@@ -69,7 +68,7 @@ class Request(NamedTuple):
 )
 @click.option(
     "--hold",
-    type=click.FloatRange(0, 600),
+    type=FloatRange(0, 600),
     default=0.0,
     show_default=True,
     help="Seconds of standing straight before the motion.",

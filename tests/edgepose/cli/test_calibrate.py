@@ -259,6 +259,7 @@ def test_recordings_that_do_not_do(arguments: list[object], message: str) -> Non
         (["--file", REAL, "--heading-reset", "mounting:up"], "an axis is x, y or z"),
         (["--file", REAL, "--filter", "madgwick"], "'madgwick' is not one of 'none', 'kalman', 'vqf'"),
         (["--file", REAL, "--hold", -1], "-1"),
+        (["--file", REAL, "--hold", "nan"], "'nan' is not a number"),
     ],
 )
 def test_wrong_use(arguments: list[object], message: str) -> None:
