@@ -5,7 +5,8 @@ Assumptions:
   on stands on something else. Slopes, and steps lower than `_STEP`, cannot be told from errors of poses.
 - What a foot stands on does not move. A foot that has stood for long is where it was.
 - No part of the body is below the ground. A foot may be, if one of them stands: it goes down a step. A
-  wearer who jumps lands on a known ground, or higher.
+  wearer who jumps lands on a known ground, or higher. Those who lie and push themselves up come down again.
+- Only those who stand or sit step on something else: the feet of those who lie or crawl do not.
 """
 
 from __future__ import annotations
@@ -20,7 +21,10 @@ _PLANTED, _LIFTED = 0.7, 0.5
 _SETTLED_S = 0.05
 """Time after which a planted foot has come to rest, seconds."""
 _STEP = 0.1
-"""Least height of a step, metres. 99 % of all footprints on level ground differ by up to 0.09 m."""
+"""Least height of a step for a body of average size, metres. 99 % of all footprints on level ground differ by
+up to 0.09 m."""
+_UPRIGHT = 0.3
+"""Height of the pelvis above the feet of those who stand or sit, for a body of average size, metres."""
 _FLIGHT, _MOST = 0.6, 0.3
 """Uncertainty of the height after a flight: metres per second, and most of it, metres."""
 _GROUND_S = 0.1
@@ -51,15 +55,16 @@ class _Foot:
 class Ground:
     """Corrects the position of the pelvis by the feet that stand on the ground."""
 
-    def __init__(self, skin: Sequence[float]) -> None:
-        """Put both feet on the floor, at height 0; `skin` is that of `BodyPoints`."""
-        self._skin = skin
+    def __init__(self, skin: Sequence[float], scale: float = 1.0) -> None:
+        """Put both feet on the floor, at height 0; `skin` and `scale` are those of `BodyPoints`."""
+        self._skin, self._scale = skin, scale
         self.reset()
 
     def reset(self) -> None:
         """Put both feet on the floor."""
         self._feet = _Foot(), _Foot()
         self._uncertainty = 0.0
+        self._lifted = 0.0
 
     def lift(self) -> None:
         """Take both feet off the ground, because nothing is known about the time since the last frame."""
@@ -101,7 +106,7 @@ class Ground:
             foot.planted_s += dt
             height = position[1] + point[1] - self._skin[side]
             if not foot.settled and foot.planted_s > _SETTLED_S:
-                foot.settled, foot.ground = True, self._ground_at(height)
+                self._settle(foot, height, -point[1])
             if foot.settled:
                 up, total = up + s * (foot.ground - height), total + s
             if foot.planted_s > _STANDING_S:
@@ -122,19 +127,31 @@ class Ground:
         self._keep_above(dt, position, points)
 
     def _keep_above(self, dt: float, position: list[float], points: Sequence[Point]) -> None:
-        """Lift a body out of the ground, in place."""
+        """Lift a body out of the ground, and lower it again as soon as it can be lower, in place."""
         ground = min(foot.ground for foot in self._feet)
         standing = any(foot.planted_s > 0.0 for foot in self._feet)
         if not standing:
             ground = min(ground, 0.0)
         parts = NEVER_BELOW[2:] if standing else NEVER_BELOW
         depth = ground + self.height_of(points, parts) - position[1]
-        position[1] += _limited(max(depth, 0.0), dt)
+        way = _limited(max(depth, -self._lifted), dt)
+        position[1] += way
+        upright = min(points[0][1], points[1][1]) < -_UPRIGHT * self._scale
+        self._lifted = 0.0 if upright else self._lifted + way
 
-    def _ground_at(self, height: float) -> float:
-        """Return the height of the ground under a foot that came to rest at `height`, metres."""
+    def _settle(self, foot: _Foot, height: float, below: float) -> None:
+        """Put a foot that has come to rest on the ground.
+
+        Args:
+            foot: the foot.
+            height: its height, metres.
+            below: how far it is below the pelvis, metres.
+        """
         known = min((self._feet[0].ground, self._feet[1].ground, 0.0), key=lambda g: abs(g - height))
-        return known if abs(height - known) < _STEP + self._uncertainty else height
+        if abs(height - known) < _STEP * self._scale + self._uncertainty + self._lifted:
+            foot.settled, foot.ground = True, known
+        elif below > _UPRIGHT * self._scale:
+            foot.settled, foot.ground = True, height
 
 
 def _limited(way: float, dt: float) -> float:

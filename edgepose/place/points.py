@@ -40,13 +40,14 @@ class BodyPoints:
     """Computes the positions of `POINTS` from rotations.
 
     Attributes:
+        scale: size of the body, 1 for the average.
         skin: 15 heights of the points above a surface that they touch, metres.
     """
 
     def __init__(self, body: Body) -> None:
         """Store the lengths of a body."""
-        scale = body.leg_length_m / _LEG_LENGTH
-        self.skin: list[float] = [_SKIN[name] * scale for name in POINTS]
+        self.scale = body.leg_length_m / _LEG_LENGTH
+        self.skin: list[float] = [_SKIN[name] * self.scale for name in POINTS]
         offsets = body.offsets.tolist()
         carries = [name in POINTS for name in JOINTS]
         self._steps: list[tuple[int, int, Point, Point | None]] = []

@@ -4,7 +4,8 @@ Each frame moves the pelvis by the velocity of `edgepose.place.velocity`; the fe
 the position, see `edgepose.place.ground`. Both modules state what they assume. Beyond that:
 
 - Rotations and velocities are those of a frame that does not turn: an error of the heading turns the path.
-- Frames come at least every `GAP_S`. What happens in a longer gap is unknown, and the wearer stays in place.
+- Frames come at least every `GAP_S`. What happens in a longer gap is unknown: the wearer stays in place, and
+  the lowest part of the body at its height.
 - Without contacts from a network the lower foot stands on the ground.
 """
 
@@ -55,7 +56,7 @@ class PlaceTracker:
         """Put the wearer above the origin of T, on the ground."""
         self._points = BodyPoints(body)
         self._velocity = PelvisVelocity()
-        self._ground = Ground(self._points.skin)
+        self._ground = Ground(self._points.skin, self._points.scale)
         self.reset()
 
     def reset(self) -> None:
@@ -97,6 +98,7 @@ class PlaceTracker:
         if not 0.0 < dt <= GAP_S:
             self._velocity.reset()
             self._ground.lift()
+            self._position[1] += self._ground.height_of(points) - self._ground.height_of(before)
             return
         if numbers is None:
             probabilities, velocity = self._lower_foot(points), None
