@@ -159,7 +159,7 @@ def add_camera(middle: Vector, span: float) -> None:
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     scene.collection.objects.link(camera)
     scene.camera = camera
-    camera.location = middle + Vector((span * 1.1 + 2.2, -1.2, 0.9))
+    camera.location = middle + Vector((span * 1.2 + 3.0, -1.2, 0.9))
     camera.rotation_euler = (middle - camera.location).to_track_quat("-Z", "Y").to_euler()
     sun = bpy.data.lights.new("sun", "SUN")
     sun.energy = 3.0
