@@ -159,7 +159,7 @@ def add_camera(middle: Vector, span: float) -> None:
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     scene.collection.objects.link(camera)
     scene.camera = camera
-    camera.location = middle + Vector((span * 1.2 + 3.0, -1.2, 0.9))
+    camera.location = middle + Vector((max(span * 1.2 + 3.0, 6.0), -1.2, 0.9))
     camera.rotation_euler = (middle - camera.location).to_track_quat("-Z", "Y").to_euler()
     sun = bpy.data.lights.new("sun", "SUN")
     sun.energy = 3.0
@@ -177,7 +177,7 @@ def render(out: Path) -> None:
     """Write the picture."""
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
-    scene.cycles.samples, scene.cycles.use_denoising = 12, False
+    scene.cycles.samples, scene.cycles.use_denoising = 16, True
     scene.render.resolution_x, scene.render.resolution_y = 800, 370
     scene.view_settings.view_transform = "Standard"
     scene.render.image_settings.file_format = "PNG"
