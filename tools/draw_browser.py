@@ -33,6 +33,8 @@ from tests.support.browser import Browser, until  # noqa: E402
 PAGE = ROOT / "tools" / "draw_three.html"
 PLAY = "[...document.querySelectorAll('input[type=checkbox]')].find(box => !box.id.startsWith('mantine'))"
 """The box `play` of the view."""
+TIME = "document.querySelector('input[inputmode=decimal]')"
+"""The number beside the time line."""
 
 
 def free_port() -> int:
@@ -109,9 +111,13 @@ def view(given: argparse.Namespace) -> None:
         time.sleep(4.0)
         browser.call("Page.navigate", url=f"http://127.0.0.1:{port}")
         until(lambda: "poses/s" in browser.text(), "the view", 120)
-        until(lambda: given.at[0] <= shown_s() < given.at[0] + 1.0, "the time", 200)
         browser.run(f"{PLAY}.click()")
-        time.sleep(2.0)
+        until(lambda: not browser.run(f"{PLAY}.checked"), "the pause")
+        time.sleep(3.0)
+        browser.run(f"{TIME}.focus(); {TIME}.select()")
+        browser.call("Input.insertText", text=f"{given.at[0]:g}")
+        browser.run(f"{TIME}.blur()")
+        until(lambda: abs(shown_s() - given.at[0]) < 0.1, "the time")
         browser.run("document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())")
         time.sleep(6.0)
         save(browser, given.out)

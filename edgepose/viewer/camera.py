@@ -66,6 +66,11 @@ class FollowingCameras:
         self._shifts: dict[int, Array] = {}  # displacement of each client's camera
         self._late: set[int] = set()  # clients whose cameras are catching up
 
+    @property
+    def catching_up(self) -> bool:
+        """Whether a camera is on its way to the figure, and `follow` is to be called again."""
+        return bool(self._late)
+
     def follow(self, pelvis: Array) -> None:
         """Move the cameras for a figure whose pelvis is at (3,), metres."""
         wanted = wanted_shift(pelvis)

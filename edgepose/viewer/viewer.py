@@ -201,10 +201,13 @@ class Viewer:
             i = int(np.searchsorted(times, line.advance(now) + 1e-9, side="right")) - 1
             if i != shown:
                 with self._server.atomic():
-                    cameras.follow(track.show(i))
+                    pelvis = track.show(i)
+                    cameras.follow(pelvis)
                     if compared is not None and second is not None:
                         second.show(compared.nearest(i))
                 shown = i
+            elif cameras.catching_up:  # after a jump on a time line that is stopped
+                cameras.follow(pelvis)
             if now - self._updated_s >= TABLE_S:
                 self._updated_s = now
                 line.update_slider()
