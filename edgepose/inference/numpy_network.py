@@ -8,20 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import copy
+from math import prod
 from typing import Any
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from edgepose.errors import ModelError
 from edgepose.inference.archive import ArchiveInfo
-from edgepose.inference.numpy_ends import Ends, State, rows
+from edgepose.inference.numpy_ends import HALF, Ends, State, rows
 from edgepose.inference.rotation_rows import SEEN
 from edgepose.inference.runtime import Array, Results, Runtime
 from edgepose.inference.weights import Recipe, read_weights, recipe_of
 
 _BLOCK = 64
-"""Columns of a block of weights. BLAS takes a third of the time for six rows if it finds small matrices."""
+"""Columns of a block of weights. BLAS takes a third of the time for several rows if matrices are small."""
 
 
 def load(info: ArchiveInfo) -> Rnn | Birnn:
@@ -32,13 +32,18 @@ def load(info: ArchiveInfo) -> Rnn | Birnn:
     """
     try:
         recipe = recipe_of(info.metadata)
-        # One by one, so that few are in memory twice.
-        weights = {
-            name: array if name.startswith("ends.") else _prepared(array, recipe.hidden)
-            for name, array in read_weights(info.path, recipe.shapes())
-        }
+        shapes = recipe.shapes()
+        # One array, because numpy asks for huge pages for a large one: they are read a tenth faster.
+        space = np.empty(sum(map(prod, shapes.values())), np.float32)
+        weights: dict[str, Array] = {}
+        for name, array in read_weights(info.path, shapes):
+            weight = array if name.startswith("ends.") else _prepared(name, array, recipe.hidden)
+            weights[name], space = space[: weight.size].reshape(weight.shape), space[weight.size :]
+            weights[name][...] = weight
     except ModelError as error:
         raise ModelError(f"{info.path}: {error}") from error
+    except MemoryError as error:
+        raise ModelError(f"{info.path}: not enough memory for its weights") from error
     return (Rnn if recipe.kind == "rnn" else Birnn)(recipe, weights)
 
 
@@ -48,27 +53,33 @@ class _Cell:
     def __init__(self, weight: Array, size: int) -> None:
         self._weight, self._size = weight, size
 
-    def run(self, products: Array, h: Array | None, c: Array | None) -> tuple[Array, Array, Array]:
-        """Return outputs (B, T, hidden) for the inputs' products (B, T, 4 hidden), and the last h and c.
+    def run(
+        self, steps: Array | list[Array], h: Array | None = None, c: Array | None = None
+    ) -> tuple[Array, Array, Array]:
+        """Return the outputs (T, B, hidden) of T steps, and the last h and c (B, hidden).
 
-        Without h and c, the state before is zero.
+        Args:
+            steps: products (B, 4 hidden) of each step's inputs.
+            h: outputs (B, hidden) before; without them and c, the state before is zero.
+            c: cell states (B, hidden) before.
         """
-        (batch, frames, _), size = products.shape, self._size
-        outputs = np.empty((batch, frames, size), np.float32)
-        for t in range(frames):
-            gates = products[:, t].copy() if h is None else _times(h, self._weight)
+        size = self._size
+        outputs = np.empty((len(steps), len(steps[0]), size), np.float32)
+        for products, output in zip(steps, outputs, strict=True):
+            gates = products.copy() if h is None else _times(h, self._weight)
             if h is not None:
-                gates += products[:, t]
+                gates += products
             np.tanh(gates, out=gates)
-            sigmoids = gates[:, : 3 * size]
-            sigmoids *= 0.5
-            sigmoids += 0.5
-            new = gates[:, :size] * gates[:, 3 * size :]
-            c = new if c is None else gates[:, size : 2 * size] * c + new
-            h = outputs[:, t]
-            np.tanh(c, out=h)
-            h *= gates[:, 2 * size : 3 * size]
-        assert h is not None, "there is at least one frame"
+            sigmoids, candidate = gates[:, : 3 * size], gates[:, 3 * size :]
+            sigmoids *= HALF
+            sigmoids += HALF
+            candidate *= sigmoids[:, :size]
+            if c is not None:
+                candidate += sigmoids[:, size : 2 * size] * c
+            c = candidate
+            h = np.tanh(c, out=output)
+            h *= sigmoids[:, 2 * size :]
+        assert h is not None, "there is at least one step"
         assert c is not None
         return outputs, h, c
 
@@ -79,12 +90,14 @@ class NumpyNetwork(Runtime):
     def __init__(self, recipe: Recipe, weights: Mapping[str, Array]) -> None:
         """Use weights as `load` prepares them."""
         self._ends = Ends(recipe, weights)
-        self._weights = weights
-        self._cells = {
-            name.removesuffix(".state.weight"): _Cell(weight, recipe.hidden)
-            for name, weight in weights.items()
-            if name.endswith(".state.weight")
-        }
+        self._cells: dict[str, _Cell] = {}
+        self._layers: dict[str, tuple[Array, Array | None]] = {}
+        for path, weight in weights.items():
+            name = path.removesuffix(".weight")
+            if name.endswith(".state"):
+                self._cells[name.removesuffix(".state")] = _Cell(weight, recipe.hidden)
+            elif not path.endswith(".bias") and not path.startswith("ends."):
+                self._layers[name] = weight, weights.get(f"{name}.bias")
         self._zero = np.zeros((1, recipe.hidden), np.float32)
 
     def with_place(self, place: bool) -> Runtime:
@@ -94,11 +107,17 @@ class NumpyNetwork(Runtime):
         return network
 
     def _product(self, name: str, x: Array) -> Array:
-        """Return the products of inputs (B, T, N) with the weights of a layer, with its bias if any."""
-        product = _times(rows(x), self._weights[f"{name}.weight"])
-        if f"{name}.bias" in self._weights:
-            product += self._weights[f"{name}.bias"]
-        return product.reshape(*x.shape[:2], -1)
+        """Return the products of inputs (..., N) with the weights of a layer, with its bias if any."""
+        weight, bias = self._layers[name]
+        product = _times(x.reshape(-1, x.shape[-1]), weight)
+        if bias is not None:
+            product += bias
+        return product.reshape(*x.shape[:-1], -1)
+
+    def _over(self, cell: str, products: Array, *state: Array) -> tuple[Array, Array, Array]:
+        """Return the outputs (B, T, hidden) of a cell for products (B, T, 4 hidden), and the last h and c."""
+        outputs, h, c = self._cells[cell].run(products.swapaxes(0, 1), *state)
+        return outputs.swapaxes(0, 1), h, c
 
     def _inputs(self, orientation: Array, acceleration: Array) -> tuple[Array, Array]:
         """Return the first hidden layer (B, T, hidden) of frames, and the frames seen from the root."""
@@ -163,8 +182,8 @@ class Rnn(NumpyNetwork):
     ) -> tuple[Results, State]:
         """Process frames (B, T, ...); return the results for the last `count`, and the new state."""
         x, seen = self._inputs(orientation, acceleration)
-        x, h1, c1 = self._cells["cell1"].run(self._product("inputs1", x), *state[:2])
-        x, h2, c2 = self._cells["cell2"].run(self._product("inputs2", x), *state[2:4])
+        x, h1, c1 = self._over("cell1", self._product("inputs1", x), *state[:2])
+        x, h2, c2 = self._over("cell2", self._product("inputs2", x), *state[2:4])
         results, lowpass = self._ends.poses(seen, x, state[4:], count)
         return results, [h1, c1, h2, c2, *lowpass]
 
@@ -187,15 +206,15 @@ class Birnn(NumpyNetwork):
     def window(self, orientation: Array, acceleration: Array, index: int) -> Results:
         """See `Runtime.window`; the second layer runs over the frames up to `index` forwards."""
         x, seen = self._inputs(orientation, acceleration)
-        ahead, back = np.split(self._product("inputs1", x), 2, axis=2)
-        ahead = self._cells["forward1"].run(ahead, None, None)[0]
-        back = _reversed(self._cells["backward1"].run(_reversed(back), None, None)[0])
-        past, later = np.split(self._product("ahead2", ahead), 2, axis=2)
+        ahead, back = _halves(self._product("inputs1", x))
+        ahead = self._over("forward1", ahead)[0]
+        back = _reversed(self._over("backward1", _reversed(back))[0])
+        past, later = _halves(self._product("ahead2", ahead))
         end = index + 1
         past = past[:, :end] + self._product("back2_forward", back[:, :end])
-        past = self._cells["forward2"].run(past, None, None)[0]
+        past = self._over("forward2", past)[0]
         later = later + self._product("back2_backward", back)
-        later = _reversed(self._cells["backward2"].run(_reversed(later), None, None)[0])[:, :end]
+        later = _reversed(self._over("backward2", _reversed(later))[0])[:, :end]
         hidden = np.concatenate([past, later], axis=2)
         return self._ends.poses(seen[:, :end], hidden, self._start(len(seen))[1], 1)[0]
 
@@ -206,41 +225,44 @@ class Birnn(NumpyNetwork):
     def stream_many(self, orientation: Array, acceleration: Array, state: State) -> tuple[Results, State]:
         """See `Runtime.stream_many`."""
         x, seen = self._inputs(orientation, acceleration)
-        ahead, back = np.split(self._product("inputs1", x), 2, axis=2)
-        ahead, h1, c1 = self._cells["forward1"].run(ahead, *state[:2])
-        new = [back, *np.split(self._product("ahead2", ahead), 2, axis=2), seen]
+        ahead, back = _halves(self._product("inputs1", x))
+        ahead, h1, c1 = self._over("forward1", ahead, *state[:2])
+        new = [back, *_halves(self._product("ahead2", ahead)), seen]
         waiting = [np.concatenate(pair, axis=1) for pair in zip(state[4:8], new, strict=True)]
         state = [h1, c1, *state[2:4], *waiting, *state[8:]]
         future = state[10].shape[1]
         due = waiting[0].shape[1] - future
-        return self._oldest(state, due, future) if due > 0 else (self._none(len(seen)), state)
+        return self._oldest(state, due) if due > 0 else (self._none(len(seen)), state)
 
     def drain(self, state: State) -> Results:
         """See `Runtime.drain`, oldest first."""
         results = [self._none(len(state[0]))]
-        while left := state[4].shape[1]:
-            result, state = self._oldest(state, 1, left - 1)
+        while state[4].shape[1]:
+            result, state = self._oldest(state, 1)
             results.append(result)
         rotations, std, places = zip(*results, strict=True)
         place = np.concatenate(places, axis=1) if self._ends.place else None
         return Results(np.concatenate(rotations, axis=1), np.concatenate(std, axis=1), place)
 
-    def _oldest(self, state: State, count: int, future: int) -> tuple[Results, State]:
+    def _oldest(self, state: State, count: int) -> tuple[Results, State]:
         """Return the results for the `count` oldest waiting frames, and the state without them.
 
-        Each pose uses the `future` frames behind its own; `count + future` frames wait. Forward states carry
-        over; the backward pass of each frame starts afresh at the last frame it uses.
+        Each pose uses as many frames behind its own. Forward states carry over; the backward pass of each
+        frame starts afresh at the last frame it uses.
         """
         batch = len(state[0])
-        back = _reversed(self._cells["backward1"].run(_fields(state[4], future), None, None)[0])
-        known = state[5][:, :count] + self._product("back2_forward", back[:, :1]).reshape(batch, count, -1)
-        past, h2, c2 = self._cells["forward2"].run(known, *state[2:4])
-        later = _fields(state[6], future) + _reversed(self._product("back2_backward", back))
-        later = self._cells["backward2"].run(later, None, None)[1].reshape(batch, count, -1)
+        back = self._cells["backward1"].run(_fields(state[4], count))[0]
+        known = self._product("back2_forward", back[-1]).reshape(batch, count, -1)
+        known += state[5][:, :count]
+        past, h2, c2 = self._over("forward2", known, *state[2:4])
+        steps = self._product("back2_backward", back)
+        for step, waiting in zip(steps, _fields(state[6], count), strict=True):
+            step += waiting
+        later = self._cells["backward2"].run(steps)[1].reshape(batch, count, -1)
         hidden = np.concatenate([past, later], axis=2)
         results, lowpass = self._ends.poses(state[7][:, :count], hidden, state[8:10], count)
-        waiting = [array[:, count:] for array in state[4:8]]
-        return results, [*state[:2], h2, c2, *waiting, *lowpass, state[10]]
+        left = [array[:, count:] for array in state[4:8]]
+        return results, [*state[:2], h2, c2, *left, *lowpass, state[10]]
 
 
 def _reversed(x: Array) -> Array:
@@ -248,26 +270,42 @@ def _reversed(x: Array) -> Array:
     return x[:, ::-1]
 
 
-def _fields(waiting: Array, future: int) -> Array:
-    """Return the frames that each frame of (B, T, N) uses, (B count, future + 1, N), the last first."""
-    fields = sliding_window_view(waiting, future + 1, axis=1).swapaxes(2, 3)
-    return _reversed(rows(fields))
+def _halves(x: Array) -> tuple[Array, Array]:
+    """Return the halves of (B, T, 2 N)."""
+    size = x.shape[2] // 2
+    return x[:, :, :size], x[:, :, size:]
 
 
-def _prepared(weight: Array, size: int) -> Array:
+def _fields(waiting: Array, count: int) -> list[Array]:
+    """Return the frames that each of the first `count` of (B, T, N) uses, step by step, the last first.
+
+    Each step is an array (B count, N).
+    """
+    return [rows(waiting[:, t : t + count]) for t in range(waiting.shape[1] - count, -1, -1)]
+
+
+def _prepared(name: str, weight: Array, size: int) -> Array:
     """Return weights (N, M) or biases (M,) of gates i, f, g, o in the order i, f, o, g, all halved.
 
     Exports double those of g, so tanh of a product is the candidate, and gives the gates, see `_Cell.run`.
-    Weights come as blocks (M / 64, N, 64), or (1, N, M) if there are no such blocks.
+    Weights that are multiplied with several rows of each frame come as blocks, see `_blocks`.
     """
     gates = weight.reshape(*weight.shape[:-1], -1, 4, size).take([0, 1, 3, 2], axis=-2)
     gates *= 0.5
-    if weight.ndim == 1:
-        return gates.reshape(-1)
+    gates = gates.reshape(weight.shape)
+    return np.ascontiguousarray(_blocks(gates)) if name == "back2_backward.weight" else gates
+
+
+def _blocks(weight: Array) -> Array:
+    """Return weights (N, M) as blocks (M / 64, N, 64), or (1, N, M) if there are no such blocks."""
     width = _BLOCK if weight.shape[1] % _BLOCK == 0 else weight.shape[1]
-    return np.ascontiguousarray(gates.reshape(len(weight), -1, width).swapaxes(0, 1))
+    return weight.reshape(len(weight), -1, width).swapaxes(0, 1)
 
 
-def _times(x: Array, blocks: Array) -> Array:
-    """Return the product (N, M) of rows (N, K) and weights in blocks."""
-    return np.matmul(x, blocks).swapaxes(0, 1).reshape(len(x), -1)
+def _times(x: Array, weight: Array) -> Array:
+    """Return the product (N, M) of rows (N, K) and weights, whole or in blocks."""
+    if weight.ndim == 2:
+        if len(x) == 1:
+            return x @ weight
+        weight = _blocks(weight)
+    return np.matmul(x, weight).swapaxes(0, 1).reshape(len(x), -1)
