@@ -36,10 +36,11 @@ def write(folder: Path, kind: str, hidden: int) -> Path:
 
 @click.command(help=__doc__)
 @click.argument("sizes", nargs=-1, metavar="[KIND:UNITS]...")
-def main(sizes: tuple[str, ...]) -> None:
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
+def main(sizes: tuple[str, ...], as_json: bool) -> None:
     """Run the command line."""
     with tempfile.TemporaryDirectory() as folder:
-        words = []
+        words = ["--json"] if as_json else []
         for size in sizes or ("birnn:512", "rnn:512"):
             kind, _, hidden = size.partition(":")
             if kind not in ("birnn", "rnn") or not hidden.isdigit():

@@ -9,32 +9,60 @@ from typing import Any
 from edgepose.errors import EdgeposeError
 from edgepose.utils.text_files import read_text
 
+Models = list[dict[str, Any]]
+"""The models of a report of `edgepose bench --json`."""
+
 
 def speed_tables(report: dict[str, Any], budget_us: float) -> str:
     """Return the speeds as Markdown tables."""
-    about = report["machine"]
-    lines = [f"{about['processor']}, one core; Python {about['python']}, torch {about['torch']}"]
-    models = report["models"]
-    names = [model["name"] for model in models]
-    lines += ["", *_header(["us a frame", *names])]
+    tables = tables_of(report, budget_us).values()
+    return "\n\n".join("\n".join(lines) for lines in tables)
+
+
+def tables_of(report: dict[str, Any], budget_us: float) -> dict[str, list[str]]:
+    """Return the lines of each table by its name; `machine` is a line of text.
+
+    Args:
+        report: what `edgepose bench --json` prints.
+        budget_us: time between two frames, microseconds.
+    """
+    about, models = report["machine"], report["models"]
+    steps = _header(["us a frame", *(model["name"] for model in models)])
     for step in models[0]["steps_us"]:
-        lines.append(_row([step, *(f"{model['steps_us'][step]:.0f}" for model in models)]))
-    lines += [
-        "",
-        *_header(["packets to UDP, full speed", "frames a second", "p50 ms", "p99 ms", "max ms"]),
-    ]
+        steps.append(_row([step, *(f"{model['steps_us'][step]:.0f}" for model in models)]))
+    return {
+        "machine": [f"{about['processor']}, one core; Python {about['python']}, torch {about['torch']}"],
+        "steps": steps,
+        "full_speed": _full_speed(models),
+        "live": _live(models, budget_us),
+        "networks": _networks(models, budget_us),
+        "start": _starts(models),
+    }
+
+
+def _full_speed(models: Models) -> list[str]:
+    lines = _header(["packets to UDP, full speed", "frames a second", "p50 ms", "p99 ms", "max ms"])
     for model in models:
         speed = model["full_speed"]
         times = (f"{speed[name]:.2f}" for name in ("p50_ms", "p99_ms", "max_ms"))
         lines.append(_row([model["name"], f"{speed['per_s']:.0f}", *times]))
-    lines += ["", *_header(["live run at 60 Hz", "us a pose", "of a core", "waits", "p50 ms", "p99 ms"])]
+    return lines
+
+
+def _live(models: Models, budget_us: float) -> list[str]:
+    lines = _header(["live run at 60 Hz", "us a pose", "of a core", "waits", "p50 ms", "p99 ms"])
     for model in (model for model in models if model["live"] is not None):
         live = model["live"]
         times = (f"{live[name]:.2f}" for name in ("waits", "p50_ms", "p99_ms"))
         share = f"{100 * live['us'] / budget_us:.1f} %"
         lines.append(_row([model["name"], f"{live['us']:.0f}", share, *times]))
-    header = ["model", "way", "weights", "us", "p50", "p99", "max", "frames a second", "of 1/60 s", "times"]
-    lines += ["", *_header(header)]
+    return lines
+
+
+def _networks(models: Models, budget_us: float) -> list[str]:
+    lines = _header(
+        ["model", "way", "weights", "us", "p50", "p99", "max", "frames a second", "of 1/60 s", "times"]
+    )
     for row in (row for model in models for row in model["ways"]):
         name = "torch.nn.LSTM, defaults" if row["mode"] == "reference" else row["mode"]
         times = (f"{row[key]:.0f}" for key in ("us", "p50_us", "p99_us", "max_us"))
@@ -43,12 +71,16 @@ def speed_tables(report: dict[str, Any], budget_us: float) -> str:
         lines.append(
             _row([row["model"], name, row["precision"], *times, speed, share, f"{row['times']:.1f}"])
         )
-    lines += ["", *_header(["a fresh process", "imports s", "model s", "memory MB"])]
+    return lines
+
+
+def _starts(models: Models) -> list[str]:
+    lines = _header(["a fresh process", "imports s", "model s", "memory MB"])
     for name, runtime, start in ((m["name"], *item) for m in models for item in m["start"].items()):
         memory = "-" if start["memory_mb"] is None else f"{start['memory_mb']:.0f}"
         imports, load = (f"{start[key]:.2f}" for key in ("imports_s", "load_s"))
         lines.append(_row([f"{name}, {runtime}", imports, load, memory]))
-    return "\n".join(lines)
+    return lines
 
 
 Figures = dict[str, float]
