@@ -14,22 +14,28 @@ WATCHED_S = 60.0
 """Length of the watch, seconds: its cost is small, but there is little left to see after that."""
 
 _EVERY_S = 2.0
+"""Time between two judgements of a rig, seconds."""
+
+_EVERY_S_PER_RIG = 0.5
+"""Least time between judgements of the rigs of one process, seconds, so that they hold up no poses."""
 
 
 class RigMonitor:
     """Checks samples like `edgepose check`, and reports each fault once, in the same words."""
 
-    def __init__(self, names: Sequence[str] = PLACEMENTS, phase: float = 0.0) -> None:
+    def __init__(self, names: Sequence[str] = PLACEMENTS, phase: float = 0.0, rigs: int = 1) -> None:
         """Start the watch with the first samples.
 
         Args:
             names: sensors of the rig.
             phase: from 0 to 1, makes several rigs of one process take turns: a judgement takes as long as a
                 frame lasts.
+            rigs: number of rigs of this process; many are judged less often.
         """
         self._names = names
-        self._first_s = _EVERY_S * (1.0 + phase)
-        self._health: SensorHealthMonitor | None = SensorHealthMonitor(names=names)
+        self._every_s = max(_EVERY_S, _EVERY_S_PER_RIG * rigs)
+        self._first_s = self._every_s * (1.0 + phase)
+        self._health: SensorHealthMonitor | None = SensorHealthMonitor(names=names, fold_s=self._every_s)
         self._start_s = self._next_s = math.nan
         self._now_s = math.nan
         self._reported: set[tuple[str, str]] = set()
@@ -49,7 +55,7 @@ class RigMonitor:
             self._start_s, self._next_s = now_s, now_s + self._first_s
         if now_s < self._next_s:
             return []
-        self._next_s = now_s + _EVERY_S
+        self._next_s = now_s + self._every_s
         lines = self.judge()
         if now_s - self._start_s > WATCHED_S:
             self._health = None

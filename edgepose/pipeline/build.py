@@ -126,6 +126,7 @@ class OpenWearer:
         several: bool,
         on_pose: Callable[[RunSummary], None],
         phase: float = 0.0,
+        wearers: int = 1,
     ) -> WearerPipeline:
         """Build the pipeline from samples to outputs.
 
@@ -135,6 +136,7 @@ class OpenWearer:
             several: align the ticks of live wearers, so that their poses can be compared and batched.
             on_pose: called after each pose.
             phase: see `RigMonitor`.
+            wearers: number of wearers of this run.
         """
         source, outputs = self._config.source, self._config.outputs
         headings = HeadingRezero(
@@ -159,7 +161,7 @@ class OpenWearer:
             notify=self.notify if source.live else lambda text: None,
             on_pose=on_pose,
             misfits=MisfitDetector(self._calibration, self._differences),
-            rig=RigMonitor(self._calibration.names, phase),
+            rig=RigMonitor(self._calibration.names, phase, wearers),
             warn=self.notify,
             look_ahead_s=future / rate if source.live else None,
             place=place,

@@ -63,7 +63,7 @@ def run_wearers(
     several = isinstance(engine, MultiWearerEngine)
     on_pose = _ignore if several else on_progress
     pipelines = [
-        wearer.pipeline(network.rate_hz, network.future, several, on_pose, i / len(opened))
+        wearer.pipeline(network.rate_hz, network.future, several, on_pose, i / len(opened), len(opened))
         for i, wearer in enumerate(opened)
     ]
     # All objects alive now stay alive; a full collection that visits them would delay a frame by 0.1 s.

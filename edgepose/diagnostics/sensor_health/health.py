@@ -17,21 +17,26 @@ from edgepose.placements import PLACEMENTS, SENSORS
 from edgepose.sources.clock_sync import DeviceClock
 from edgepose.utils.fault_messages import shared_convention
 
-_FOLD_S = 2.0  # time between two measurements if no report is requested
 _MOST_PENDING = 5000
 
 
 class SensorHealthMonitor:
     """Takes the samples of a rig and reports the health of its sensors at any time."""
 
-    def __init__(self, calibration: Calibration | None = None, names: Sequence[str] = PLACEMENTS) -> None:
+    def __init__(
+        self,
+        calibration: Calibration | None = None,
+        names: Sequence[str] = PLACEMENTS,
+        fold_s: float = 2.0,
+    ) -> None:
         """Create the monitor.
 
         Args:
             calibration: with it, headings and placements of the six sensors are checked on the body.
             names: sensors of the rig; others are reported only if they send something.
+            fold_s: time between two measurements if no report is requested, seconds.
         """
-        self._names = names
+        self._names, self._fold_s = names, fold_s
         self._sensors = [Sensor() for _ in SENSORS]
         self._comparison = RigComparison(calibration)
         self._next_fold_s = -math.inf
@@ -54,7 +59,7 @@ class SensorHealthMonitor:
                 pending[-1] = joined
             if sample.time_s >= self._next_fold_s or len(pending) >= _MOST_PENDING:
                 self._fold()
-                self._next_fold_s = sample.time_s + _FOLD_S
+                self._next_fold_s = sample.time_s + self._fold_s
 
     def report(
         self, now_s: float, clocks: Mapping[int, DeviceClock] | None = None, lag_ms: float = 0.0
@@ -67,7 +72,7 @@ class SensorHealthMonitor:
             lag_ms: delay with which this machine reads packets, see `SensorHealth`.
         """
         self._fold()
-        self._next_fold_s = now_s + 2.0 * _FOLD_S  # the next report comes before
+        self._next_fold_s = now_s + 2.0 * self._fold_s  # the next report comes before
         result = []
         rig, values = self._comparison.result(), compare_values(self._sensors)
         for i, (name, sensor) in enumerate(zip(SENSORS, self._sensors, strict=True)):
