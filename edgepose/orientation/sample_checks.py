@@ -38,15 +38,13 @@ class SampleChecker:
         The time is 0 if the sample is to be skipped, and inf if the filter has to restart: at the first
         sample, after a long gap, and when the device's clock has restarted.
         """
-        rate = max(abs(gyr[0]), abs(gyr[1]), abs(gyr[2]))
-        force = max(abs(acc[0]), abs(acc[1]), abs(acc[2]))
-        # Sums, because max() ignores a NaN unless it comes first.
-        if not (
-            abs(gyr[0]) + abs(gyr[1]) + abs(gyr[2]) < _MAX_RATE
-            and abs(acc[0]) + abs(acc[1]) + abs(acc[2]) < _MAX_FORCE
-            and -inf < time_s < inf
-        ):
+        a, b, c = gyr
+        x, y, z = acc
+        a, b, c, x, y, z = abs(a), abs(b), abs(c), abs(x), abs(y), abs(z)
+        # Sums, because NaN compares false to everything.
+        if not (a + b + c < _MAX_RATE and x + y + z < _MAX_FORCE and -inf < time_s < inf):
             return _BAD, 0.0
+        rate, force = max(a, b, c), max(x, y, z)
         events = 0
         if rate > _LEAST_PEAK_RATE or force > _LEAST_PEAK_FORCE:
             events = self._saturation(rate, force)
