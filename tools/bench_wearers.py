@@ -313,6 +313,8 @@ def main(
             try:
                 run = measure_program(model, count, seconds, core)
             except TimeoutError:  # so far behind that poses of some wearers never come
+                if not results:
+                    raise click.ClickException(f"{count} wearers: no poses of some of them") from None
                 cells = [model, str(count), f"{us:.0f}", *["-"] * 6, "no"]
                 click.echo("| " + " | ".join(cells) + " |")
                 break
