@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edgepose import rotations as rot
 from edgepose.calibration import Calibration
@@ -13,7 +14,6 @@ from edgepose.calibration.fit import PoseFit, fit_pose
 from edgepose.calibration.impossible import ImpossibleBones
 from edgepose.calibration.slip import Slip, SlipMonitor
 from edgepose.imu import ImuFrame
-from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 
 START_S = 20.0
@@ -57,7 +57,7 @@ class MisfitDetector:
         self._nearest: PoseFit | None = None  # of the rests so far
         self._warned_no_pose = False
         self._impossible = ImpossibleBones()
-        self._slip_monitor = SlipMonitor(calibration.compares_headings)
+        self._slip_monitor = SlipMonitor(calibration.compares_headings, calibration.without)
         self.slips: list[Slip] = []
         self._swapped = False
         self._explained = False  # whether a reported swap or slip explains impossible bones
@@ -97,7 +97,7 @@ class MisfitDetector:
         return [f"warning: {line}" for line in self._compare()]
 
     def _check_slips(self, frame: ImuFrame, bones: Array) -> list[str]:
-        if frame.held.any():
+        if (frame.held & ~self._calibration.missing).any():
             return []
         found = self._slip_monitor.update(frame.time_s, bones)
         if not found or self._swapped:
@@ -123,7 +123,7 @@ class MisfitDetector:
         return [f"warning: {', '.join(names)}: {problem}" for problem, names in wrong.items()]
 
     def _check_pose(self, passed_s: float) -> list[str]:
-        rest = _rest(self._frames)
+        rest = _rest(self._frames, ~self._calibration.missing)
         if rest is not None:
             fit = fit_pose(self._calibration, rest)
             self._looking = fit.swapped is None and not fit.good
@@ -141,7 +141,7 @@ class MisfitDetector:
             return [f"warning: {_slip(*nearest.slipped)}"]
         if warned or nearest is None or (nearest.in_pose and nearest.tilt_deg.max() < STRANGE_DEG):
             return []
-        tilt = ", ".join(f"{n} {angle:.0f}" for n, angle in zip(PLACEMENTS, nearest.tilt_deg, strict=True))
+        tilt = ", ".join(f"{n} {angle:.0f}" for n, angle in zip(nearest.names, nearest.tilt_deg, strict=True))
         return [
             f"warning: the wearer has not stood still in the calibration's pose (tilt off by {tilt} deg); if "
             "they have, the calibration is of another wearer or rig: calibrate again"
@@ -156,17 +156,17 @@ def _slip(name: str, angle_deg: float) -> str:
     return f"{off}: if the wearer stood in its pose, the sensor has slipped; put it back, or calibrate again"
 
 
-def _rest(frames: deque[ImuFrame]) -> Array | None:
-    """Mean orientations (6, 4) of frames in which no sensor turned; None if one did."""
-    silent = any(frame.held.any() for frame in frames)
+def _rest(frames: deque[ImuFrame], worn: NDArray[np.bool_]) -> Array | None:
+    """Mean orientations (6, 4) of frames in which none of the worn sensors turned; None if one did."""
+    silent = any((frame.held & worn).any() for frame in frames)
     if silent or frames[-1].time_s - frames[0].time_s < REST_S - _EVERY_S:
         return None
     # A cheap check that catches most motion.
-    if _angles_deg(frames[0].orientation, frames[-1].orientation).max() > REST_DEG:
+    if _angles_deg(frames[0].orientation, frames[-1].orientation)[worn].max() > REST_DEG:
         return None
     orientation = np.stack([frame.orientation for frame in frames])
     mean = np.stack([rot.mean_rotation(quats) for quats in orientation.swapaxes(0, 1)])
-    return mean if _angles_deg(mean, orientation).max() < REST_DEG else None
+    return mean if _angles_deg(mean, orientation)[:, worn].max() < REST_DEG else None
 
 
 def _angles_deg(one: Array, other: Array) -> Array:

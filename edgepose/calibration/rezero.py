@@ -189,9 +189,8 @@ def _from_hold(calibration: Calibration, frames: list[ImuFrame]) -> HeadingReset
     if moved := _names(worn & (spread > SPREAD_LIMIT_DEG), spread):
         raise CalibrationError(f"moved: {moved}; hold still")
     found = headings_from_pose(calibration, mean)
-    # With a sensor too few, no order of the others can be found.
-    fit = fit_pose(replace(calibration, north=False), mean) if worn.all() else None
-    if fit is not None and fit.swapped is not None:
+    fit = fit_pose(replace(calibration, north=False), mean)
+    if fit.swapped is not None:
         raise CalibrationError(fit.swapped)
     if crooked := _names(worn & (found.error_deg > TILT_LIMIT_DEG), found.error_deg):
         raise CalibrationError(

@@ -1,6 +1,6 @@
 """Detection, during a run, of a sensor that has turned on its limb.
 
-While five bones say that the wearer is upright, the mean orientation of the sixth over a stride is near that
+While the other bones say that the wearer is upright, the mean orientation of one over a stride is near that
 of the straight pose, whatever the wearer does: in four hours of motion capture (sport, work, walks) no lower
 leg and no pelvis stayed away from it for a minute. The bone of a sensor that has slipped does.
 """
@@ -8,12 +8,13 @@ leg and no pelvis stayed away from it for a minute. The bone of a sensor that ha
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from edgepose import rotations as rot
+from edgepose.calibration.fit import telling
 from edgepose.calibration.sensor_to_segment import POSES
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
@@ -22,7 +23,7 @@ WINDOW_S = 2.0
 """Time over which orientations are averaged, seconds: longer than a stride."""
 
 UPRIGHT_DEG = 20.0
-"""Largest mean tilt of the five other bones of a wearer who is upright."""
+"""Largest mean tilt of the other bones of a wearer who is upright."""
 
 MOST = 0.9
 """Share of the windows in which a bone must be off by more than its limit."""
@@ -81,26 +82,29 @@ class Slip(NamedTuple):
 class SlipMonitor:
     """Collects windows in which the wearer is upright, and reports each sensor that is off, once."""
 
-    def __init__(self, north: bool) -> None:
+    def __init__(self, north: bool, without: Sequence[str] = ()) -> None:
         """Create the monitor.
 
         Args:
             north: whether headings count from one north, so that they can be compared.
+            without: sensors that the rig lacks, which are not judged.
         """
         self._north = north
+        self._worn = [i for i, name in enumerate(PLACEMENTS) if name not in without]
+        judged = telling([PLACEMENTS[i] for i in self._worn])
         self._sum = np.zeros((len(PLACEMENTS), 3, 3))
         self._frames = 0
         self._from_s: float | None = None
         # Of each sensor not reported yet: tilt, heading in degrees.
         self._windows: dict[str, deque[tuple[float, float]]] = {
-            name: deque(maxlen=limit.windows) for name, limit in _LIMITS.items()
+            name: deque(maxlen=limit.windows) for name, limit in _LIMITS.items() if name in judged
         }
 
     def update(self, time_s: float, bones: Array) -> list[Slip]:
         """Return the sensors that are now found to have slipped.
 
         Args:
-            time_s: time of a frame in which no sensor is held, seconds.
+            time_s: time of a frame in which no sensor of the rig is held, seconds.
             bones: (6, 3, 3) its bones, R_TB, in the order of PLACEMENTS.
         """
         if self._from_s is None or not 0.0 <= time_s - self._from_s < 2.0 * WINDOW_S:
@@ -123,11 +127,11 @@ class SlipMonitor:
 
     def _judge(self, mean: Array) -> list[Slip]:
         """Return the slips that a window with mean rotations (6, 3, 3) completes."""
-        tilt_deg, heading_deg = _tilts_deg(mean), _headings_deg(mean)
+        tilt_deg, heading_deg = _tilts_deg(mean), _headings_deg(mean, self._worn)
         slips = []
-        for i, name in enumerate(PLACEMENTS):
-            windows = self._windows.get(name)
-            if windows is None or np.delete(tilt_deg, i).max() > UPRIGHT_DEG:
+        for name, windows in list(self._windows.items()):
+            i = PLACEMENTS.index(name)
+            if max(tilt_deg[j] for j in self._worn if j != i) > UPRIGHT_DEG:
                 continue
             windows.append((float(tilt_deg[i]), float(heading_deg[i])))
             if len(windows) == windows.maxlen and (slip := self._slip(name, np.array(windows))) is not None:
@@ -153,8 +157,9 @@ def _tilts_deg(mean: Array) -> Array:
     return np.asarray(np.degrees(np.arccos(np.clip(np.sum(up * _UP, axis=1) / size, -1.0, 1.0))))
 
 
-def _headings_deg(mean: Array) -> Array:
+def _headings_deg(mean: Array, worn: Sequence[int]) -> Array:
     """Return the headings (6,) of mean rotations (6, 3, 3) against those of the others of trunk and legs."""
     heading = np.exp(1j * rot.yaw_of_matrix(mean @ rot.transpose(_STRAIGHT)))
-    others = [sum(heading[j] for j in _FORWARD_SHOWN_BY if j != i) for i in range(len(PLACEMENTS))]
+    shown_by = [j for j in _FORWARD_SHOWN_BY if j in worn]
+    others = [sum(heading[j] for j in shown_by if j != i) for i in range(len(PLACEMENTS))]
     return np.asarray(np.degrees(np.angle(heading / np.array(others))))

@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from edgepose.calibration import Calibration, mounting_warnings
-from edgepose.placements import SENSORS
+from edgepose.calibration.fit import telling
+from edgepose.placements import PLACEMENTS, SENSORS
 from edgepose.sources import Device
 from edgepose.sources.sensor_map import SensorMap
 from edgepose.utils.fault_messages import no_common_heading
@@ -52,7 +53,19 @@ def unlike_six(calibration: Calibration) -> str | None:
         parts.append(f"{', '.join(calibration.added.names)} measured besides the six{drift}")
     if calibration.without:
         parts.append(f"{', '.join(calibration.without)} not measured: poses are less accurate")
+        parts += _not_judged(calibration)
     return f"sensors  {len(calibration.sensors)}; {'; '.join(parts)}" if parts else None
+
+
+def _not_judged(calibration: Calibration) -> list[str]:
+    """Return what a run cannot find out about a rig that lacks some of the six sensors."""
+    worn = [name for name in PLACEMENTS if name not in calibration.without]
+    judged = telling(worn)
+    hidden = [name for name in worn if name not in judged]
+    parts = [f"a slip of {'any' if not judged else ', '.join(hidden)} does not show"] if hidden else []
+    if not calibration.north and not any(name.endswith("forearm") for name in worn):
+        parts.append("without a forearm, the straight pose does not correct drift")
+    return parts
 
 
 def missing_quantities(

@@ -26,16 +26,15 @@ class RigComparison:
     def __init__(self, calibration: Calibration | None) -> None:
         """Create the comparison.
 
-        Without a calibration of all six, only sensors that lie side by side are compared.
+        Without a calibration, only sensors that lie side by side are compared.
         """
-        whole = None if calibration is None or calibration.without else calibration
-        self._worn = None if whole is None else WornComparison(whole)
+        self._worn = None if calibration is None else WornComparison(calibration)
         self._table_deg: Array | None = None
 
     def update(self, sensors: Sequence[Sensor]) -> None:
         """Compare the sensors, in the order of SENSORS, in their current state."""
         if self._worn is not None:
-            self._worn.check_bones(sensors[: len(PLACEMENTS)])
+            self._worn.check_bones(sensors)
         resting = {i: rest for i, sensor in enumerate(sensors) if (rest := sensor.present_rest()) is not None}
         reporting = sum(len(sensor.window) > 0 for sensor in sensors)
         if len(resting) < 2 or len(resting) < reporting:
@@ -47,9 +46,9 @@ class RigComparison:
             if reset.error_deg.max() < RESET_TILT_LIMIT_DEG:  # false for sensors without orientation
                 self._table_deg = np.full(len(SENSORS), np.nan)
                 self._table_deg[list(resting)] = from_median(-reset.offset)
-        elif self._worn is not None and set(range(len(PLACEMENTS))) <= resting.keys():
+        elif self._worn is not None and set(self._worn.placements) <= resting.keys():
             self._table_deg = None
-            self._worn.compare_pose([resting[i] for i in range(len(PLACEMENTS))])
+            self._worn.compare_pose(resting)
 
     def result(self) -> list[dict[str, Any]]:
         """Return fields for the `SensorHealth` of each sensor."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
@@ -26,47 +26,57 @@ _EVERY_S = 0.1  # time between two checks of the bones
 
 
 class WornComparison:
-    """Sensors against a calibration, which knows how they sat in its pose."""
+    """Sensors against a calibration, which knows how they sat in its pose.
+
+    Attributes:
+        placements: indices of the sensors that are compared: those of the six that the rig has.
+    """
 
     def __init__(self, calibration: Calibration) -> None:
         """Create the comparison with the calibration that the wearer should have."""
         # Devices' own headings differ from those that a filter computed here.
         self._own_headings = calibration.filter == "none"
         self._calibration = calibration
+        self.placements = np.flatnonzero(~calibration.missing).tolist()
         self._tilts_only = dataclasses.replace(calibration, north=False)
         self._fit: PoseFit | None = None
-        self._swaps: list[str | None] = [None] * len(PLACEMENTS)
+        self._swaps: dict[int, str] = {}
         self._off_deg = math.inf
-        self._headings: Array | None = None
+        self._headings: dict[int, float] = {}
         self._bones = ImpossibleBones()
         self._impossible: dict[str, str] = {}
-        self._slip_monitor = SlipMonitor(calibration.compares_headings)
+        self._slip_monitor = SlipMonitor(calibration.compares_headings, calibration.without)
         self._slips: dict[str, str] = {}
         self._next_s = -math.inf
 
-    def compare_pose(self, rests: Sequence[Rest]) -> None:
-        """Compare six sensors at rest, whose wearer stands in the pose, or should."""
-        oriented = all(np.isfinite(rest.quat).all() for rest in rests) and self._own_headings
-        if not oriented and not all(np.linalg.norm(rest.acc) > 0.0 for rest in rests):
+    def compare_pose(self, resting: Mapping[int, Rest]) -> None:
+        """Compare sensors at rest, by placement, whose wearer stands in the pose, or should."""
+        rests = {i: resting[i] for i in self.placements}
+        oriented = all(np.isfinite(rest.quat).all() for rest in rests.values()) and self._own_headings
+        if not oriented and not all(np.linalg.norm(rest.acc) > 0.0 for rest in rests.values()):
             return
         calibration = self._calibration if oriented else self._tilts_only
-        quats = np.stack([rest.quat if oriented else level(rest.acc) for rest in rests])
+        quats = np.tile([1.0, 0.0, 0.0, 0.0], (len(PLACEMENTS), 1))
+        for i, rest in rests.items():
+            quats[i] = rest.quat if oriented else level(rest.acc)
         fit = fit_pose(calibration, quats)
         if not fit.off_deg <= self._off_deg + _POSE_OFF_DEG:
             return  # the wearer has been nearer to the pose before
         self._off_deg = min(fit.off_deg, self._off_deg)
         if fit.in_pose and oriented:
-            self._headings = fit.heading_deg
-        self._swaps = [None] * len(PLACEMENTS)
+            self._headings = dict(zip(self.placements, fit.heading_deg.tolist(), strict=True))
+        self._swaps = {}
         if fit.sits_at is not None:
-            self._swaps = [PLACEMENTS[at] if at != i else None for i, at in enumerate(fit.sits_at)]
+            pairs = zip(self.placements, fit.sits_at, strict=True)
+            self._swaps = {i: PLACEMENTS[at] for i, at in pairs if at != i}
         elif fit.in_pose:
-            self._swaps = _swaps(calibration, quats, fit.tilt_deg)
+            off = [i for i, tilt in zip(self.placements, fit.tilt_deg, strict=True) if tilt > POSE_TILT_DEG]
+            self._swaps = _swaps(calibration, quats, off)
         self._fit = fit
 
     def check_bones(self, sensors: Sequence[Sensor]) -> None:
-        """Look for bones in impossible orientations, in the newest rows of six sensors."""
-        windows = [sensor.window for sensor in sensors]
+        """Look for bones in impossible orientations, in the newest rows of all sensors."""
+        windows = [sensors[i].window for i in self.placements]
         if not self._own_headings or not all(len(window) for window in windows):
             return
         first_s, last_s = (f(float(w[i, TIME]) for w in windows) for f, i in ((max, 0), (min, -1)))
@@ -75,12 +85,15 @@ class WornComparison:
             return
         self._next_s = float(times[-1]) + _EVERY_S
         rows = [np.minimum(np.searchsorted(w[:, TIME], times), len(w) - 1) for w in windows]
-        quats = np.stack([w[row, QUAT] for w, row in zip(windows, rows, strict=True)], axis=1)
+        quats = np.tile([1.0, 0.0, 0.0, 0.0], (len(times), len(PLACEMENTS), 1))
+        quats[:, self.placements] = np.stack(
+            [w[row, QUAT] for w, row in zip(windows, rows, strict=True)], axis=1
+        )
         unit = np.abs(np.linalg.norm(quats, axis=-1) - 1.0).max(axis=1) < 0.01
         times, quats = times[unit], quats[unit]
         bones, _ = apply_calibration(self._calibration, quats, np.zeros((*quats.shape[:2], 3)))
         for time_s, instant in zip(times.tolist(), bones, strict=True):
-            self._impossible |= self._bones.update(instant, [False] * len(PLACEMENTS), _EVERY_S)
+            self._impossible |= self._bones.update(instant, self._calibration.missing, _EVERY_S)
             for slip in self._slip_monitor.update(time_s, instant):
                 self._slips[slip.placement] = f"it has {slip.message}"
 
@@ -90,12 +103,13 @@ class WornComparison:
         impossible = self._impossible if self._fit is None or self._fit.good else {}
         impossible = self._slips or impossible
         fields: list[dict[str, Any]] = [{"impossible": impossible.get(name)} for name in PLACEMENTS]
-        for i, of_sensor in enumerate(fields):
-            if self._fit is not None:
-                of_sensor["pose_tilt_deg"] = float(self._fit.tilt_deg[i])
-                of_sensor["in_pose"], of_sensor["swapped_with"] = self._fit.in_pose, self._swaps[i]
-            if self._headings is not None:
-                of_sensor |= {"heading_deg": float(self._headings[i]), "heading_on": "body"}
+        if self._fit is not None:
+            for i, tilt in zip(self.placements, self._fit.tilt_deg.tolist(), strict=True):
+                fields[i] |= {"pose_tilt_deg": tilt, "in_pose": self._fit.in_pose}
+        for i, name in self._swaps.items():
+            fields[i]["swapped_with"] = name
+        for i, heading in self._headings.items():
+            fields[i] |= {"heading_deg": heading, "heading_on": "body"}
         return fields
 
 
@@ -106,10 +120,10 @@ def level(acc: Array) -> Array:
     return quat / np.linalg.norm(quat)
 
 
-def _swaps(calibration: Calibration, quats: Array, tilt: Array) -> list[str | None]:
-    """Find for each sensor the one with which it must be swapped so that both fit the pose."""
-    result: list[str | None] = [None] * len(PLACEMENTS)
-    for i, j in combinations(np.flatnonzero(tilt > POSE_TILT_DEG), 2):
+def _swaps(calibration: Calibration, quats: Array, off: Sequence[int]) -> dict[int, str]:
+    """Find for each sensor that is off the one with which it must be swapped so that both fit the pose."""
+    result: dict[int, str] = {}
+    for i, j in combinations(off, 2):
         swapped = quats.copy()
         swapped[[i, j]] = quats[[j, i]]
         if headings_from_pose(calibration, swapped).error_deg[[i, j]].max() < POSE_TILT_DEG:

@@ -5,7 +5,8 @@ Assumptions:
   how well they foresee what is measured: an odd posture that lasts does not turn the sensors of a good rig.
 - Standing, sitting and walking straight show headings. Lying, turning on the spot and bones that are level or
   upside down show none.
-- A wearer who stands still with all bones as in the straight pose has also turned them as in that pose.
+- A wearer who stands still with all bones as in the straight pose has also turned them as in that pose. A
+  hanging forearm is among them: without one, sitting looks the same.
 """
 
 from __future__ import annotations
@@ -82,6 +83,7 @@ class DriftEstimator:
         self._odds = odds
         self._roles = [next(role for end, role in ROLES.items() if name.endswith(end)) for name in placements]
         self._root = root
+        self._forearms = np.array([name.endswith("forearm") for name in placements])
         habits = np.array([role.habit for role in self._roles])
         lasting = [Habit(seconds, factor * habits) for seconds, factor in HABITS]
         self._good, self._poor = (HeadingFilter(each, lasting, root) for each in (GOOD, POOR))
@@ -156,7 +158,9 @@ class DriftEstimator:
 
     def _take_pose(self, block: Block) -> None:
         """Take the straight pose, once each time it is held."""
-        other = bool(block.held.any() or block.upright.min() < _POSE_TILT or block.moved.max() > 2.0 * STILL)
+        posed = block.held | ((block.upright > _POSE_TILT) & (block.moved < 2.0 * STILL))
+        known = not block.held[self._root] and bool(np.any(self._forearms & ~block.held))
+        other = not (known and posed.all())
         before, self._posed_s = self._posed_s, 0.0 if other else self._posed_s + block.seconds
         if before < _POSE_S <= self._posed_s:
             for i in self._others(block.held):

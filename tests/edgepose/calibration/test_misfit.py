@@ -338,3 +338,21 @@ def test_a_calm_run_keeps_few_frames(calibrated):
         misfits.update(frame, POSES["t-pose"])
     assert isinstance(misfits._frames, deque)
     assert len(misfits._frames) < 120
+
+
+def test_run_and_check_judge_a_rig_that_lacks_a_sensor(command, real, calibrated, tmp_path):
+    """By the others: nothing as it is, and two sensors that are exchanged."""
+    document = json.loads(calibrated.read_text())
+    del document["sensors"]["head"]
+    (tmp_path / "five.json").write_text(json.dumps(document | {"without": ["head"]}))
+    for pairs in ([], [("left_forearm", "left_lower_leg")]):
+        recording = read_recording(exchanged(real, tmp_path, pairs))
+        write_npz(
+            tmp_path / "five.npz",
+            Recording(dict(list(recording.sensors.items())[:4] + list(recording.sensors.items())[5:]), {}),
+        )
+        warnings, table, code = told(command, tmp_path / "five.npz", tmp_path / "five.json")
+        moved = {name for pair in pairs for name in pair}
+        assert set(re.findall(r"(\w+) is where", " ".join(warnings))) == moved
+        assert set(re.findall(r"^(\w+): it is where", table, re.MULTILINE)) == moved
+        assert code == (3 if moved else 0), table

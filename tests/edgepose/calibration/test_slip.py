@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -90,6 +91,29 @@ def test_two_slipped_sensors_and_a_wearer_who_lies_are_not_judged():
     assert slips(one) == []
 
 
+@pytest.mark.parametrize(
+    ("without", "found"),
+    [(("head",), ["pelvis"]), (("left_forearm", "head"), ["pelvis"]), (PLACEMENTS[:2], [])],
+)
+def test_a_rig_that_lacks_sensors_is_judged_by_the_others(walked, without, found):
+    """Whatever stands for those that it lacks; without forearms, another posture may look like it."""
+    whole, quats = walked
+    lacking = np.isin(PLACEMENTS, without)
+    made = replace(
+        whole, without=without, bone_from_sensor=np.where(lacking[:, None], 0.5, whole.bone_from_sensor)
+    )
+    quats = np.where(lacking[:, None], [1.0, 0.0, 0.0, 0.0], quats)
+    assert slips_of_run(made, quats, lacking) == []
+    assert slips_of_run(made, turned(whole, quats, 5, "x", 40.0), lacking) == found
+
+
+def slips_of_run(made: cal.Calibration, quats: np.ndarray, held: np.ndarray) -> list[str]:
+    detector = MisfitDetector(made)
+    for k, (quat, bones) in enumerate(zip(quats, bones_of(made, quats), strict=True)):
+        detector.update(ImuFrame(k, k / RATE, quat, np.zeros((6, 3)), held, k / RATE), bones)
+    return [slip.placement for slip in detector.slips]
+
+
 def test_a_run_warns_once_and_keeps_it(walked):
     made, quats = walked
     half = len(quats) // 2
@@ -134,3 +158,11 @@ def test_poses_of_a_file_show_it():
     )
     (slip,) = find_slips(poses, default_body())
     assert (slip.placement, round(slip.angle_deg)) == ("head", 45)
+
+
+def test_one_forearm_without_the_other_may_be_at_work(walked):
+    made, quats = walked
+    working = turned(made, quats, 1, "x", 60.0)
+    assert [slip.placement for slip in slips(bones_of(made, working))] == ["right_forearm"]
+    monitor = SlipMonitor(north=True, without=["left_forearm"])
+    assert not [s for k, now in enumerate(bones_of(made, working)) for s in monitor.update(k / RATE, now)]

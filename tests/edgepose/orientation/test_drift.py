@@ -135,6 +135,22 @@ def test_the_straight_pose_sets_all_headings_at_once():
     np.testing.assert_allclose(found - found[ROOT], drifted, atol=10.0)
 
 
+@pytest.mark.parametrize(
+    ("lacking", "recognised"), [({0}, True), ({0, 4}, True), ({0, 1}, False), ({5}, False)]
+)
+def test_the_straight_pose_of_a_rig_that_lacks_sensors(lacking, recognised):
+    """With one forearm that hangs it is one; without any, the wearer might sit."""
+    estimator = DriftEstimator(PLACEMENTS, ROOT, KNOWN_TO_DRIFT)
+    held = np.isin(np.arange(6), list(lacking))
+    for _ in range(3 * MINUTE):
+        estimator.update(block({}, upright=np.zeros(6), held=held))
+    posed = {"upright": np.where(held, 0.0, 1.0), "moved": np.full(6, DEG), "spread": np.ones(6)}
+    for _ in range(4):
+        estimator.update(block({3: 15.0}, held=held, **posed))
+    found = np.degrees(estimator.error)
+    assert found[3] - found[ROOT] == pytest.approx(15.0 if recognised else 0.0, abs=7.0)
+
+
 def test_a_rezero_reveals_scale_errors():
     """After thirteen turns of someone who lies, so that nothing else shows headings."""
     estimator = DriftEstimator(PLACEMENTS, ROOT)
