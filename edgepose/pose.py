@@ -156,7 +156,8 @@ class PoseSequence(NamedTuple):
         translation: (T, 3) position of the pelvis in T, metres, if the file has it.
         held: T sets, see `PoseFrame`.
         warming_up: T flags, see `PoseFrame`.
-        about: what the file says about its origin: `model`, `calibration`, `source`, `date`, `edgepose`.
+        about: what the file says about its origin: `model`, `calibration`, `source`, `date`, `edgepose`,
+            `without` (sensors that the rig lacked).
         contacts: (T, 7) probabilities that the joints `CONTACTS` rest on something, if the file has them.
     """
 

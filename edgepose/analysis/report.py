@@ -275,7 +275,7 @@ def find_slips(poses: PoseSequence, body: Body) -> list[Slip]:
     rows = np.arange(0, len(poses.rotations), max(1, round(poses.rate / SLIP_RATE)))
     rows = rows[~held_sensors([poses.held[row] for row in rows]).any(axis=1)]
     bones = forward_kinematics(poses.rotations[rows], body.offsets)[0][:, list(BONES)]
-    monitor = SlipMonitor(north=False)
+    monitor = SlipMonitor(north=False, without=poses.about.get("without", "").split(", "))
     return [
         slip
         for time_s, instant in zip(poses.time_s[rows].tolist(), bones, strict=True)

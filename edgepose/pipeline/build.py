@@ -107,6 +107,7 @@ class OpenWearer:
                 "source": self._config.source.name,
                 "date": datetime.now().astimezone().isoformat(" ", "minutes"),
                 "edgepose": edgepose.__version__,
+                **({"without": ", ".join(lacking)} if (lacking := self._calibration.without) else {}),
             }
             self._sinks = open_outputs(
                 *(stack, self._config.outputs, self._config.outputs.rate or network.rate_hz, stopped),

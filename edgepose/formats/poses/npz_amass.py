@@ -42,7 +42,7 @@ about its pelvis. Other bodies differ by a few centimetres, which only the licen
 JOINT_COUNTS = {24: "SMPL", 52: "SMPL-H", 55: "SMPL-X"}
 """Numbers of joints that can be written, and the body models that have them; fingers and face are at rest."""
 
-ABOUT = ("model", "calibration", "source", "date", "edgepose")
+ABOUT = ("model", "calibration", "source", "date", "edgepose", "without")
 """Keys of the facts about the origin of the poses."""
 
 _LONGEST_ABOUT = 10_000  # characters

@@ -158,6 +158,7 @@ def test_poses_of_a_file_show_it():
     )
     (slip,) = find_slips(poses, default_body())
     assert (slip.placement, round(slip.angle_deg)) == ("head", 45)
+    assert find_slips(poses._replace(about={"without": "left_forearm, head"}), default_body()) == []
 
 
 def test_one_forearm_without_the_other_may_be_at_work(walked):
