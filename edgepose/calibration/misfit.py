@@ -12,6 +12,7 @@ from edgepose import rotations as rot
 from edgepose.calibration import Calibration
 from edgepose.calibration.fit import PoseFit, fit_pose
 from edgepose.calibration.impossible import ImpossibleBones
+from edgepose.calibration.same_limb import SAME_LIMB, SameLimb
 from edgepose.calibration.slip import Slip, SlipMonitor
 from edgepose.imu import ImuFrame
 from edgepose.rotations import Array
@@ -57,6 +58,7 @@ class MisfitDetector:
         self._nearest: PoseFit | None = None  # of the rests so far
         self._warned_no_pose = False
         self._impossible = ImpossibleBones()
+        self._same_limb = SameLimb()
         self._slip_monitor = SlipMonitor(calibration.compares_headings, calibration.without)
         self.slips: list[Slip] = []
         self._swapped = False
@@ -81,6 +83,8 @@ class MisfitDetector:
         self._next_s = frame.time_s + _EVERY_S
         passed_s = frame.time_s - self._start_s
         lines += self._check_bones(frame, bones)
+        pair = self._same_limb.update(frame.time_s, frame.orientation, frame.held | self._calibration.missing)
+        lines += [] if pair is None else [f"warning: {' and '.join(pair)} {SAME_LIMB}"]
         if not self._compared and passed_s >= COMPARE_S:
             lines += self._comparison()
         if self._looking:

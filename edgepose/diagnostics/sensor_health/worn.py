@@ -13,6 +13,7 @@ import numpy as np
 from edgepose.calibration.fit import POSE_TILT_DEG, PoseFit, fit_pose
 from edgepose.calibration.heading_reset import headings_from_pose
 from edgepose.calibration.impossible import ImpossibleBones
+from edgepose.calibration.same_limb import SAME_LIMB, SameLimb
 from edgepose.calibration.sensor_to_segment import Calibration, apply_calibration
 from edgepose.calibration.slip import SlipMonitor
 from edgepose.diagnostics.sensor_health.columns import QUAT, TIME
@@ -47,6 +48,8 @@ class WornComparison:
         self._impossible: dict[str, str] = {}
         self._slip_monitor = SlipMonitor(calibration.compares_headings, calibration.without)
         self._slips: dict[str, str] = {}
+        self._same_limb = SameLimb()
+        self._shared: dict[str, str] = {}
         self._next_s = -math.inf
 
     def compare_pose(self, resting: Mapping[int, Rest]) -> None:
@@ -92,8 +95,11 @@ class WornComparison:
         unit = np.abs(np.linalg.norm(quats, axis=-1) - 1.0).max(axis=1) < 0.01
         times, quats = times[unit], quats[unit]
         bones, _ = apply_calibration(self._calibration, quats, np.zeros((*quats.shape[:2], 3)))
-        for time_s, instant in zip(times.tolist(), bones, strict=True):
-            self._impossible |= self._bones.update(instant, self._calibration.missing, _EVERY_S)
+        missing = self._calibration.missing
+        for time_s, instant, quat in zip(times.tolist(), bones, quats, strict=True):
+            self._impossible |= self._bones.update(instant, missing, _EVERY_S)
+            pair = self._same_limb.update(time_s, quat, missing) or ()
+            self._shared |= {name: f"{' and '.join(pair)} {SAME_LIMB}" for name in pair}
             for slip in self._slip_monitor.update(time_s, instant):
                 self._slips[slip.placement] = f"it has {slip.message}"
 
@@ -101,7 +107,7 @@ class WornComparison:
         """Return fields for the `SensorHealth` of each sensor."""
         # A sensor that does not fit the pose makes others look impossible, too.
         impossible = self._impossible if self._fit is None or self._fit.good else {}
-        impossible = self._slips or impossible
+        impossible = self._shared or self._slips or impossible
         fields: list[dict[str, Any]] = [{"impossible": impossible.get(name)} for name in PLACEMENTS]
         if self._fit is not None:
             for i, tilt in zip(self.placements, self._fit.tilt_deg.tolist(), strict=True):

@@ -356,3 +356,24 @@ def test_run_and_check_judge_a_rig_that_lacks_a_sensor(command, real, calibrated
         assert set(re.findall(r"(\w+) is where", " ".join(warnings))) == moved
         assert set(re.findall(r"^(\w+): it is where", table, re.MULTILINE)) == moved
         assert code == (3 if moved else 0), table
+
+
+def test_two_sensors_on_one_limb(calibrated):
+    """Both shins' sensors on the right one, strapped at another angle; half of the steps are calm."""
+    made, rng = load_calibration(calibrated), np.random.default_rng(0)
+    turns = rng.normal(scale=0.4, size=(120, 6, 3))
+    turns[::2] = 0.0
+    walking = rot.matrix_to_quat(rot.rotvec_to_matrix(turns))
+    strapped = np.array([0.6, 0.0, 0.8, 0.0])
+    for shared in (False, True):
+        if shared:
+            flesh = rot.matrix_to_quat(rot.rotvec_to_matrix(rng.normal(scale=0.03, size=(120, 3))))
+            walking[:, 2] = rot.quat_multiply(rot.quat_multiply(walking[:, 3], flesh), strapped)
+        detector, lines = MisfitDetector(made), []
+        for k, quats in enumerate(walking):
+            frame = ImuFrame(k, k / 2.0, quats, np.zeros((6, 3)), np.zeros(6, bool), k / 2.0)
+            lines += detector.update(frame, POSES["straight"])
+        found = [line for line in lines if "one limb" in line]
+        assert [line.split(" move ")[0] for line in found] == (
+            ["warning: left_lower_leg and right_lower_leg"] if shared else []
+        )
