@@ -66,7 +66,7 @@ def live_cost(model: Path, seconds: float = MEASURED_S) -> LiveCost | None:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory()))
         save(calibration(), folder / "calib.json")
-        line = stack.enter_context(_Line())
+        line = stack.enter_context(SensorLine())
         receiver = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         receiver.bind(("127.0.0.1", 0))
         receiver.setblocking(False)
@@ -90,7 +90,7 @@ def live_cost(model: Path, seconds: float = MEASURED_S) -> LiveCost | None:
     return LiveCost(us, waits, float(latency[1]), float(latency[2]), poses)
 
 
-def _send_until_first_pose(line: _Line, receiver: socket.socket, run: subprocess.Popen[bytes]) -> None:
+def _send_until_first_pose(line: SensorLine, receiver: socket.socket, run: subprocess.Popen[bytes]) -> None:
     end_s = time.monotonic() + START_S
     while not line.send(0.1, receiver):
         if run.poll() is not None or time.monotonic() > end_s:
@@ -99,7 +99,7 @@ def _send_until_first_pose(line: _Line, receiver: socket.socket, run: subprocess
             raise EdgeposeError(f"no poses of a live run: {run.stderr.read().decode()[-200:].strip()}")
 
 
-class _Line:
+class SensorLine:
     """A pseudo terminal with six sensors that send in turn."""
 
     def __init__(self) -> None:
@@ -112,7 +112,7 @@ class _Line:
         self._start_s = time.monotonic()
         self._sent = 0
 
-    def __enter__(self) -> _Line:
+    def __enter__(self) -> SensorLine:
         return self
 
     def __exit__(self, *_: object) -> None:
