@@ -2,7 +2,7 @@
 
 \b
     count_arm64.py /var/tmp/edgepose-arm64/bookworm
-    count_arm64.py /var/tmp/edgepose-arm64/bookworm --tree FOLDER --runtime torch     another revision's sources
+    count_arm64.py /var/tmp/edgepose-arm64/bookworm --tree FOLDER --runtime torch     another revision
 
 network: one step of the streaming network, in f32.
 live: a whole `edgepose run` at 60 Hz, with six sensors at 100 Hz that send in turn over one serial line and
@@ -33,6 +33,9 @@ from slow_clock import slow_down
 TOOLS = Path(__file__).parent
 CALLS = {"getppid": 173, "sendto": 206}
 """System calls that mark frames, and their numbers on 64-bit ARM."""
+
+OWN = ("[", "/usr/bin/qemu", "/usr/lib/x86_64-linux-gnu")
+"""Names of memory that is qemu's own."""
 
 START_S = 30.0
 """Longest time until the first pose, slow seconds."""
@@ -74,7 +77,18 @@ class Computer(NamedTuple):
             "OPENBLAS_NUM_THREADS": "1",
             "OMP_NUM_THREADS": "1",
         }
-        command = ["taskset", "-c", core, "qemu-aarch64", "-L", str(self.root), "-cpu", self.cpu, "-U", "OPENBLAS_CORETYPE"]
+        command = [
+            "taskset",
+            "-c",
+            core,
+            "qemu-aarch64",
+            "-L",
+            str(self.root),
+            "-cpu",
+            self.cpu,
+            "-U",
+            "OPENBLAS_CORETYPE",
+        ]
         command += ["-plugin", f"{self.plugin},out={counts},call={CALLS[call]}"]
         command += [word for name, value in variables.items() for word in ("-E", f"{name}={value}")]
         return [*command, str(self.root / "usr/bin" / packages.parent.name)]
@@ -87,7 +101,9 @@ def network(computer: Computer, folder: Path, model: str, runtime: str, frames: 
     return per_frame(folder / "counts")
 
 
-def live(computer: Computer, folder: Path, words: list[str], slow: float, seconds: float) -> tuple[float, float]:
+def live(
+    computer: Computer, folder: Path, words: list[str], slow: float, seconds: float
+) -> tuple[float, float]:
     """Return millions of instructions of a frame of `edgepose run`, and the megabytes of the program."""
     from edgepose.benchmarks.live_run import SensorLine
 
@@ -125,7 +141,9 @@ def memory_mb(process: int) -> float:
         if re.match(r"[0-9a-f]+-[0-9a-f]+ ", line):
             _, access, _, _, _, *name = line.split(maxsplit=5)
             own = "".join(name)
-            counts = access != "rwxp" and not own.startswith(("[", "/usr/bin/qemu", "/usr/lib/x86_64-linux-gnu"))
+            counts = access != "rwxp" and not own.startswith(
+                ("[", "/usr/bin/qemu", "/usr/lib/x86_64-linux-gnu")
+            )
         elif counts and line.startswith("Rss:"):
             total += int(line.split()[1])
     return total / 1024
@@ -147,7 +165,12 @@ def plugin() -> Iterator[Path]:
 @click.option("--tree", type=click.Path(exists=True, file_okay=False, path_type=Path), help="Sources to run.")
 @click.option("--model", "models", multiple=True, default=("rnn", "birnn"), show_default=True)
 @click.option(
-    "--runtime", "runtimes", multiple=True, default=("torch", "numpy"), show_default=True, help="none: no flag."
+    "--runtime",
+    "runtimes",
+    multiple=True,
+    default=("torch", "numpy"),
+    show_default=True,
+    help="none: no flag.",
 )
 @click.option("--frames", default=60, show_default=True, help="Steps of the network.")
 @click.option("--seconds", default=20.0, show_default=True, help="Length of a live run.")
@@ -173,11 +196,20 @@ def main(
         save(calibration(), folder / "calib.json")
         for model in models:
             for runtime in runtimes:
-                words = ["--protocol", "native", "--calibration", str(folder / "calib.json"), "--model", model]
+                words = [
+                    "--protocol",
+                    "native",
+                    "--calibration",
+                    str(folder / "calib.json"),
+                    "--model",
+                    model,
+                ]
                 words += ["--precision", "f32"]
                 if runtime != "none":  # revisions before there was a choice
                     words += ["--runtime", runtime]
-                    print(f"{cpu} {model} {runtime}: network {network(computer, folder, model, runtime, frames):.2f} M")
+                    print(
+                        f"{cpu} {model} {runtime}: network {network(computer, folder, model, runtime, frames):.2f} M"
+                    )
                 millions, megabytes = live(computer, folder, words, slow, seconds)
                 print(f"{cpu} {model} {runtime}: live {millions:.2f} M, {megabytes:.0f} MB", flush=True)
 

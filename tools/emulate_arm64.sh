@@ -5,13 +5,16 @@
 #   sudo tools/emulate_arm64.sh [bookworm|trixie] [CPU...]
 #
 # CPU: qemu's name of a processor; the default is cortex-a72 (Raspberry Pi 4) and cortex-a76 (Raspberry Pi 5).
-# Needs root, Debian's packages qemu-user-static, binfmt-support and mmdebstrap, and a .venv here (created by tools/demo).
+# Needs root, Debian's packages qemu-user-static, binfmt-support and mmdebstrap, and a Python with edgepose here: that of
+# .venv (created by tools/demo), or PYTHON=/path/to/python3.
 # Takes an hour and 3 GB below FOLDER (/var/tmp/edgepose-arm64). An existing installation there is reused.
 set -eu
 cd "$(dirname "$0")/.."
 suite=${1:-bookworm}
 [ $# -gt 0 ] && shift
 [ $# -gt 0 ] || set -- cortex-a72 cortex-a76
+python=${PYTHON:-.venv/bin/python}
+export PYTHONPATH=$PWD:$PWD/export OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
 folder=${FOLDER:-/var/tmp/edgepose-arm64}/$suite
 home=/home/rig  # in the emulated root
 repository=$home/repository
@@ -32,7 +35,7 @@ make_root() {
 
 inside() {  # CPU, COMMANDS
   env -i HOME="$home" PATH=/usr/sbin:/usr/bin:/sbin:/bin LANG=C.UTF-8 DEBIAN_FRONTEND=noninteractive QEMU_CPU="$1" \
-    PIP_CERT=/etc/ssl/certs/ca-certificates.crt chroot "$folder" bash -ec "cd $home; $2"
+    OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 PIP_CERT=/etc/ssl/certs/ca-certificates.crt chroot "$folder" bash -ec "cd $home; $2"
 }
 
 block() {  # N: print the Nth block of commands of the install page
@@ -68,29 +71,36 @@ inside "$1" "edgepose/.venv/bin/pip list 2>/dev/null | grep -E '^(torch|numpy|sc
 here=$(mktemp -d)
 trap 'umount "$folder/proc"; rm -rf "$here"' EXIT
 tries=$(block 2)
-edgepose() { .venv/bin/python -m edgepose "$@"; }
+edgepose() { "$python" -m edgepose "$@"; }
 calibrate=$(grep ' calibrate ' <<< "$tries") run=$(grep ' run ' <<< "$tries")
 for model in birnn rnn; do
   eval "$(sed "s|.venv/bin/edgepose|edgepose|; s|calib.json|$here/calib.json|" <<< "$calibrate")" > /dev/null 2>&1
   eval "$(sed "s|.venv/bin/edgepose|edgepose|; s|calib.json|$here/calib.json|; s|poses.csv|$here/$model.csv|" <<< "$run") --model $model --precision f32" 2> /dev/null
   rm "$here/calib.json"
 done
+status=0
 for cpu in "$@"; do
   for model in birnn rnn; do
-    rm -f "$folder$home/edgepose/calib.json" "$folder$home/edgepose/poses.csv"
-    SECONDS=0
-    inside "$cpu" "cd edgepose; $calibrate; $run --model $model" > "$log" 2>&1 || { tail -n 5 "$log"; exit 1; }
-    echo "$cpu $model: $(grep -o 'running.*;' "$log") $SECONDS s; $(.venv/bin/python tools/compare_poses.py "$here/$model.csv" "$folder$home/edgepose/poses.csv")"
+    for runtime in torch numpy; do
+      rm -f "$folder$home/edgepose/calib.json" "$folder$home/edgepose/poses.csv"
+      SECONDS=0
+      inside "$cpu" "cd edgepose; $calibrate; $run --model $model --runtime $runtime" > "$log" 2>&1 || { tail -n 5 "$log"; exit 1; }
+      echo "$cpu $model $runtime: $(grep -o 'running.*;' "$log") $SECONDS s; $("$python" tools/compare_poses.py "$here/$model.csv" "$folder$home/edgepose/poses.csv")"
+    done
   done
-  inside "$cpu" "cd edgepose; rm -f poses.csv; $run --precision fp16" > "$log" 2>&1 && echo "$cpu: fp16 ran" ||
-    echo "$cpu: fp16: $(tail -n 1 "$log")"
+  for precision in fp16 int8; do  # a refusal is one line and exit code 1 or 2; an illegal instruction is 132
+    code=0
+    inside "$cpu" "cd edgepose; rm -f poses.csv; $run --model rnn --precision $precision" > "$log" 2>&1 || code=$?
+    [ $code -lt 126 ] || status=1
+    echo "$cpu $precision: exit code $code; $(grep -m 1 -E '^edgepose: |warning: ' "$log")"
+  done
 done
 
 tests="tests/firmware_protocols tests/edgepose/sources/test_clock.py tests/edgepose/calibration tests/edgepose/orientation
   tests/edgepose/inference/test_engine.py tests/edgepose/inference/test_numpy_network.py"
-# Of what tests need, only what these do: vendors' own decoders exist for x86-64 only.
-status=0
-inside "$1" "cd edgepose; .venv/bin/pip install --quiet cantools cobs hypothesis pytest
-  PYTHONPATH=\$PWD:\$PWD/export .venv/bin/python -m pytest -q -p no:cacheprovider --continue-on-collection-errors $(tr -d '\n' <<< "$tests")" > "$log" 2>&1 || status=1
+# Of what tests need, only what these do: xsens's, x-io's and MicroStrain's own decoders exist for x86-64 only.
+inside "$1" "sudo apt-get install -qq build-essential python3-dev
+  cd edgepose; .venv/bin/pip install --quiet --constraint constraints.txt '.[mavlink,vqf]' adafruit-circuitpython-bno08x-rvc cantools cobs hypothesis pytest witmotion
+  PYTHONPATH=\$PWD:\$PWD/export .venv/bin/python -m pytest -p no:cacheprovider --continue-on-collection-errors $(tr -d '\n' <<< "$tests")" > "$log" 2>&1 || status=1
 echo "$1: tests: $(tail -n 1 "$log"); the rest is in $log"
 exit $status

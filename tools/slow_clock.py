@@ -1,7 +1,7 @@
 """Runs edgepose with a slow clock, so that a slow computer is as good as one that keeps up.
 
 \b
-    slow_clock.py 10 run --port /dev/pts/3 ...       `edgepose run`, for which time passes at a tenth of its pace
+    slow_clock.py 10 run --port /dev/pts/3 ...    `edgepose run`; its time passes at a tenth of the pace
 
 Everything that asks for the time or waits for some of it is slowed down, also in other threads. Whoever sends
 packets has to be as slow.

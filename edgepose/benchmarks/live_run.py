@@ -103,6 +103,7 @@ class SensorLine:
     """A pseudo terminal with six sensors that send in turn."""
 
     def __init__(self) -> None:
+        """Open the terminal; its name is `port`."""
         import tty
 
         self._master, self._slave = os.openpty()
@@ -113,9 +114,11 @@ class SensorLine:
         self._sent = 0
 
     def __enter__(self) -> SensorLine:
+        """Return the line."""
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Close the terminal."""
         os.close(self._master)
         os.close(self._slave)
 

@@ -65,12 +65,22 @@ def _can_be_forked(words: list[str], given: Mapping[str, Any], environment: Mapp
 
     return (
         sys.platform == "linux"
+        and _can_adopt()
         and words[:1] == [sys.executable]
         and (words[1:2] == ["-m"] or words[1].endswith(".py"))
         and own(environment) == own(os.environ)
         and _pickled(given["preexec_fn"]) is not None
         and not given["pass_fds"]
     )
+
+
+@cache
+def _can_adopt() -> bool:
+    """Whether orphans become children of this process, so that their exit codes are known; not under qemu."""
+    reaper = ctypes.CDLL(None).prctl
+    adopted = reaper(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0) == 0
+    reaper(_PR_SET_CHILD_SUBREAPER, 0, 0, 0, 0)
+    return bool(adopted)
 
 
 def _pickled(function: Callable[[], None] | None) -> str | None:

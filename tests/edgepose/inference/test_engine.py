@@ -1,7 +1,11 @@
+import platform
+
 import numpy as np
 import pytest
 import torch
 
+from edgepose.errors import ModelError
+from edgepose.inference import quantisation
 from edgepose.inference.engine import EngineInput, EngineOutput, MultiWearerEngine, StreamEngine, WindowEngine
 from edgepose.inference.quantisation import pack_weights
 from edgepose_export.archive.torchscript import script
@@ -131,6 +135,10 @@ def test_frames_together_of_a_field(tiny, wearers):
 def test_the_place_beside_the_same_poses(parts, wearers, kind, precision):
     """In every engine and precision, to the last bit; without the wish for it there is none."""
     module = script(*parts(BIRNN._replace(kind=kind, place=True)))
+    if precision == "fp16" and not quantisation.has_fp16_products(platform.machine(), quantisation._hwcap()):
+        with pytest.raises(ModelError, match="asimdfhm"):
+            pack_weights(module, precision)
+        return
     if precision != "f32":
         pack_weights(module, precision)
     orientation, acceleration = (x[0] for x in wearers(1, 11))
