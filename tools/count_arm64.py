@@ -196,22 +196,15 @@ def main(
         save(calibration(), folder / "calib.json")
         for model in models:
             for runtime in runtimes:
-                words = [
-                    "--protocol",
-                    "native",
-                    "--calibration",
-                    str(folder / "calib.json"),
-                    "--model",
-                    model,
-                ]
-                words += ["--precision", "f32"]
+                words = ["--protocol", "native", "--calibration", str(folder / "calib.json")]
+                words += ["--model", model, "--precision", "f32"]
+                what = f"{cpu} {model} {runtime}:"
                 if runtime != "none":  # revisions before there was a choice
                     words += ["--runtime", runtime]
-                    print(
-                        f"{cpu} {model} {runtime}: network {network(computer, folder, model, runtime, frames):.2f} M"
-                    )
+                    millions = network(computer, folder, model, runtime, frames)
+                    print(f"{what} network {millions:.2f} M", flush=True)
                 millions, megabytes = live(computer, folder, words, slow, seconds)
-                print(f"{cpu} {model} {runtime}: live {millions:.2f} M, {megabytes:.0f} MB", flush=True)
+                print(f"{what} live {millions:.2f} M, {megabytes:.0f} MB", flush=True)
 
 
 if __name__ == "__main__":
