@@ -99,7 +99,7 @@ done
 tests="tests/firmware_protocols tests/edgepose/sources/test_clock.py tests/edgepose/calibration tests/edgepose/orientation
   tests/edgepose/inference/test_engine.py tests/edgepose/inference/test_numpy_network.py"
 # Of what tests need, only what these do: xsens's, x-io's and MicroStrain's own decoders exist for x86-64 only.
-inside "$1" "sudo apt-get install -qq build-essential python3-dev
+inside "$1" "sudo apt-get install -qq --no-install-recommends build-essential python3-dev
   cd edgepose; .venv/bin/pip install --quiet --constraint constraints.txt '.[mavlink,vqf]' adafruit-circuitpython-bno08x-rvc cantools cobs hypothesis pytest witmotion
   PYTHONPATH=\$PWD:\$PWD/export .venv/bin/python -m pytest -p no:cacheprovider --continue-on-collection-errors $(tr -d '\n' <<< "$tests")" > "$log" 2>&1 || status=1
 echo "$1: tests: $(tail -n 1 "$log"); the rest is in $log"
