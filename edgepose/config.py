@@ -27,8 +27,8 @@ from edgepose.utils.text_files import read_toml
 
 ANY_OUTPUT = "give at least one output, such as --csv FILE, --udp HOST:PORT or --view"
 ONE_SOURCE = (
-    "give one source: --port PORT, --can INTERFACE:CHANNEL, --listen HOST:PORT, --connect HOST:PORT "
-    "or --file PATH"
+    "give one source: --port PORT, --can INTERFACE:CHANNEL, --listen HOST:PORT, --connect HOST:PORT, "
+    "--ble ADDRESS or --file PATH"
 )
 
 
@@ -48,6 +48,7 @@ class SourceConfig:
         sensors: TOML file that maps devices to placements.
         listen: addresses of this machine to receive datagrams on, HOST:PORT, separated by commas.
         connect: devices to connect to over TCP, HOST:PORT, separated by commas.
+        ble: Bluetooth addresses of Movella DOT sensors, separated by commas.
     """
 
     port: str | None = None
@@ -61,6 +62,7 @@ class SourceConfig:
     sensors: Path | None = None
     listen: str | None = None
     connect: str | None = None
+    ble: str | None = None
 
     def __post_init__(self) -> None:
         """Raise ConfigError unless the fields name exactly one source and are in their ranges."""
@@ -87,7 +89,7 @@ class SourceConfig:
     @property
     def lines(self) -> tuple[str | None, ...]:
         """Names of the live lines, by kind."""
-        return self.port, self.can, self.listen, self.connect
+        return self.port, self.can, self.listen, self.connect, self.ble
 
     @property
     def name(self) -> str:
@@ -339,6 +341,7 @@ _KEYS = {
     "sensors": _TEXT,
     "listen": _TEXT,
     "connect": _TEXT,
+    "ble": _TEXT,
     "filter": _TEXT,
     "no-mag": _SWITCH,
     "calibration": _TEXT,

@@ -120,7 +120,7 @@ def _lines(wearer: WearerConfig) -> dict[str, list[int | None]]:
         sensor_map = _sensor_map(wearer)
         specs = line_specs(
             *(source.port, source.baud, source.can, source.bitrate, source.fd, source.protocol),
-            *(sensor_map, source.listen, source.connect),
+            *(sensor_map, source.listen, source.connect, source.ble),
         )
     lines: dict[str, list[int | None]] = {}
     for spec in specs:

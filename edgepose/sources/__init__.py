@@ -134,6 +134,7 @@ def open_source(
     blocking: bool = True,
     listen: str | None = None,
     connect: str | None = None,
+    ble: str | None = None,
     wanted: Callable[[], float] | None = None,
     without: Sequence[str] = (),
 ) -> Source:
@@ -149,14 +150,15 @@ def open_source(
             bus.
         realtime: replay a file at its own pace.
         protocol: name of a wire format, a TOML file that describes text lines, or "auto".
-        sensors: map of devices to placements; lines that it names need no `port`, `can`, `listen` or
-            `connect`.
+        sensors: map of devices to placements; lines that it names need no `port`, `can`, `listen`,
+            `connect` or `ble`.
         lenient: accept incomplete input: the good rows of a recording, with any number of sensors, and the
             lines that send; lines that do not are warned about and waited for.
         blocking: wait for a batch as the module's docstring describes; if false, return one at once, empty if
             nothing has come, for callers that read several sources.
         listen: addresses of this machine to receive datagrams on, HOST:PORT, separated by commas.
         connect: devices to connect to over TCP, HOST:PORT, separated by commas.
+        ble: Bluetooth addresses of Movella DOT sensors, separated by commas.
         wanted: returns the time on the source's clock, seconds, until which samples of live lines may be
             gathered into one batch; by default they are delivered as they come.
         without: sensors that the rig lacks and that recordings need not hold.
@@ -164,8 +166,8 @@ def open_source(
     Raises:
         EdgeposeError: no input or more than one; an unknown protocol or kind of file; an invalid map.
     """
-    if file is not None and any(name is not None for name in (port, can, listen, connect)):
-        raise EdgeposeError("give one input: --port, --can, --listen or --connect, or --file")
+    if file is not None and any(name is not None for name in (port, can, listen, connect, ble)):
+        raise EdgeposeError("give one input: --port, --can, --listen, --connect or --ble, or --file")
     # Imported only here: each kind of input has dependencies of its own.
     from edgepose.sources.sensor_map import read_map
 
@@ -177,5 +179,5 @@ def open_source(
     from edgepose.sources.line_config import line_specs
     from edgepose.sources.live import LiveSource
 
-    specs = line_specs(port, baud, can, bitrate, fd, protocol, sensor_map, listen, connect)
+    specs = line_specs(port, baud, can, bitrate, fd, protocol, sensor_map, listen, connect, ble)
     return LiveSource(specs, lenient, blocking, wanted)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple
 
@@ -23,6 +24,13 @@ QUEUE = 512
 """Number of arrivals from a socket that may wait: most of a second of the packets of six sensors."""
 
 
+DOT = "dot"
+"""Name of the protocol of Movella DOT sensors."""
+
+_BLUETOOTH_ADDRESS = re.compile("[0-9A-F]{2}(:[0-9A-F]{2}){5}|[0-9A-F]{8}(-[0-9A-F]{4}){3}-[0-9A-F]{12}")
+"""A MAC address, or the name that macOS gives a device in its place."""
+
+
 class Lines(NamedTuple):
     """Names of the lines to read from, by kind.
 
@@ -31,12 +39,14 @@ class Lines(NamedTuple):
         can: CAN buses, INTERFACE:CHANNEL.
         listen: addresses to listen on for datagrams, HOST:PORT.
         connect: devices to connect to over TCP, HOST:PORT.
+        ble: Bluetooth addresses of Movella DOT sensors.
     """
 
     port: Sequence[str] = ()
     can: Sequence[str] = ()
     listen: Sequence[str] = ()
     connect: Sequence[str] = ()
+    ble: Sequence[str] = ()
 
     @property
     def all(self) -> list[str]:
@@ -54,6 +64,7 @@ def line_specs(
     sensor_map: SensorMap | None = None,
     listen: str | None = None,
     connect: str | None = None,
+    ble: str | None = None,
 ) -> list[LineSpec]:
     """Return the lines to read from; the arguments are those of `open_source`.
 
@@ -63,7 +74,7 @@ def line_specs(
     lines = Lines(
         *(
             _split_names(f"--{kind}", text)
-            for kind, text in zip(Lines._fields, (port, can, listen, connect), strict=True)
+            for kind, text in zip(Lines._fields, (port, can, listen, connect, _upper(ble)), strict=True)
         )
     )
     if sensor_map is not None:
@@ -72,7 +83,7 @@ def line_specs(
         _check_map(sensor_map, lines)
     count = len(lines.all)
     if not count:
-        raise ConfigError("give one input: --port, --can, --listen, --connect or --file")
+        raise ConfigError("give one input: --port, --can, --listen, --connect, --ble or --file")
     for bus in lines.can:
         if ":" not in bus:
             raise ConfigError(f"{bus}: give --can as INTERFACE:CHANNEL, such as socketcan:can0")
@@ -92,6 +103,8 @@ def line_specs(
             return can_line(name, found, settings.baud or bitrate, fd, placements)
         if kind == "connect":
             return tcp_line(name, found, placements)
+        if kind == "ble":
+            return ble_line(name, found, placements)
         return udp_line(name, found, placements, None if sensor_map is None else sensor_map.senders(name))
 
     named = [(kind, name) for kind in Lines._fields for name in getattr(lines, kind)]
@@ -109,7 +122,7 @@ def _check_map(sensor_map: SensorMap, lines: Lines) -> None:
         if device.line is not None and device.line not in known:
             raise ConfigError(
                 f"{sensor_map.path}: {name}: {device.name} is not one of the lines given "
-                f"with --port, --can, --listen and --connect: {', '.join(lines.all)}"
+                f"with --port, --can, --listen, --connect and --ble: {', '.join(lines.all)}"
             )
         if device.sender is not None and not lines.listen:
             raise ConfigError(
@@ -241,6 +254,36 @@ def tcp_line(name: str, protocol: str, placements: Callable[[Protocol], Placemen
 
     check = ("that the device is set to send over this connection", "--protocol")
     return LineSpec(name, open_connection, protocols, placements, "bytes", check, None, QUEUE)
+
+
+def ble_line(name: str, protocol: str, placements: Callable[[Protocol], PlacementById]) -> LineSpec:
+    """Return the specification of a Movella DOT, by its Bluetooth address.
+
+    Raises:
+        ConfigError: the protocol is another one, the address is invalid, or the sensor has no placement.
+    """
+    if protocol not in ("auto", DOT):
+        raise ConfigError(f"--ble is for Movella DOT sensors: leave out --protocol {protocol}, or give {DOT}")
+    if not _BLUETOOTH_ADDRESS.fullmatch(name):
+        raise ConfigError(
+            f"--ble {name}: not a Bluetooth address such as D4:22:CD:00:12:34; "
+            "edgepose devices --ble lists those in range"
+        )
+    protocols = candidate_protocols(DOT, "udp", live=True)
+    placements(protocols[0])  # raises if it cannot be known where the sensor is
+
+    def open_sensor() -> Transport:
+        # Imported only here: bleak is optional, and brings an event loop along.
+        from edgepose.sources.ble import DotSensor
+
+        return DotSensor(name)
+
+    check = ("that the sensor is not charging", "with Movella's app that its firmware is up to date")
+    return LineSpec(name, open_sensor, protocols, placements, "notifications", check, None, QUEUE)
+
+
+def _upper(addresses: str | None) -> str | None:
+    return None if addresses is None else addresses.upper()
 
 
 def _split_names(flag: str, text: str | None) -> Sequence[str]:

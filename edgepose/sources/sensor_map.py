@@ -16,7 +16,7 @@ from edgepose.utils.similar_names import choices
 from edgepose.utils.text_files import read_toml
 from firmware_protocols.registry import Protocol
 
-LINES = ("port", "can", "listen", "connect")
+LINES = ("port", "can", "listen", "connect", "ble")
 """Keys that name a line."""
 
 _DIRECTION = "(left|right|up|down|forward|back)"
@@ -33,6 +33,7 @@ class Device(NamedTuple):
         can: its bus, INTERFACE:CHANNEL or the channel alone; None for any line.
         listen: the address at which its datagrams arrive, HOST:PORT; None for any line.
         connect: its address for TCP, HOST:PORT; None for any line.
+        ble: its Bluetooth address; None for any line.
         sender: IP address from which its datagrams come, or the MAC address that they state; None for any.
         id: its id on the line; None if it is the only device there.
         mounting: orientation in which it is worn, in the format of `edgepose calibrate`.
@@ -42,6 +43,7 @@ class Device(NamedTuple):
     can: str | None = None
     listen: str | None = None
     connect: str | None = None
+    ble: str | None = None
     sender: str | None = None
     id: int | None = None
     mounting: str | None = None
@@ -49,7 +51,7 @@ class Device(NamedTuple):
     @property
     def name(self) -> str | None:
         """The line as the file names it; None for any."""
-        return self.port or self.can or self.listen or self.connect
+        return self.port or self.can or self.listen or self.connect or self.ble
 
     @property
     def line(self) -> str | None:
@@ -88,7 +90,7 @@ class SensorMap(NamedTuple):
         return [name for name in PLACEMENTS if name not in self.devices]
 
     def lines(self, key: str) -> list[str]:
-        """Return the lines of a kind that the devices name, each once: "port", "can", "listen", "connect"."""
+        """Return the lines of a kind that the devices name, each once: a key of `LINES`."""
         named = [getattr(device, key) for device in self.devices.values()]
         return [name for name in dict.fromkeys(named) if name is not None]
 
@@ -143,7 +145,7 @@ def default_places(
         protocol: protocol of the line.
         index: number of the line, from 0.
         count: total number of lines.
-        kind: kind of the line, for the message: "port", "can", "listen" or "connect".
+        kind: kind of the line, for the message, one of LINES.
 
     Raises:
         ConfigError: there is no default for such a line.
@@ -214,11 +216,13 @@ def _device(where: str, entry: object) -> Device:
     if given[1:]:
         raise ConfigError(f"{where}: give {' or '.join(given)}, not both")
     if not given and device.id is None and device.sender is None:
-        raise ConfigError(f"{where}: no device named; give its port, can, listen, connect, sender or id")
+        raise ConfigError(f"{where}: no device named; give its port, can, listen, connect, ble, sender or id")
     if device.sender is not None:
         if given not in ([], ["listen"]):
             raise ConfigError(f"{where}: sender is for datagrams; it does not go with {given[0]}")
         device = device._replace(sender=_sender(where, device.sender))
+    if device.ble is not None:
+        device = device._replace(ble=device.ble.upper())
     if device.mounting is not None:
         words = _MOUNTING.fullmatch(device.mounting)
         if words is None or _AXIS[words[1]] == _AXIS[words[2]]:

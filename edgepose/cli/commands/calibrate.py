@@ -48,7 +48,7 @@ from edgepose.sources.sensor_map import SensorMap, read_map
 PAGE_PORT = 8090
 """Port of the page without an address."""
 
-_LINES = "--port, --can, --listen or --connect"
+_LINES = "--port, --can, --listen, --connect or --ble"
 
 
 def _body_frame(ctx: click.Context, param: click.Parameter, value: str | None) -> str | None:
@@ -199,7 +199,7 @@ def calibrate(
 ) -> None:
     """Find out how the sensors sit on their wearer.
 
-    The wearer holds a pose for a few seconds, live (--port, --can, --listen, --connect) or in a recording
+    The wearer holds a pose for a few seconds, live (--port, --can, --listen, --connect, --ble) or in a recording
     (--file). The calibration contains the direction that the wearer faces and the orientation of each sensor
     on its segment; `edgepose run` needs it. Repeat it whenever a sensor was taken off or slipped.
 

@@ -112,6 +112,12 @@ def source_options(command: Callable[..., Any]) -> Callable[..., Any]:
             help="Connect to the sensors over TCP, such as 192.168.1.21:7000, in the order of --port.",
         ),
         click.option(
+            "--ble",
+            metavar="ADDRESS[,...]",
+            help="Connect to these Movella DOT sensors over Bluetooth, such as D4:22:CD:00:12:34, in the order "
+            "of --port. Needs edgepose[ble].",
+        ),
+        click.option(
             "--file",
             type=click.Path(path_type=Path),
             help="Read a file instead: a recording ("
