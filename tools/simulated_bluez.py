@@ -16,12 +16,15 @@ from pathlib import Path
 from typing import Any
 
 from dbus_fast import Message, MessageFlag, MessageType, Variant
-from dbus_fast.unmarshaller import Unmarshaller
+from dbus_fast._private.unmarshaller import Unmarshaller
 
 ADAPTER = "/org/bluez/hci0"
 BUS_NAME, PROPERTIES = "org.freedesktop.DBus", "org.freedesktop.DBus.Properties"
 OBJECTS = "org.freedesktop.DBus.ObjectManager"
 _UUID = "1517{}-4947-11e9-8646-d663bd873d93".format
+
+ADVERTISE_S = 0.1
+"""Time between two advertisements of a device, seconds."""
 
 Interfaces = dict[str, dict[str, Any]]
 
@@ -121,7 +124,7 @@ class SimulatedBluez:
         self.address = f"unix:path={path}"
         self._path, self._dots, self._adapter = path, dots, adapter
         self._clients: dict[asyncio.StreamWriter, bool] = {}  # whether it wants signals
-        self._serial = 0
+        self._serial = self._discovering = 0
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True, name="bluez")
 
@@ -228,6 +231,8 @@ class SimulatedBluez:
         if member == "GetManagedObjects":
             return "a{oa{sa{sv}}}", [self._objects()], None
         if call.path == ADAPTER:
+            if member in ("StartDiscovery", "StopDiscovery"):
+                self._discovering += 1 if member == "StartDiscovery" else -1
             return "", [], self._advertise if member == "StartDiscovery" else None
         for dot in self._dots:
             if call.path.startswith(dot.path):
@@ -255,6 +260,10 @@ class SimulatedBluez:
         return objects
 
     def _advertise(self) -> None:
+        """Report the devices in range, again and again while a program looks for them."""
+        if not self._discovering:
+            return
+        self._loop.call_later(ADVERTISE_S, self._advertise)
         for dot in self._dots:
             if dot.in_range and not dot.connected:
                 self._signal("/", OBJECTS, "InterfacesAdded", "oa{sa{sv}}", [dot.path, dot.device()])
@@ -264,6 +273,7 @@ class SimulatedBluez:
             if not dot.in_range:
                 raise _Failed("org.bluez.Error.Failed", "br-connection-create-socket")
             dot.connected = True
+            self._changed(dot.path, "org.bluez.Device1", {"Connected": ("b", True)})
             return lambda: self._resolve(dot)
         if call.member == "Disconnect":
             return lambda: self._disconnect(dot, dot.in_range)
@@ -278,7 +288,6 @@ class SimulatedBluez:
         return None
 
     def _resolve(self, dot: SimulatedDot) -> None:
-        self._changed(dot.path, "org.bluez.Device1", {"Connected": ("b", True)})
         for path, interfaces in dot.attributes().items():
             self._signal("/", OBJECTS, "InterfacesAdded", "oa{sa{sv}}", [path, interfaces])
         self._changed(dot.path, "org.bluez.Device1", {"ServicesResolved": ("b", True)})
