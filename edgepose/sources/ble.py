@@ -216,7 +216,8 @@ def sensors_in_range() -> dict[str, str]:
 
 def _problem(error: Exception) -> str:
     """Describe an error of bleak, and what to do about it."""
-    text = (str(error).splitlines() or [""])[0]
+    # The first argument alone: bleak adds a code for programs.
+    text = (str(error.args[0] if error.args else "").splitlines() or [""])[0]
     if isinstance(error, BleakDeviceNotFoundError):
         return (
             f"not found over Bluetooth in {FIND_S:g} s; check that the sensor is on, in range, and not connected "
@@ -225,7 +226,7 @@ def _problem(error: Exception) -> str:
     if isinstance(error, BleakBluetoothNotAvailableError):
         return f"Bluetooth is not available: {text.rstrip('.')}; plug in an adapter, and switch it on"
     if isinstance(error, OSError) and not isinstance(error, TimeoutError):
-        return f"Bluetooth is not available: no D-Bus ({text}); check that BlueZ (bluetoothd) is running"
+        return f"Bluetooth is not available: no D-Bus ({error.strerror or error}); check that BlueZ (bluetoothd) is running"
     if "ServiceUnknown" in text or "NameHasNoOwner" in text:
         return "Bluetooth is not available: BlueZ (bluetoothd) is not running; start the service bluetooth"
     if isinstance(error, TimeoutError | asyncio.TimeoutError):

@@ -35,9 +35,14 @@ if TYPE_CHECKING:
     metavar="HOST:PORT[,...]",
     help="Connect to sensors over TCP, and report what they send.",
 )
+@click.option(
+    "--ble",
+    is_flag=True,
+    help="Look for Movella DOT sensors in range over Bluetooth, for some seconds. Needs edgepose[ble].",
+)
 @json_option
 def devices(
-    names: tuple[str, ...], probe: bool, listen: str | None, connect: str | None, as_json: bool
+    names: tuple[str, ...], probe: bool, listen: str | None, connect: str | None, ble: bool, as_json: bool
 ) -> None:
     """List the serial ports and CAN interfaces of this machine, or only the named ones.
 
@@ -54,12 +59,24 @@ def devices(
             lines.begin(flag, f"Network (edgepose run --{flag} ADDRESS):")
             for name in text.split(","):
                 lines.add(name, "", find)
-    if names or probe or (listen is None and connect is None):
+    if ble:
+        _show_bluetooth(lines)
+    if names or probe or not (listen or connect or ble):
         _show_local(lines, tuple(name for text in names for name in text.split(",") if name), probe)
     if as_json:
         show_json("devices", lines.found)
     if names or listen or connect:
         _check_failed(lines.failed)
+
+
+def _show_bluetooth(lines: _Lines) -> None:
+    """Show the Movella DOT sensors in range."""
+    from edgepose.sources.ble import sensors_in_range
+
+    lines.begin("ble", "Movella DOT sensors (edgepose run --ble ADDRESS):")
+    for address, description in sensors_in_range().items():
+        lines.add(address, description, None)
+    lines.end("none in range; switch them on, and disconnect them from phones and other programs")
 
 
 def _show_local(lines: _Lines, names: tuple[str, ...], probe: bool) -> None:
@@ -97,7 +114,8 @@ class _Lines:
 
     def __init__(self, as_json: bool) -> None:
         """Start without lines."""
-        self.found: dict[str, list[dict[str, Any]]] = {"ports": [], "buses": [], "listen": [], "connect": []}
+        kinds = ("ports", "buses", "listen", "connect", "ble")
+        self.found: dict[str, list[dict[str, Any]]] = {kind: [] for kind in kinds}
         self.failed: list[str] = []
         self._show: Callable[[str], None] = (lambda text: None) if as_json else show
         self._kind, self._width = "ports", 0
