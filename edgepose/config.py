@@ -26,10 +26,7 @@ from edgepose.utils.sockets import parse_host_and_port
 from edgepose.utils.text_files import read_toml
 
 ANY_OUTPUT = "give at least one output, such as --csv FILE, --udp HOST:PORT or --view"
-ONE_SOURCE = (
-    "give one source: --port PORT, --can INTERFACE:CHANNEL, --listen HOST:PORT, --connect HOST:PORT, "
-    "--ble ADDRESS or --file PATH"
-)
+ONE_SOURCE = "give one source: --port PORT, --can BUS, --listen, --connect or --ble ADDRESS, or --file PATH"
 
 
 @dataclass(frozen=True, kw_only=True)

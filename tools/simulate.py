@@ -9,13 +9,15 @@
     simulate.py walk.bvh --udp 127.0.0.1:9000         native packets in datagrams, from one sender
     simulate.py walk.bvh --protocol slimevr --udp 127.0.0.1:6969    six SlimeVR trackers
     simulate.py walk.bvh --protocol ximu3 --tcp 127.0.0.1    six devices with a TCP server each
+    simulate.py walk.bvh --protocol dot --ble         six Bluetooth sensors on a simulated BlueZ
     simulate.py walk.bvh --exercises --mounting 7 --raw 6    sensors without a filter at random angles
 
 Prints `port NAME[,NAME...]` for use with --port (or `can NAME` for --can, `listen ADDRESS` for --listen,
-`connect ADDRESS[,ADDRESS...]` for --connect), `senders ADDRESS,...` if there are several, `started UNIX_TIME`
-and `ended UNIX_TIME`. Before a clip, the wearer stands straight for 6 s. Sensors have the noise of a data
-sheet; with --ideal only while they rest before and after the recording. Ends at Ctrl-C, or when standard
-input closes and the recording, if it has started, is over.
+`connect ADDRESS[,ADDRESS...]` for --connect; `ble ADDRESS,...` for --ble, and `bus ADDRESS`, which edgepose
+needs in the environment variable DBUS_SYSTEM_BUS_ADDRESS), `senders ADDRESS,...` if there are several,
+`started UNIX_TIME` and `ended UNIX_TIME`. Before a clip, the wearer stands straight for 6 s. Sensors have
+the noise of a data sheet; with --ideal only while they rest before and after the recording. Ends at Ctrl-C,
+or when standard input closes and the recording, if it has started, is over.
 """
 
 from __future__ import annotations
@@ -318,6 +320,7 @@ class Target(NamedTuple):
     bus: str | None = None
     udp: tuple[str, int] | None = None
     tcp: str | None = None
+    ble: bool = False
 
 
 def open_lines(wire_format: Format, target: Target, sensors: int) -> list[Line]:
@@ -327,6 +330,11 @@ def open_lines(wire_format: Format, target: Target, sensors: int) -> list[Line]:
     if wire_format.transport == "can":
         return [Pty(slcan=True)]
     count = sensors if wire_format.single_device else 1
+    if target.ble:
+        # Imported only here: dbus-fast comes with edgepose[ble].
+        from simulated_bluez import dot_lines
+
+        return [*dot_lines(count)]
     if target.tcp is not None:
         return [TcpServer(target.tcp) for _ in range(count)]
     if target.udp is not None:
@@ -346,6 +354,9 @@ def print_lines(wire_format: Format, target: Target, lines: list[Line]) -> None:
                 ",".join(line.sender for line in lines if isinstance(line, DatagramLine)),
                 flush=True,
             )
+    elif target.ble:
+        print("ble", names, flush=True)
+        print("bus", lines[0].bus, flush=True)
     elif target.tcp is not None:
         print("connect", names, flush=True)
     elif wire_format.transport == "bytes":
@@ -608,6 +619,7 @@ def simulate(
     help="Send datagrams here, several senders from 127.0.0.11 on.",
 )
 @click.option("--tcp", metavar="HOST", help="Be a TCP server at this address for each line.")
+@click.option("--ble", is_flag=True, help="Be Movella DOT sensors on a simulated BlueZ; for --protocol dot.")
 @click.option("--loss", type=click.FloatRange(0, 1), default=0.0, help="Share of packets that are lost.")
 @click.option(
     "--corrupt", type=click.FloatRange(0, 1), default=0.0, help="Share of packets with a wrong bit."
@@ -657,6 +669,7 @@ def main(
     bus: str | None,
     udp: tuple[str, int] | None,
     tcp: str | None,
+    ble: bool,
     loss: float,
     corrupt: float,
     jitter: float,
@@ -678,7 +691,9 @@ def main(
         raise click.UsageError(f"{protocol} is a CAN protocol")
     if udp and tcp:
         raise click.UsageError("give --udp or --tcp, not both")
-    if wire_format.transport == "udp" and not udp:
+    if ble and (protocol != "dot" or udp or tcp):
+        raise click.UsageError("--ble is for --protocol dot, without --udp and --tcp")
+    if wire_format.transport == "udp" and not udp and not ble:
         raise click.UsageError(f"{protocol} needs --udp HOST:PORT")
     if corrupt and wire_format.transport == "can":
         raise click.UsageError("CAN controllers drop frames with wrong bits; use --loss")
@@ -693,7 +708,7 @@ def main(
             return
         noisy = not ideal and raw is None  # chips without a filter have their own noise
         faults = Faults(loss, corrupt, jitter, drift, kill, duplicate_id)
-        simulate(played, wire_format, Target(bus, udp, tcp), stand, noisy, faults)
+        simulate(played, wire_format, Target(bus, udp, tcp, ble), stand, noisy, faults)
     except EdgeposeError as error:
         raise click.ClickException(str(error)) from error
     except KeyboardInterrupt:

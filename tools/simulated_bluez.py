@@ -9,9 +9,10 @@ from __future__ import annotations
 import asyncio
 import io
 import struct
+import tempfile
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -98,7 +99,12 @@ class SimulatedDot:
             return {"org.bluez.GattCharacteristic1": _variants(values)}
 
         uuid = _UUID("2000" if self._measures else "1000")
-        values = {"UUID": ("s", uuid), "Device": ("o", self.path), "Primary": ("b", True), "Includes": ("ao", [])}
+        values = {
+            "UUID": ("s", uuid),
+            "Device": ("o", self.path),
+            "Primary": ("b", True),
+            "Includes": ("ao", []),
+        }
         objects: dict[str, Interfaces] = {service: {"org.bluez.GattService1": _variants(values)}}
         if self._measures:
             objects[self.control] = characteristic("2001", ["read", "write"])
@@ -291,6 +297,40 @@ class SimulatedBluez:
         for path, interfaces in dot.attributes().items():
             self._signal("/", OBJECTS, "InterfacesAdded", "oa{sa{sv}}", [path, interfaces])
         self._changed(dot.path, "org.bluez.Device1", {"ServicesResolved": ("b", True)})
+
+
+class DotLine:
+    """A simulated sensor as a line of the simulator; all sensors share one bus, which the last one closes.
+
+    Attributes:
+        name: its Bluetooth address.
+        bus: value for DBUS_SYSTEM_BUS_ADDRESS.
+        master: None, because nothing has to be read here.
+    """
+
+    master = None
+
+    def __init__(self, dot: SimulatedDot, bluez: SimulatedBluez, close: Callable[[], None]) -> None:
+        """Store the sensor, its bus, and what closes the bus."""
+        self.name, self.bus, self.close = dot.address, bluez.address, close
+        self._dot, self._bluez = dot, bluez
+
+    def send(self, wire: bytes) -> None:
+        """Send a notification, if a program has started the measurement."""
+        self._bluez.notify(self._dot, wire)
+
+    def receive(self) -> bytes:
+        """Return nothing: the bus answers by itself."""
+        return b""
+
+
+def dot_lines(count: int) -> list[DotLine]:
+    """Return simulated sensors on a new bus."""
+    stack = ExitStack()
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="simulated-bluez-")))
+    dots = [SimulatedDot(f"D4:22:CD:00:00:{number:02X}") for number in range(count)]
+    bluez = stack.enter_context(SimulatedBluez(folder / "bus", dots))
+    return [DotLine(dot, bluez, stack.close if dot is dots[-1] else lambda: None) for dot in dots]
 
 
 class _Failed(Exception):

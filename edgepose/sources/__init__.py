@@ -150,10 +150,9 @@ def open_source(
             bus.
         realtime: replay a file at its own pace.
         protocol: name of a wire format, a TOML file that describes text lines, or "auto".
-        sensors: map of devices to placements; lines that it names need no `port`, `can`, `listen`,
-            `connect` or `ble`.
-        lenient: accept incomplete input: the good rows of a recording, with any number of sensors, and the
-            lines that send; lines that do not are warned about and waited for.
+        sensors: map of devices to placements; lines that it names need no flag.
+        lenient: accept incomplete input: a recording's good rows, with any number of sensors; lines that send
+            nothing are warned about and waited for.
         blocking: wait for a batch as the module's docstring describes; if false, return one at once, empty if
             nothing has come, for callers that read several sources.
         listen: addresses of this machine to receive datagrams on, HOST:PORT, separated by commas.

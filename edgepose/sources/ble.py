@@ -1,7 +1,7 @@
 """Movella DOT sensors over Bluetooth Low Energy as transports.
 
-bleak works in an event loop. One loop, in a thread of its own, serves all sensors of the process, because they
-share an adapter. The module is imported only when such sensors are asked for.
+bleak works in an event loop. One loop, in a thread of its own, serves all sensors of the process, because
+they share an adapter. The module is imported only when such sensors are asked for.
 """
 
 from __future__ import annotations
@@ -220,13 +220,14 @@ def _problem(error: Exception) -> str:
     text = (str(error.args[0] if error.args else "").splitlines() or [""])[0]
     if isinstance(error, BleakDeviceNotFoundError):
         return (
-            f"not found over Bluetooth in {FIND_S:g} s; check that the sensor is on, in range, and not connected "
-            "to a phone or another program"
+            f"not found over Bluetooth in {FIND_S:g} s; check that the sensor is on, in range, and not "
+            "connected to a phone or another program"
         )
     if isinstance(error, BleakBluetoothNotAvailableError):
         return f"Bluetooth is not available: {text.rstrip('.')}; plug in an adapter, and switch it on"
     if isinstance(error, OSError) and not isinstance(error, TimeoutError):
-        return f"Bluetooth is not available: no D-Bus ({error.strerror or error}); check that BlueZ (bluetoothd) is running"
+        reason = error.strerror or error
+        return f"Bluetooth is not available: no D-Bus ({reason}); check that BlueZ (bluetoothd) is running"
     if "ServiceUnknown" in text or "NameHasNoOwner" in text:
         return "Bluetooth is not available: BlueZ (bluetoothd) is not running; start the service bluetooth"
     if isinstance(error, TimeoutError | asyncio.TimeoutError):

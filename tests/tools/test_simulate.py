@@ -345,9 +345,15 @@ def test_can_frames_on_a_bus_of_python_can(recording):
 
 
 @pytest.mark.parametrize(
-    ("name", "flags"), [("slimevr", ("--udp",)), ("ximu3", ("--tcp", "127.0.0.1")), ("native", ("--udp",))]
+    ("name", "flags"),
+    [
+        ("slimevr", ("--udp",)),
+        ("ximu3", ("--tcp", "127.0.0.1")),
+        ("native", ("--udp",)),
+        ("dot", ("--ble",)),
+    ],
 )
-def test_devices_in_the_network(recording, tmp_path, name, flags):
+def test_devices_without_a_cable(recording, tmp_path, monkeypatch, name, flags):
     if flags == ("--udp",):
         flags = ("--udp", free_address(socket.SOCK_DGRAM))
     rig = None
@@ -358,6 +364,8 @@ def test_devices_in_the_network(recording, tmp_path, name, flags):
             pairs = zip(PLACEMENTS, senders.split(","), strict=True)
             rig = tmp_path / "rig.toml"
             rig.write_text("".join(f'{place} = {{ sender = "{sender}" }}\n' for place, sender in pairs))
+        if name == "dot":
+            monkeypatch.setenv("DBUS_SYSTEM_BUS_ADDRESS", process.stdout.readline().split()[1])
         quats = {}
         with open_source(**{flag: address}, protocol=name, sensors=rig) as source:
             for batch in source:

@@ -199,9 +199,10 @@ def calibrate(
 ) -> None:
     """Find out how the sensors sit on their wearer.
 
-    The wearer holds a pose for a few seconds, live (--port, --can, --listen, --connect, --ble) or in a recording
-    (--file). The calibration contains the direction that the wearer faces and the orientation of each sensor
-    on its segment; `edgepose run` needs it. Repeat it whenever a sensor was taken off or slipped.
+    The wearer holds a pose for a few seconds, live (--port, --can, --listen, --connect, --ble) or in a
+    recording (--file). The calibration contains the direction that the wearer faces and the orientation of
+    each sensor on its segment; `edgepose run` needs it. Repeat it whenever a sensor was taken off or
+    slipped.
 
     IN are recordings to calibrate from, each by itself, instead of a source: files, patterns and folders.
     --out then names a folder for the calibrations.

@@ -114,8 +114,8 @@ def source_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--ble",
             metavar="ADDRESS[,...]",
-            help="Connect to these Movella DOT sensors over Bluetooth, such as D4:22:CD:00:12:34, in the order "
-            "of --port. Needs edgepose[ble].",
+            help="Connect to these Movella DOT sensors over Bluetooth, such as D4:22:CD:00:12:34, in the "
+            "order of --port. Needs edgepose[ble].",
         ),
         click.option(
             "--file",
