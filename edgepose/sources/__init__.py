@@ -150,11 +150,10 @@ def open_source(
             bus.
         realtime: replay a file at its own pace.
         protocol: name of a wire format, a TOML file that describes text lines, or "auto".
-        sensors: map of devices to placements; lines that it names need no flag.
+        sensors: map of devices to placements; lines in it need no flag.
         lenient: accept incomplete input: a recording's good rows, with any number of sensors; lines that send
             nothing are warned about and waited for.
-        blocking: wait for a batch as the module's docstring describes; if false, return one at once, empty if
-            nothing has come, for callers that read several sources.
+        blocking: wait for a batch as the module's docstring says; if false, one comes at once, maybe empty.
         listen: addresses of this machine to receive datagrams on, HOST:PORT, separated by commas.
         connect: devices to connect to over TCP, HOST:PORT, separated by commas.
         ble: Bluetooth addresses of Movella DOT sensors, separated by commas.
@@ -178,5 +177,5 @@ def open_source(
     from edgepose.sources.line_config import line_specs
     from edgepose.sources.live import LiveSource
 
-    specs = line_specs(port, baud, can, bitrate, fd, protocol, sensor_map, listen, connect, ble)
-    return LiveSource(specs, lenient, blocking, wanted)
+    lines = line_specs(port, baud, can, bitrate, fd, protocol, sensor_map, listen, connect, ble)
+    return LiveSource(lines, lenient, blocking, wanted)
