@@ -7,7 +7,7 @@ WearerConfig(source=SourceConfig(port="/dev/ttyUSB0"), calibration=Path("calib.j
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,14 +16,12 @@ from edgepose.errors import ConfigError, EdgeposeError
 from edgepose.formats.poses.csv_columns import ROTATION_FORMATS
 from edgepose.imu import FILTERS
 from edgepose.pose import RATES
+from edgepose.rig_file import read_rig
 from edgepose.sinks.output_files import check_output
+from edgepose.sinks.receivers import check_receivers
 from edgepose.sinks.registry import SINKS
-from edgepose.skeleton import DEFAULT_HEIGHT, Body, default_body
-from edgepose.sources.protocol_detection import checked_protocol
+from edgepose.skeleton import DEFAULT_HEIGHT, Body, check_measures, default_body
 from edgepose.utils.output_targets import is_stream
-from edgepose.utils.similar_names import choices
-from edgepose.utils.sockets import parse_host_and_port
-from edgepose.utils.text_files import read_toml
 
 ANY_OUTPUT = "give at least one output, such as --csv FILE, --udp HOST:PORT or --view"
 ONE_SOURCE = "give one source: --port PORT, --can BUS, --listen, --connect or --ble ADDRESS, or --file PATH"
@@ -170,12 +168,17 @@ class OutputConfig:
             if (name, target) in pairs[:i]:
                 what = "" if target is True else " with the same target"
                 raise ConfigError(f"the output {name} is given twice{what}")
+        check_receivers(("", name, target) for name, target in pairs)
         if rotations not in ROTATION_FORMATS:
             raise ConfigError(
                 f"rotations: {rotations!r} is not one of {', '.join(map(repr, ROTATION_FORMATS))}"
             )
         if rate is not None and not RATES[0] <= rate <= RATES[1]:
             raise ConfigError(f"rate: {rate:g} is not from {RATES[0]:g} to {RATES[1]:g} poses per second")
+        try:
+            check_measures(height, leg_length)
+        except EdgeposeError as error:
+            raise ConfigError(str(error)) from None
         if page_port is not None and "view" not in dict(pairs):
             raise ConfigError(f"--page-port {page_port} is that of the page of --view: give --view as well")
         if page_port is not None and not 1 <= page_port <= 65535:
@@ -286,12 +289,8 @@ class WearerConfig:
         Raises:
             ConfigError: the file cannot be read, or a key or value is not valid.
         """
-        content = read_toml(path)
-        name = content.pop("name", path.stem)
-        if not isinstance(name, str) or not name.isprintable() or not name.strip():
-            raise ConfigError(f"{path}: name must be text in quotes on one line, not {name!r}")
+        name, values = read_rig(path)
         try:
-            values = {key.replace("-", "_"): _value(key, v, path.parent) for key, v in content.items()}
             return cls.from_values(values, name=name, path=path)
         except EdgeposeError as error:
             # Messages name flags; the keys of the file are the flags without hyphens.
@@ -314,86 +313,3 @@ class WearerConfig:
         if values.get("calibration") is None:
             raise ConfigError("calibration is missing")
         return cls(source=source, outputs=outputs, **values, **more)
-
-
-# --- TOML ---------------------------------------------------------------------------------------------------
-
-_TEXT, _SWITCH, _WHOLE, _NUMBER = "text in quotes", "true or false", "a whole number", "a number"
-_TEXTS = "text in quotes or a list of such texts"
-
-_TYPES: dict[str, Any] = {_SWITCH: (bool,), _WHOLE: (int,), _NUMBER: (int, float)}  # others are text
-
-_FILES = ("file", "sensors", "calibration", *(name for name, output in SINKS.items() if output.suffix))
-"""Keys whose values are files, relative to the TOML file; that of `protocol` may be one too."""
-
-_KEYS = {
-    "port": _TEXT,
-    "baud": _WHOLE,
-    "can": _TEXT,
-    "bitrate": _WHOLE,
-    "fd": _SWITCH,
-    "file": _TEXT,
-    "realtime": _SWITCH,
-    "protocol": _TEXT,
-    "sensors": _TEXT,
-    "listen": _TEXT,
-    "connect": _TEXT,
-    "ble": _TEXT,
-    "filter": _TEXT,
-    "no-mag": _SWITCH,
-    "calibration": _TEXT,
-    **{name: _SWITCH if output.metavar is None else _TEXTS for name, output in SINKS.items()},
-    "rotations": _TEXT,
-    "std": _SWITCH,
-    "height": _NUMBER,
-    "leg-length": _NUMBER,
-    "overwrite": _SWITCH,
-    "rate": _NUMBER,
-    "page-port": _WHOLE,
-    "no-place": _SWITCH,
-    "no-drift-correction": _SWITCH,
-    "control": _TEXT,
-}
-
-
-def _value(key: str, value: object, folder: Path) -> Any:
-    """Convert a value of the TOML file to that of the configuration.
-
-    Raises:
-        ConfigError: there is no such key, or the value has the wrong type or is invalid.
-    """
-    if key == "sinks" and isinstance(value, dict) and all(map(_is_text_or_texts, value.values())):
-        return value
-    what = _KEYS.get(key)
-    if what is _TEXTS and isinstance(value, list) and _is_text_or_texts(value):
-        return [_value(key, item, folder) for item in value]
-    if what is None:
-        raise ConfigError(f"unknown key {key!r}; {choices(key, ['name', *_KEYS, 'sinks'], 'keys are')}")
-    if type(value) not in _TYPES.get(what, (str,)):  # not isinstance, to which a bool is an int
-        raise ConfigError(f"{key} must be {what}, not {value!r}")
-    if not isinstance(value, str):
-        return float(value) if what == _NUMBER and isinstance(value, int | float) else value
-    if "\0" in value:
-        raise ConfigError(f"{key} must be text without NUL characters, not {value!r}")
-    return _text(key, value, folder)
-
-
-def _is_text_or_texts(value: object) -> bool:
-    return all(isinstance(item, str) for item in (value if isinstance(value, list) else [value]))
-
-
-def _text(key: str, value: str, folder: Path) -> Any:
-    if key in _FILES and value != "-":
-        value = str(folder / value)
-    if key in ("file", "sensors", "calibration"):
-        return Path(value)
-    parse: dict[str, Callable[[str], Any]] = {
-        "protocol": lambda name: str(folder / name) if name.endswith(".toml") else checked_protocol(name),
-        "control": parse_host_and_port,
-    }
-    if key not in parse:
-        return value
-    try:
-        return parse[key](value)
-    except EdgeposeError as error:
-        raise ConfigError(f"{key}: {error}") from None

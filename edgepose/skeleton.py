@@ -97,6 +97,9 @@ def standing_pelvis_position(offsets: ArrayLike) -> Array:
 MIN_HEIGHT, MAX_HEIGHT = 0.8, 2.5
 """Range of statures that `default_body` accepts, metres; others are mistakes, mostly centimetres."""
 
+MIN_LEG_LENGTH, MAX_LEG_LENGTH = 0.3, 1.5
+"""Range of the lengths of legs, which encloses those of all statures, metres."""
+
 DEFAULT_HEIGHT = 1.75
 """Stature of a wearer whose height is unknown, metres."""
 
@@ -168,6 +171,21 @@ def default_body(
     rows = table["sexes"][sex]
     body = Body(at(rows["offsets"]), at(rows["sensors"]), float(height_m))
     return body if leg_length_m is None else with_leg_length(body, leg_length_m)
+
+
+def check_measures(height_m: float | None, leg_length_m: float | None) -> None:
+    """Check measures of a body, of which those that are None are not known yet.
+
+    Raises:
+        EdgeposeError: no body has them.
+    """
+    if height_m is not None:
+        default_body(height_m, leg_length_m=leg_length_m)
+    elif leg_length_m is not None and not MIN_LEG_LENGTH <= leg_length_m <= MAX_LEG_LENGTH:
+        raise EdgeposeError(
+            f"leg length {leg_length_m:g} m is not between {MIN_LEG_LENGTH} and {MAX_LEG_LENGTH} m: give the "
+            "length of thigh and shank in metres"
+        )
 
 
 def with_leg_length(body: Body, leg_length_m: float) -> Body:

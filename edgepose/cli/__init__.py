@@ -18,7 +18,7 @@ import click
 
 from edgepose import __version__
 from edgepose.cli import exit_codes
-from edgepose.cli.repeated_options import refuse_repeats
+from edgepose.cli.given_options import check_given
 from edgepose.cli.terminal.messages import prepare, say
 from edgepose.cli.terminal.stop_signal import stop_signals
 from edgepose.errors import as_edgepose_error
@@ -76,7 +76,7 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find the command of the first argument, and check that no option of it is given twice."""
+        """Find the command of the first argument, and check its arguments with `check_given`."""
         try:
             name, command, rest = super().resolve_command(ctx, args)
         except click.UsageError as error:
@@ -85,7 +85,7 @@ class LazyGroup(click.Group):
             raise click.UsageError(error.message + hint, error.ctx) from None
         if command is not None and not ctx.resilient_parsing:
             inner = click.Context(command, info_name=name, parent=ctx, **command.context_settings)
-            refuse_repeats(command, inner, rest)
+            check_given(command, inner, rest)
         return name, command, rest
 
 

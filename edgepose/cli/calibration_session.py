@@ -285,11 +285,11 @@ def _side_by_side(
     path = plan.side_by_side
     if path is None:
         return None, False
-    notify(f"Heading reset from {path}.")
     fresh = orient.fresh()
     # What the lying sensors of a rig are connected to is in their file.
     lying_source = dataclasses.replace(source, file=path, port=None, can=None)
     everything, damage, _ = read_holds(lying_source, fresh, plan.names)
+    notify(f"Heading reset from {path}.")
     if not fresh.north:
         raise EdgeposeError(
             "without magnetometers the filter starts each recording with arbitrary headings, which another "

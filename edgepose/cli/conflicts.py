@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
+from edgepose.cli.options.gathered import usage_errors
 from edgepose.cli.options.outputs import check_files
 from edgepose.errors import EdgeposeError, prefix_errors
-from edgepose.sinks.registry import SINKS
+from edgepose.sinks.receivers import check_receivers
 from edgepose.utils.output_targets import has_reader
 
 if TYPE_CHECKING:
@@ -69,27 +70,14 @@ def check_all_files(wearers: Sequence[WearerConfig], model: Path) -> None:
     for wearer in wearers:
         with prefix_errors(wearer.name):
             wearer.outputs.check()
-    _check_receivers(wearers)
+    with usage_errors():
+        check_receivers((wearer.name, *output) for wearer in wearers for output in wearer.outputs.targets)
     if len(wearers) > 1:
         for flag, file in outputs:
             if has_reader(file):
                 raise click.UsageError(
                     f"{flag} {file} is not a file on a disk: a slow reader of it would delay every wearer; "
                     "give each a file, --udp or --tcp"
-                )
-
-
-def _check_receivers(wearers: Sequence[WearerConfig]) -> None:
-    """Raise click.UsageError if a receiver that cannot tell wearers apart would get two."""
-    owners: dict[tuple[str, Any], str] = {}
-    for wearer in wearers:
-        for output in wearer.outputs.targets:
-            name = output[0]
-            other = owners.setdefault(output, wearer.name)
-            if other != wearer.name and name in SINKS and SINKS[name].one_wearer:
-                raise click.UsageError(
-                    f"{other} and {wearer.name} have the same {name}, whose receiver cannot tell them apart; "
-                    "give each their own"
                 )
 
 

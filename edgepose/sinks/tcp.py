@@ -13,7 +13,7 @@ from edgepose.pose import PoseFrame
 from edgepose.rotations import matrix_to_rotvec
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.skeleton import Body, default_body, standing_pelvis_position
-from edgepose.utils.sockets import resolve
+from edgepose.utils.sockets import failure_text, resolve
 
 CLIENTS = 16
 """Largest number of viewers at a time; further ones are rejected."""
@@ -72,7 +72,8 @@ class TcpSink(Sink):
             family, address = resolve(host, port, socket.SOCK_STREAM)
             self._server = socket.create_server(address[:2], family=family, backlog=CLIENTS)
         except (OSError, UnicodeError) as error:
-            raise EdgeposeError(f"cannot listen for viewers at {host} port {port}: {error}") from error
+            reason = failure_text(error, host)
+            raise EdgeposeError(f"cannot listen for viewers at {host} port {port}: {reason}") from error
         # Connections inherit it.
         self._server.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         self._server.setblocking(False)

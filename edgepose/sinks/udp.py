@@ -21,7 +21,7 @@ from edgepose.pose import CONTACTS, PoseFrame, format_status, held_bits, parse_s
 from edgepose.rotations import matrix_to_quat, matrix_to_rotvec, quat_to_matrix, rotvec_to_matrix
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.skeleton import JOINTS
-from edgepose.utils.sockets import Destination, address_text, resolve
+from edgepose.utils.sockets import Destination, address_text, failure_text, resolve
 
 MAGIC = b"EPOS"
 
@@ -187,7 +187,7 @@ class DatagramSink(Sink):
         try:
             family, address = resolve(host, port, socket.SOCK_DGRAM)
         except (OSError, UnicodeError) as error:
-            reason = getattr(error, "strerror", None) or error
+            reason = failure_text(error, host)
             raise EdgeposeError(f"cannot find host {host!r} to send poses to: {reason}") from error
         if ip_address(address[0].partition("%")[0]).is_multicast and cast != "multicast":
             raise EdgeposeError(_many_machines(host, port, "multicast"))
@@ -202,9 +202,8 @@ class DatagramSink(Sink):
             raise EdgeposeError(_many_machines(host, port, "broadcast")) from error
         except OSError as error:
             self._socket.close()
-            raise EdgeposeError(
-                f"cannot send poses to {host} port {port}: {error.strerror or error}"
-            ) from error
+            reason = failure_text(error, host)
+            raise EdgeposeError(f"cannot send poses to {host} port {port}: {reason}") from error
 
     @abstractmethod
     def encode(self, pose: PoseFrame) -> Sequence[bytes]:

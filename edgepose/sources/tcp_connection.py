@@ -10,7 +10,7 @@ from contextlib import suppress
 from edgepose.errors import DeviceError
 from edgepose.sources import POLL_S
 from edgepose.sources.line_reader import LineDisconnectedError
-from edgepose.utils.sockets import address_text
+from edgepose.utils.sockets import address_text, failure_text
 
 CONNECT_S = 2.0
 """Longest time until a device accepts the connection, seconds."""
@@ -34,7 +34,7 @@ class TcpConnection:
         try:
             self._socket = socket.create_connection((host, port), CONNECT_S)
         except (OSError, UnicodeError) as error:
-            reason = getattr(error, "strerror", None) or error
+            reason = failure_text(error, host)
             raise DeviceError(
                 f"{address_text(host, port)}: cannot connect: {reason}; check that the device is on, in this "
                 "network, and serves no other program"

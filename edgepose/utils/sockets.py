@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -23,6 +24,13 @@ def resolve(host: str, port: int, kind: socket.SocketKind) -> tuple[socket.Addre
     return family, address
 
 
+def failure_text(error: OSError | UnicodeError, host: str) -> str:
+    """Return the reason why a host cannot be found, listened on or sent to."""
+    if getattr(error, "errno", None) == errno.EINVAL and ":" in host and "%" not in host:
+        return f"it needs the network interface by which it is reached, such as {host}%eth0"
+    return str(getattr(error, "strerror", None) or error)
+
+
 def bound_socket(host: str, port: int) -> socket.socket:
     """Return a UDP socket that listens on an address and does not block.
 
@@ -33,14 +41,14 @@ def bound_socket(host: str, port: int) -> socket.socket:
         family, address = resolve(host, port, socket.SOCK_DGRAM)
         bound = socket.socket(family, socket.SOCK_DGRAM)
     except (OSError, UnicodeError) as error:
-        raise DeviceError(f"cannot find {host!r} to listen on: {error}") from error
+        raise DeviceError(f"cannot find {host!r} to listen on: {failure_text(error, host)}") from error
     bound.setblocking(False)
     try:
         bound.bind(address)
     except OSError as error:
         bound.close()
         raise DeviceError(
-            f"cannot listen on {host} port {port}: {error.strerror or error}; "
+            f"cannot listen on {host} port {port}: {failure_text(error, host)}; "
             "give an address of this machine and a free port"
         ) from error
     return bound
@@ -109,8 +117,8 @@ def parse_datagram_address(text: str) -> Address:
     Raises:
         ConfigError: the text has another form.
     """
-    host, port, options = _split_options(text, CASTS)
-    return Address(host, port, _last(options, CASTS, ""))
+    host, port, (cast,) = _split_options(text, CASTS)
+    return Address(host, port, cast)
 
 
 def parse_destination(text: str, key: str, choices: Sequence[str]) -> Destination:
@@ -124,23 +132,27 @@ def parse_destination(text: str, key: str, choices: Sequence[str]) -> Destinatio
     Raises:
         ConfigError: the text has another form.
     """
-    values = [f"{key}={choice}" for choice in choices]
-    host, port, options = _split_options(text, (*values, *CASTS))
-    value = _last(options, values, values[0]).removeprefix(f"{key}=")
-    return Destination(host, port, value, _last(options, CASTS, ""))
+    host, port, (value, cast) = _split_options(text, [f"{key}={choice}" for choice in choices], CASTS)
+    return Destination(host, port, value.removeprefix(f"{key}=") or choices[0], cast)
 
 
-def _split_options(text: str, possible: Sequence[str]) -> tuple[str, int, list[str]]:
+def _split_options(text: str, *groups: Sequence[str]) -> tuple[str, int, list[str]]:
+    """Return host, port, and the option of each group that follows them; "" where there is none.
+
+    Raises:
+        ConfigError: an option is unknown, or there are two of a group.
+    """
     address, *options = text.split(",")
     host, port = parse_address(address)
     for option in options:
-        if option not in possible:
-            raise ConfigError(f"unknown option {option!r} in {text!r}: possible are {', '.join(possible)}")
-    return host, port, options
-
-
-def _last(options: Sequence[str], among: Sequence[str], default: str) -> str:
-    return next((option for option in reversed(options) if option in among), default)
+        if not any(option in group for group in groups):
+            possible = ", ".join(each for group in groups for each in group)
+            raise ConfigError(f"unknown option {option!r} in {text!r}: possible are {possible}")
+    given = [[option for option in options if option in group] for group in groups]
+    for several in given:
+        if len(several) > 1:
+            raise ConfigError(f"{several[0]!r} and {several[1]!r} in {text!r}: give one of them")
+    return host, port, ["".join(each) for each in given]
 
 
 def check_page(host: str, port: int) -> None:
@@ -153,7 +165,7 @@ def check_page(host: str, port: int) -> None:
     try:
         socket.create_server((host, port), family=family).close()
     except (OSError, UnicodeError) as error:
-        reason = getattr(error, "strerror", None) or error
+        reason = failure_text(error, host)
         # Errors of name resolution have negative numbers.
         flag = "--page-port" if isinstance(error, OSError) and (error.errno or -1) > 0 else "--host"
         raise DeviceError(

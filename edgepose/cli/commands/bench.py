@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from edgepose.cli.options.json_result import json_option, show_json
 from edgepose.cli.terminal.messages import has_terminal, progress_bar, say, show
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     help="Shipped model or path of an archive; repeatable.  [default: all shipped models]",
 )
 @click.option("--trust", is_flag=True, help="Load models even if their checksums are unknown.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
+@json_option
 @click.option(
     "--against",
     type=click.Path(path_type=Path),
@@ -93,16 +93,11 @@ def _speed(models: tuple[str, ...], trust: bool, as_json: bool, against: Path | 
     if before is not None:
         report["against"] = compared(before, report)
     if as_json:
-        show(json.dumps(report, indent=1))
+        show_json("bench", report)
         return
     show(speed_tables(report, speed.BUDGET_US))
     if before is not None:
         show(f"\n{ratio_table(report['against'])}")
-
-
-def _known(value: Any) -> Any:
-    """Return a value for JSON, which has no NaN: other packages' filters compute it from some data."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 @bench.command(short_help="Orientation filters on BROAD.")
@@ -112,7 +107,7 @@ def _known(value: Any) -> Any:
     type=click.Path(path_type=Path),
     help="Folder of trials: data_mat of the BROAD download, or .npz files with the same arrays.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
+@json_option
 def orientation(data: Path, as_json: bool) -> None:
     """Compare orientation filters on BROAD: edgepose's, and vqf, imufusion and ahrs if installed.
 
@@ -130,8 +125,7 @@ def orientation(data: Path, as_json: bool) -> None:
     scores = [score for trial_scores in _with_progress(compare(files), len(files)) for score in trial_scores]
     cost = cost_us(read_trial(files[0]))
     if as_json:
-        rows = [{key: _known(value) for key, value in score._asdict().items()} for score in scores]
-        show(json.dumps({"scores": rows, "us_a_sample_at_286_hz": cost}, indent=1, allow_nan=False))
+        show_json("bench orientation", {"scores": scores, "us_a_sample_at_286_hz": cost})
         return
     show(f"{len(files)} trials; RMSE over movement in deg, mean over trials; us a sample on one core\n")
     show("with magnetometer")

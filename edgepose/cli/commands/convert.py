@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from edgepose.cli.many_files import Outcome, raise_failures, text_table, with_progress
-from edgepose.cli.options.body import leg_length_option
+from edgepose.cli.options.body import HEIGHT, leg_length_option
 from edgepose.cli.options.json_result import json_option, show_json
 from edgepose.cli.options.outputs import overwrite_option, rate_option
 from edgepose.cli.options.source import protocol_option, sensors_option
@@ -73,7 +73,7 @@ def _format(ctx: click.Context, param: click.Parameter, value: str) -> FileTarge
 )
 @click.option(
     "--height",
-    type=float,
+    type=HEIGHT,
     default=1.75,
     show_default=True,
     help="The wearer's height, metres, for the bones of BVH, GLB and MOT files.",

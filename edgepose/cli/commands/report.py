@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from edgepose.cli.options.body import leg_length_option
+from edgepose.cli.options.body import HEIGHT, leg_length_option
 from edgepose.cli.options.outputs import overwrite_option
 from edgepose.cli.terminal.messages import show
 from edgepose.sinks.output_files import check_output
@@ -23,7 +23,7 @@ from edgepose.sinks.output_files import check_output
 )
 @click.option(
     "--height",
-    type=float,
+    type=HEIGHT,
     default=1.75,
     show_default=True,
     help="The wearer's height, metres, for the figures and for finding steps.",

@@ -13,6 +13,7 @@ import click
 
 from edgepose.cli.conflicts import check_all_files, check_all_live
 from edgepose.cli.options.gathered import usage_errors
+from edgepose.cli.options.inputs import check_jobs
 from edgepose.cli.options.json_result import check_standard_output, json_option, show_json
 from edgepose.cli.options.network import network_options
 from edgepose.cli.options.wearer import wearer_options
@@ -71,6 +72,7 @@ def run(
       edgepose run --rig anna.toml --rig ben.toml --model rnn
       edgepose run takes/ --calibration calibrations --csv poses --jobs 2
     """
+    check_jobs(jobs, inputs)
     if as_json:
         for wearer in wearers:
             check_standard_output(wearer.outputs)

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import os
-import socket
 from contextlib import ExitStack, closing
 from typing import TYPE_CHECKING
 
 import click
 
-from edgepose.cli.options.body import leg_length_option
+from edgepose.cli.options.body import HEIGHT, leg_length_option
+from edgepose.cli.options.outputs import address
 from edgepose.cli.terminal.messages import say, show
 from edgepose.cli.terminal.stop_signal import StopSignal
-from edgepose.errors import EdgeposeError
-from edgepose.utils.sockets import address_text, resolve
+from edgepose.utils.sockets import address_text, bound_socket
 
 if TYPE_CHECKING:
     from edgepose.skeleton import Body
@@ -27,7 +26,10 @@ PAGE_PORT = 8080
 @click.command()
 @click.argument("poses", required=False, metavar="[POSES]")
 @click.option(
-    "--udp", metavar="HOST:PORT", help="Show poses that `edgepose run --udp` sends here, as they arrive."
+    "--udp",
+    callback=address,
+    metavar="HOST:PORT",
+    help="Show poses that `edgepose run --udp` sends here, as they arrive.",
 )
 @click.option(
     "--reference", metavar="FILE", help="File of poses to compare those of POSES with, on one clock."
@@ -43,7 +45,7 @@ PAGE_PORT = 8080
     type=click.IntRange(1, 65535),
     help="TCP port of the page.  [default: 8080]",
 )
-@click.option("--height", type=float, default=1.75, show_default=True, help="Height of the figure, metres.")
+@click.option("--height", type=HEIGHT, default=1.75, show_default=True, help="Height of the figure, metres.")
 @leg_length_option
 @click.option("--buttons", is_flag=True, hidden=True, help="Write the keys of pressed buttons to stdout.")
 @click.option(
@@ -51,7 +53,7 @@ PAGE_PORT = 8080
 )
 def view(
     poses: str | None,
-    udp: str | None,
+    udp: tuple[str, int] | None,
     reference: str | None,
     host: str,
     page_port: int | None,
@@ -87,7 +89,7 @@ def view(
     with ExitStack() as stack:
         stop = stack.enter_context(StopSignal())
         if udp is not None:
-            receiver = stack.enter_context(_listen(udp))
+            receiver = stack.enter_context(bound_socket(*udp))
             viewer = stack.enter_context(closing(_open(host, page_port, body, with_parent)))
             if buttons:
                 viewer.add_buttons(show)
@@ -104,23 +106,6 @@ def _open(host: str, port: int | None, body: Body, for_run: bool = False) -> Vie
     from edgepose.viewer.viewer import Viewer
 
     viewer = Viewer(host, port or PAGE_PORT, body, next_free=for_run and port is None)
-    address = address_text({"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host), viewer.port)
-    say(f"open http://{address} in a browser" + ("" if for_run else "; Ctrl-C ends the view"))
+    page = address_text({"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host), viewer.port)
+    say(f"open http://{page} in a browser" + ("" if for_run else "; Ctrl-C ends the view"))
     return viewer
-
-
-def _listen(udp: str) -> socket.socket:
-    from edgepose.utils.sockets import parse_address
-
-    host, port = parse_address(udp)
-    try:
-        family, address = resolve(host, port, socket.SOCK_DGRAM)
-        receiver = socket.socket(family, socket.SOCK_DGRAM)
-    except (OSError, UnicodeError) as error:
-        raise EdgeposeError(f"cannot listen for poses at {udp}: {error}") from error
-    try:
-        receiver.bind(address)
-    except OSError as error:
-        receiver.close()
-        raise EdgeposeError(f"cannot listen for poses at {udp}: {error.strerror or error}") from error
-    return receiver

@@ -22,7 +22,7 @@ from urllib.parse import urlsplit
 
 from edgepose.cli.guide.stage import DONE, WAIT, Stage
 from edgepose.errors import DeviceError
-from edgepose.utils.sockets import address_text, resolve
+from edgepose.utils.sockets import address_text, failure_text, resolve
 
 BUTTONS = {WAIT: ("start",), DONE: ("repeat", "finish")}
 """Buttons of each kind of stage that has some."""
@@ -60,8 +60,7 @@ class PhonePage:
             self._server = _Server(family, address, self, host)
         except (OSError, UnicodeError) as error:
             raise DeviceError(
-                f"cannot serve a page at {address_text(host, port)}: "
-                f"{getattr(error, 'strerror', None) or error}; "
+                f"cannot serve a page at {address_text(host, port)}: {failure_text(error, host)}; "
                 "give an address of this machine and a free port"
             ) from error
         self.port: int = self._server.server_port

@@ -10,14 +10,24 @@ import click
 
 from edgepose.cli.options.float_range import FloatRange
 from edgepose.cli.options.gathered import add_flags
-from edgepose.skeleton import DEFAULT_HEIGHT, MAX_HEIGHT, MIN_HEIGHT, with_leg_length
+from edgepose.skeleton import (
+    DEFAULT_HEIGHT,
+    MAX_HEIGHT,
+    MAX_LEG_LENGTH,
+    MIN_HEIGHT,
+    MIN_LEG_LENGTH,
+    with_leg_length,
+)
 
 if TYPE_CHECKING:
     from edgepose.skeleton import Body
 
+HEIGHT = FloatRange(MIN_HEIGHT, MAX_HEIGHT, unit="metres")
+"""Type of the flag --height."""
+
 leg_length_option = click.option(
     "--leg-length",
-    type=float,
+    type=FloatRange(MIN_LEG_LENGTH, MAX_LEG_LENGTH, unit="metres"),
     help="Length of the wearer's thigh and shank, metres: standing, from the bony point at the side of the "
     "hip, where the leg turns, straight down to the ankle bone.  [default: the average for --height]",
 )
@@ -77,7 +87,7 @@ def body_options(command: Callable[..., Any]) -> Callable[..., Any]:
         ),
         click.option(
             "--height",
-            type=FloatRange(MIN_HEIGHT, MAX_HEIGHT),
+            type=HEIGHT,
             help=f"The wearer's height, metres.  [default: the calibration's, or {DEFAULT_HEIGHT}]",
         ),
         leg_length_option,

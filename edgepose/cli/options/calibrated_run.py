@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from edgepose.cli.options.body import HEIGHT
 from edgepose.cli.options.gathered import add_flags
 from edgepose.imu import FILTERS
 
@@ -41,7 +42,7 @@ _FLAGS = [
         help="Filter of the planned run, to compare with --calibration.",
     ),
     click.option("--no-mag", is_flag=True, help="The planned run does not use magnetometers."),
-    click.option("--height", "height_m", type=float, help="The wearer's height in the planned run, metres."),
+    click.option("--height", "height_m", type=HEIGHT, help="The wearer's height in the planned run, metres."),
 ]
 
 

@@ -40,6 +40,12 @@ def with_first(inputs: tuple[Path, ...], values: Mapping[str, Any]) -> dict[str,
     return {**values, "file": inputs[0]}
 
 
+def check_jobs(jobs: int, inputs: tuple[Path, ...]) -> None:
+    """Raise click.UsageError if several processes are asked for although there are no inputs."""
+    if jobs > 1 and not inputs:
+        raise click.UsageError("--jobs is for recordings named as IN; one source is one process")
+
+
 def recordings_or_source(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the argument to a command with `source_options`, whose source is then the first of the inputs."""
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from edgepose.cli.options.body import leg_length_option
+from edgepose.cli.options.body import HEIGHT, leg_length_option
 from edgepose.cli.options.float_range import FloatRange
 from edgepose.cli.options.gathered import Command, gathered
 from edgepose.config import OutputConfig
@@ -96,7 +96,7 @@ def output_options(command: Command) -> Command:
     )
     height_option = click.option(
         "--height",
-        type=float,
+        type=HEIGHT,
         help="The wearer's height, metres: for the length of their steps, and for the bones of --bvh, --glb, "
         f"--mot, --osc, --vrchat, --mocopi and --view.  [default: the calibration's, or {DEFAULT_HEIGHT}]",
     )

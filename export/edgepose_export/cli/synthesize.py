@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from edgepose.cli.options.body import HEIGHT
 from edgepose.cli.options.float_range import FloatRange
 from edgepose.cli.options.outputs import overwrite_option
 from edgepose.cli.terminal.messages import say
@@ -57,7 +58,7 @@ class Request(NamedTuple):
 @click.option("--rate", type=FloatRange(1, 1000), default=60.0, show_default=True, help="Samples per second.")
 @click.option(
     "--height",
-    type=FloatRange(0.8, 2.5),
+    type=HEIGHT,
     help="Height of the default body, metres  [default: 1.75]",
 )
 @click.option(

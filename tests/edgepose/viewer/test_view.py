@@ -491,12 +491,12 @@ def test_a_viewer_ends_with_a_run_that_is_killed(wearer, tmp_path):
         ("--udp 127.0.0.1:9000 --reference poses.csv", 2, "--reference needs a file of POSES"),
         ("nothing.csv", 1, "cannot read poses from nothing.csv"),
         ("poses.csv --reference notes.md", 1, "notes.md is not a file of poses"),
-        ("poses.csv --height 175", 1, "height 175 m is not between"),
+        ("poses.csv --height 175", 2, "175.0 is not in the range 0.8<=x<=2.5 metres"),
         ("poses.csv --leg-length 1.2", 1, "leg length 1.2 m does not fit a height of 1.75 m"),
         ("poses.csv --host no-such-host.invalid", 1, "cannot show poses at no-such-host.invalid port 8080"),
-        ("--udp 127.0.0.1", 1, "no port in '127.0.0.1'"),
-        ("--udp no-such-host.invalid:9", 1, "cannot listen for poses at no-such-host.invalid:9"),
-        ("--udp 192.0.2.1:9000", 1, "cannot listen for poses at 192.0.2.1:9000"),
+        ("--udp 127.0.0.1", 2, "no port in '127.0.0.1'"),
+        ("--udp no-such-host.invalid:9", 1, "cannot find 'no-such-host.invalid' to listen on"),
+        ("--udp 192.0.2.1:9000", 1, "cannot listen on 192.0.2.1 port 9000"),
     ],
 )
 def test_wrong_use(command, tmp_path, words, code, says):
