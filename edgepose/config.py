@@ -7,7 +7,7 @@ WearerConfig(source=SourceConfig(port="/dev/ttyUSB0"), calibration=Path("calib.j
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,12 +16,16 @@ from edgepose.errors import ConfigError, EdgeposeError
 from edgepose.formats.poses.csv_columns import ROTATION_FORMATS
 from edgepose.imu import FILTERS
 from edgepose.pose import RATES
-from edgepose.rig_file import read_rig
 from edgepose.sinks.output_files import check_output
 from edgepose.sinks.receivers import check_receivers
 from edgepose.sinks.registry import SINKS
 from edgepose.skeleton import DEFAULT_HEIGHT, Body, check_measures, default_body
+from edgepose.sources.protocol_detection import checked_protocol
 from edgepose.utils.output_targets import is_stream
+from edgepose.utils.similar_names import choices
+from edgepose.utils.sockets import parse_host_and_port
+from edgepose.utils.text_files import read_toml
+from edgepose.utils.toml_values import NUMBER, SWITCH, TEXT, TEXTS, WHOLE, checked_value, texts_by_name
 
 ANY_OUTPUT = "give at least one output, such as --csv FILE, --udp HOST:PORT or --view"
 ONE_SOURCE = "give one source: --port PORT, --can BUS, --listen, --connect or --ble ADDRESS, or --file PATH"
@@ -289,8 +293,12 @@ class WearerConfig:
         Raises:
             ConfigError: the file cannot be read, or a key or value is not valid.
         """
-        name, values = read_rig(path)
+        content = read_toml(path)
+        name = content.pop("name", path.stem)
+        if not isinstance(name, str) or not name.isprintable() or not name.strip():
+            raise ConfigError(f"{path}: name must be text in quotes on one line, not {name!r}")
         try:
+            values = {key.replace("-", "_"): _value(key, v, path.parent) for key, v in content.items()}
             return cls.from_values(values, name=name, path=path)
         except EdgeposeError as error:
             # Messages name flags; the keys of the file are the flags without hyphens.
@@ -313,3 +321,72 @@ class WearerConfig:
         if values.get("calibration") is None:
             raise ConfigError("calibration is missing")
         return cls(source=source, outputs=outputs, **values, **more)
+
+
+# --- TOML ---------------------------------------------------------------------------------------------------
+
+_FILES = ("file", "sensors", "calibration", *(name for name, output in SINKS.items() if output.suffix))
+"""Keys whose values are files, relative to the TOML file; that of `protocol` may be one too."""
+
+_KEYS = {
+    "port": TEXT,
+    "baud": WHOLE,
+    "can": TEXT,
+    "bitrate": WHOLE,
+    "fd": SWITCH,
+    "file": TEXT,
+    "realtime": SWITCH,
+    "protocol": TEXT,
+    "sensors": TEXT,
+    "listen": TEXT,
+    "connect": TEXT,
+    "ble": TEXT,
+    "filter": TEXT,
+    "no-mag": SWITCH,
+    "calibration": TEXT,
+    **{name: SWITCH if output.metavar is None else TEXTS for name, output in SINKS.items()},
+    "rotations": TEXT,
+    "std": SWITCH,
+    "height": NUMBER,
+    "leg-length": NUMBER,
+    "overwrite": SWITCH,
+    "rate": NUMBER,
+    "page-port": WHOLE,
+    "no-place": SWITCH,
+    "no-drift-correction": SWITCH,
+    "control": TEXT,
+}
+
+
+def _value(key: str, value: object, folder: Path) -> Any:
+    """Convert a value of the TOML file to that of the configuration.
+
+    Raises:
+        ConfigError: there is no such key, or the value has the wrong type or is invalid.
+    """
+    if key == "sinks":
+        return texts_by_name(key, value)
+    what = _KEYS.get(key)
+    if what is None:
+        raise ConfigError(f"unknown key {key!r}; {choices(key, ['name', *_KEYS, 'sinks'], 'keys are')}")
+    value = checked_value(key, value, what)
+    if isinstance(value, list):
+        return [_text(key, item, folder) for item in value]
+    return _text(key, value, folder) if isinstance(value, str) else value
+
+
+def _text(key: str, value: str, folder: Path) -> Any:
+    if key in _FILES and value != "-":
+        value = str(folder / value)
+    if key in ("file", "sensors", "calibration"):
+        return Path(value)
+    parse: dict[str, Callable[[str], Any]] = {
+        "protocol": lambda name: str(folder / name) if name.endswith(".toml") else checked_protocol(name),
+        "control": parse_host_and_port,
+    }
+    if key not in parse:
+        return value
+    try:
+        return parse[key](value)
+    except EdgeposeError as error:
+        raise ConfigError(f"{key}: {error}") from None

@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[1]
 LEVELS = (
     "errors placements rotations skeleton imu pose utils",
     "formats orientation calibration inference place",
-    "sources sinks sip analysis diagnostics viewer convert record config rig_file",
+    "sources sinks sip analysis diagnostics viewer convert record config",
     "pipeline",
     "benchmarks",
     "cli",

@@ -213,6 +213,18 @@ def test_every_output_has_a_flag_in_the_order_of_the_table():
         (lambda: edgepose.OutputConfig(csv=["a", "a"]), "csv is given twice with the same target"),
         (lambda: edgepose.OutputConfig(view=[True, True]), "view is given twice"),
         (lambda: edgepose.OutputConfig(sinks={"csv": "a"}), "csv is not an output of another package"),
+        (lambda: edgepose.OutputConfig(csv="a", height=175), "height 175 m is not between"),
+        (
+            lambda: edgepose.OutputConfig(csv="a", height=1.75, leg_length=1.2),
+            "leg length 1.2 m does not",
+        ),
+        (lambda: edgepose.OutputConfig(csv="a", leg_length=85), "leg length 85 m is not between 0.3 and 1.5"),
+        (lambda: edgepose.OutputConfig(udp="pc:9", mocopi="PC:9"), "udp and mocopi send to PC:9 in two form"),
+        (
+            lambda: edgepose.OutputConfig(udp=["localhost:9", "127.0.0.1:9,format=binary"]),
+            "udp and udp send to 127.0.0.1:9 in two forms, of which a receiver reads one; give each its own",
+        ),
+        (lambda: edgepose.OutputConfig(osc=["[::1]:9", "[0::1]:9"]), r"osc sends to \[0::1\]:9 twice"),
         (lambda: edgepose.OutputConfig(view="no"), "view: 'no' is neither True nor False"),
     ],
 )

@@ -19,7 +19,7 @@ from edgepose.cli.terminal.messages import end_status, has_terminal, say, status
 from edgepose.cli.terminal.stop_signal import StopSignal
 from edgepose.config import SourceConfig
 from edgepose.errors import EdgeposeError
-from edgepose.placements import PLACEMENTS, SENSORS
+from edgepose.placements import LACKING, PLACEMENTS, SENSORS
 
 if TYPE_CHECKING:
     from edgepose.record import RecordSummary
@@ -134,5 +134,7 @@ def _report(out: str, summary: RecordSummary, source: Source, names: Sequence[st
     say(f"packets  {counts.packets} good, {counts.lost} lost, {counts.bad} bad, {counts.unknown} unknown")
     silent = [name for name, n in by_name.items() if not n]
     if total and silent:
-        needed = "poses need all six sensors" if len(names) == len(PLACEMENTS) else "check power, link and id"
-        say(f"warning: nothing arrived from {', '.join(silent)}; {needed}")
+        hint = "check power, link and id"
+        if LACKING.issuperset(silent):
+            hint += f", or calibrate with --without {','.join(silent)}"
+        say(f"warning: nothing arrived from {', '.join(silent)}; {hint}")

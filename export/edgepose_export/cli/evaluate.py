@@ -145,13 +145,14 @@ def evaluate(
     \b
     Examples:
       edgepose evaluate --real --model birnn --model my-rnn.pt --trust
-      edgepose evaluate --data recordings/ --baselines
-      edgepose evaluate --data recordings/ --model birnn --model rnn --part cmu-walk-run
-      edgepose evaluate --data recordings/ --online window --past 50 --future 5
-      edgepose evaluate --data recordings/ --table 3 --histogram errors.png
-      edgepose evaluate --data DIP_IMU/s_09 --part published --table 3 --model birnn --model dip-birnn.pt
-      edgepose evaluate --data recordings/ --part cmu-walk-run --heat-map window.png --every 10
-      edgepose evaluate --data recordings/ --place --part cmu-walk-run --paths paths.png
+      edgepose evaluate --data takes --baselines
+      edgepose evaluate --data takes --model birnn --model rnn --part cmu-walk-run
+      edgepose evaluate --data takes --online window --past 50 --future 5
+      edgepose evaluate --data takes --table 3 --histogram errors.png
+      edgepose evaluate --data DIP_IMU/s_09 --part published --table 3 \\
+        --model birnn --model dip-birnn.pt
+      edgepose evaluate --data takes --part cmu-walk-run --heat-map past.png
+      edgepose evaluate --data takes --place --part cmu-walk-run --paths paths.png
     """
     results = Results(as_json)
     if real:

@@ -106,8 +106,8 @@ def export(
 
     \b
     Examples:
-      edgepose export runs/birnn/checkpoint.pt --out my-birnn.pt --measure recordings/
-      edgepose export runs/tuned/checkpoint.pt runs/birnn/checkpoint.pt --out my-birnn.pt
+      edgepose export runs/birnn/checkpoint.pt --out my-birnn.pt --measure takes
+      edgepose export tuned/checkpoint.pt birnn/checkpoint.pt --out my-birnn.pt
     """
     if out.suffix != ".pt":
         raise click.UsageError("--out must name a .pt file")

@@ -84,10 +84,12 @@ def train(
     \b
     Examples:
       edgepose train --recipe birnn mocap/ --out runs/birnn
-      edgepose train --config birnn --data recordings/ --out runs/birnn
-      edgepose train --config birnn --data recordings/ --out runs/birnn --resume
-      edgepose train --config birnn --data mine/ --out runs/tuned --init runs/birnn/best.pt --steps 2000
-      torchrun --nproc-per-node 4 -m edgepose train --config birnn --data recordings/ --out runs/birnn
+      edgepose train --config birnn --data takes --out runs/birnn
+      edgepose train --config birnn --data takes --out runs/birnn --resume
+      edgepose train --config birnn --data mine --out runs/tuned \\
+        --init runs/birnn/best.pt --steps 2000
+      torchrun --nproc-per-node 4 -m \\
+        edgepose train --config birnn --data takes --out runs/birnn
     """
     if (recipe is None) == (config is None):
         raise click.UsageError("give --recipe to make a model from raw motion, or --config for a single run")

@@ -4,6 +4,7 @@ import json
 import os
 import pty
 import re
+import shlex
 import subprocess
 import sys
 import tty
@@ -73,6 +74,25 @@ def test_every_flag_is_explained(name):
     assert bare == []
 
 
+@pytest.mark.parametrize("name", [*COMMANDS, "bench orientation"])
+def test_help_fits_a_terminal_and_its_examples_can_be_parsed(name):
+    command = cli
+    for word in name.split():
+        command = command.get_command(click.Context(command), word)
+    text = command.get_help(click.Context(command, info_name=f"edgepose {name}", terminal_width=80))
+    assert [line for line in text.splitlines() if len(line) > 80] == []
+    examples = re.findall(rf"^ +edgepose {name}\b *(.*)$", text.replace("\\\n", ""), re.MULTILINE)
+    assert examples
+    for example in examples:
+        words = shlex.split(re.sub(" [|>] .*", "", example))
+        problem = ""
+        try:
+            command.make_context(name, words)
+        except click.BadParameter as error:
+            problem = error.message
+        assert not problem or "does not exist" in problem, example  # the files of the examples
+
+
 def test_all_commands_are_listed():
     output, modules = imported("--help")
     assert {"calibrate", "convert", "run", "train", "evaluate", "export"} <= set(COMMANDS)
@@ -115,6 +135,13 @@ BASICS = WEARER + "--file SHORT --csv OUT "
         (BASICS + "--port x", "give one source"),
         (BASICS + "--future -1", "--future"),
         (BASICS + "--rotations x", "--rotations"),
+        (BASICS + "--height 175", "'--height': 175.0 is not in the range 0.8<=x<=2.5 metres"),
+        (BASICS + "--leg-length 85", "'--leg-length': 85.0 is not in the range 0.3<=x<=1.5 metres"),
+        (BASICS + "--jobs 2", "--jobs is for recordings named as IN"),
+        (
+            BASICS + "--udp 127.0.0.1:9 --mocopi localhost:9",
+            "udp and mocopi send to localhost:9 in two",
+        ),
         (BASICS + "--model rnn --future 3", "unidirectional"),
         (BASICS + "--debug", "--debug"),  # it belongs in front of the command
         (WEARER + "--file SHORT --csv SHORT", "overwrite"),
@@ -284,8 +311,10 @@ def test_an_archive_of_unknown_sum(fail, tmp_path):
 @pytest.mark.parametrize(
     ("udp", "says"),
     [
-        ("", "no port"),
+        ("", "--udp is empty"),
         ("localhost", "no port"),
+        ("127.0.0.1:9,broadcast,multicast", "'broadcast' and 'multicast' in '127.0.0.1:9,"),
+        ("127.0.0.1:9,format=json,format=json", "'format=json' and 'format=json' in "),
         ("127.0.0.1:0", "from 1 to 65535"),
         ("127.0.0.1:ninety", "from 1 to 65535"),
         (":9000", "no host"),

@@ -1,4 +1,4 @@
-"""Options given twice, and commands that are mistyped."""
+"""Options given twice or without a value, and commands that are mistyped."""
 
 from __future__ import annotations
 
@@ -20,6 +20,21 @@ def test_an_option_twice(command, tmp_path, words, flag):
     assert f"Error: {flag} is given 2 times, but only once counts" in result.stderr
     assert f"Usage: python -m edgepose {words[0]}" in result.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (("convert", "", "--to", "npz"), "IN"),
+        (("run", "--file", "a.npz", "--csv", "a.csv", "--csv="), "--csv"),
+        (("view", ""), "POSES"),
+        (("calibrate", "--file", ""), "--file"),
+    ],
+)
+def test_an_empty_value_is_no_folder(command, tmp_path, words, name):
+    result = command(*words, cwd=tmp_path)
+    assert result.returncode == 2
+    assert f"Error: {name} is empty: give a value, or leave it out\n" in result.stderr
 
 
 def test_options_that_may_be_repeated(command):

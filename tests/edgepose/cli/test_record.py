@@ -149,7 +149,10 @@ def test_a_sensor_that_is_silent_is_told(tmp_path):
         process = start("record", tmp_path / "walk.npz", "--port", rig.port, "--seconds", 0.5)
         code, errors = end(process)
     assert code == 0
-    assert "warning: nothing arrived from head" in errors
+    assert (
+        "warning: nothing arrived from head; check power, link and id, or calibrate with --without head"
+        in errors
+    )
     assert "head" not in salvage_recording(tmp_path / "walk.npz").sensors
 
 

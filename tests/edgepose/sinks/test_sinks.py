@@ -21,10 +21,11 @@ from edgepose.rotations import matrix_to_euler_zxy
 from edgepose.sinks import pose_file
 from edgepose.sinks.csv import CsvSink, pose_columns
 from edgepose.sinks.registry import SINKS
+from edgepose.sinks.tcp import TcpSink
 from edgepose.sinks.udp import UdpSink, decode, decode_binary, encode_binary, encode_json
 from edgepose.sinks.vmc import VmcSink
 from edgepose.skeleton import JOINTS
-from edgepose.utils.sockets import resolve
+from edgepose.utils.sockets import bound_socket, resolve
 
 DOCS = Path(__file__).parents[3] / "docs" / "reference" / "outputs.md"
 STATUSES = ("ok", "held head", "held left_forearm pelvis; filling window", "filling window")
@@ -468,6 +469,16 @@ def test_many_machines_must_be_asked_for(sink, host, cast):
         sink(host, 9000)
 
 
+@pytest.mark.parametrize("use", [UdpSink, TcpSink, bound_socket])
+def test_an_address_of_one_link_needs_its_interface(use):
+    with pytest.raises(
+        EdgeposeError, match=r"fe80::1 port 9000: it needs the network interface.*fe80::1%eth0"
+    ):
+        use("fe80::1", 9000)
+    with pytest.raises(EdgeposeError, match="fe80::1%nosuch0"):
+        use("fe80::1%nosuch0", 9000)
+
+
 def test_udp_unknown_host():
     with pytest.raises(EdgeposeError, match="cannot find host"):
         UdpSink("no-such-host.invalid", 9000)
@@ -481,6 +492,7 @@ def test_udp_unknown_host():
         ("127.0.0.1:9000", ("127.0.0.1", 9000, "json", "")),
         ("pc.local:1,format=binary", ("pc.local", 1, "binary", "")),
         ("[::1]:65535,format=json", ("::1", 65535, "json", "")),
+        ("[fe80::1%eth0]:9000", ("fe80::1%eth0", 9000, "json", "")),
         ("10.0.0.255:9000,format=binary,broadcast", ("10.0.0.255", 9000, "binary", "broadcast")),
         ("224.0.0.251:9000,multicast", ("224.0.0.251", 9000, "json", "multicast")),
     ],
