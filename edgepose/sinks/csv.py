@@ -6,10 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from edgepose.errors import EdgeposeError
-from edgepose.formats.poses.csv_columns import ROTATION_FORMATS, numbers, pose_columns
+from edgepose.formats.poses.csv_columns import ROTATION_FORMATS, numbers, pose_columns, rotation_columns
 from edgepose.pose import PoseFrame, format_status, place_values
 from edgepose.sinks.base import Sink, SinkContext
 from edgepose.sinks.pose_file import PoseFileSink
+from edgepose.sinks.shared_numbers import rotvec_text
 from edgepose.utils.growing_files import GrowingFile
 from edgepose.utils.output_targets import FileTarget
 
@@ -57,19 +58,26 @@ class CsvSink(PoseFileSink):
         self._rotations, self._std = rotations, std
         self._translation, self._contacts = translation, contacts
         columns = pose_columns(rotations, std, translation, contacts)
-        self._format = ",".join(["%d,%.6f,%s"] + ["%.6f"] * (len(columns) - 3)) + "\n"
+        angles = len(rotation_columns(rotations))
+        self._rotations_format = ",".join(["%.6f"] * angles)
+        others = len(columns) - 3 - angles
+        self._format = "%d,%.6f,%s,%s" + ",%.6f" * others + "\n"
         self._rows: list[str] = []
         output = GrowingFile(path, "poses", overwrite=overwrite, follow=follow, stopped=stopped, waits=waits)
         super().__init__(output, (",".join(columns) + "\n").encode())
 
     def _add(self, pose: PoseFrame) -> bool:
-        values = numbers(self._rotations, pose.rotations).ravel().tolist()
-        if self._std:
-            values += pose.std.tolist()
+        values = pose.std.tolist() if self._std else []
         values += place_values(pose, self._translation, self._contacts)
         status = format_status(pose.held, pose.warming_up)
-        self._rows.append(self._format % (pose.index, pose.time_s, status, *values))
+        text = self._rotations_text(pose)
+        self._rows.append(self._format % (pose.index, pose.time_s, status, text, *values))
         return not self._output.regular
+
+    def _rotations_text(self, pose: PoseFrame) -> str:
+        if self._rotations == "axis-angle":
+            return rotvec_text(pose)
+        return self._rotations_format % tuple(numbers(self._rotations, pose.rotations).ravel().tolist())
 
     def _write_collected(self) -> None:
         rows, self._rows = "".join(self._rows).encode(), []

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from edgepose.errors import EdgeposeError
 from edgepose.formats.poses.csv_columns import pose_columns
 from edgepose.pose import PoseFrame, held_bits, place_values
-from edgepose.rotations import matrix_to_quat, quat_near
+from edgepose.rotations import quat_near
 from edgepose.sinks.base import Sink, SinkContext
+from edgepose.sinks.shared_numbers import quats
 from edgepose.skeleton import JOINTS
 
 Array = NDArray[np.float64]
@@ -100,7 +101,7 @@ class LslSink(Sink):
         if self._ahead_s is None:  # a recording, which begins now
             self._ahead_s = self._local_clock() - pose.time_s
         # Receivers that interpolate the numbers would turn a joint round where signs change.
-        self._quats = quat_near(matrix_to_quat(pose.rotations), self._quats)
+        self._quats = quat_near(quats(pose), self._quats)
         values = self._quats.ravel().tolist()
         values += place_values(pose, self._translation, self._contacts)
         self._outlet.push_sample(

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.pose import PoseFrame, pelvis_position
-from edgepose.rotations import matrix_to_quat, quat_near
+from edgepose.rotations import quat_near
 from edgepose.sinks.base import Sink, SinkContext
+from edgepose.sinks.shared_numbers import quats
 from edgepose.sinks.udp import DatagramSink
 from edgepose.skeleton import JOINTS, Body, default_body, standing_pelvis_position
 from edgepose.utils.sockets import Address
@@ -117,6 +118,9 @@ class MocopiSink(DatagramSink):
         heads = [id + parent for id, parent in zip(_IDS, _PARENTS, strict=True)]
         bones = _transforms(b"bndt", heads, self._numbers)
         self._skeleton = self._start + _chunk(b"skdf", _chunk(b"bons", bones))
+        frame = _transforms(b"btdt", _IDS, self._numbers)
+        bone = [("head", f"V{len(frame) // len(BONES) - 28}"), ("numbers", "<f4", 7)]
+        self._bones = np.frombuffer(bytearray(frame), bone)
         self._every, self._count = max(1, round(rate)), 0
         self._start_s: float | None = None
 
@@ -124,16 +128,17 @@ class MocopiSink(DatagramSink):
         """Return the datagram of a pose, and that of the skeleton before it when it is due."""
         if self._start_s is None:
             self._start_s = pose.time_s
-        quats = matrix_to_quat(pose.rotations[_JOINTS])[:, [1, 2, 3, 0]]
+        moved = quats(pose)[_JOINTS][:, [1, 2, 3, 0]]
         # Against those of the pose before, so that receivers that interpolate do not turn a bone round.
-        self._numbers[_MOVED, :4] = quat_near(quats, self._numbers[_MOVED, :4])
+        self._numbers[_MOVED, :4] = quat_near(moved, self._numbers[_MOVED, :4])
         self._numbers[0, 4:] = pelvis_position(pose, self._offsets)
+        self._bones["numbers"] = self._numbers
         frame = _chunk(
             b"fram",
             _chunk(b"fnum", struct.pack("<I", pose.index & 0xFFFFFFFF)),
             _chunk(b"time", struct.pack("<f", pose.time_s - self._start_s)),
             _chunk(b"uttm", struct.pack("<d", pose.time_s)),
-            _chunk(b"btrs", _transforms(b"btdt", _IDS, self._numbers)),
+            _chunk(b"btrs", self._bones.tobytes()),
         )
         due = self._count % self._every == 0
         self._count += 1

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from edgepose.errors import EdgeposeError
 from edgepose.pose import PoseFrame
-from edgepose.rotations import matrix_to_rotvec
 from edgepose.sinks.base import Sink, SinkContext
+from edgepose.sinks.shared_numbers import rotvecs
 from edgepose.skeleton import Body, default_body, standing_pelvis_position
 from edgepose.utils.sockets import failure_text, resolve
 
@@ -34,7 +34,7 @@ def encode(pose: PoseFrame, standing: NDArray[np.float64]) -> bytes:
         standing: (3,) position of the pelvis of that body, metres.
     """
     moved = np.zeros(3) if pose.translation is None else pose.translation - standing
-    return (_TEXT % (*matrix_to_rotvec(pose.rotations).ravel().tolist(), *moved.tolist())).encode()
+    return (_TEXT % (*rotvecs(pose).ravel().tolist(), *moved.tolist())).encode()
 
 
 @dataclass

@@ -18,8 +18,9 @@ from edgepose.errors import EdgeposeError
 from edgepose.formats.joint_tree import LARGEST
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import CONTACTS, PoseFrame, format_status, held_bits, parse_status
-from edgepose.rotations import matrix_to_quat, matrix_to_rotvec, quat_to_matrix, rotvec_to_matrix
+from edgepose.rotations import quat_to_matrix, rotvec_to_matrix
 from edgepose.sinks.base import Sink, SinkContext
+from edgepose.sinks.shared_numbers import quats, rotvec_text
 from edgepose.skeleton import JOINTS
 from edgepose.utils.sockets import Destination, address_text, failure_text, resolve
 
@@ -34,7 +35,7 @@ _FILLING_WINDOW = 1
 _CONTACTS = 2
 """Bit of a datagram's flags: the contacts are known."""
 
-_JSON = '{"frame":%d,"time_s":%.6f,"status":%s,"pose":[' + ",".join(["%.6f"] * 72) + "]"
+_JSON = '{"frame":%d,"time_s":%.6f,"status":%s,"pose":[%s]'
 # Magic, version, flags, held sensors, joints, time, frame, quaternions: each at a multiple of its size.
 _BINARY = struct.Struct("<4sBBBBdI96f")
 _PLACE = struct.Struct("<3f7f")
@@ -49,9 +50,8 @@ def encode_json(pose: PoseFrame) -> bytes:
 
     Known translations and contacts follow as trans and contacts.
     """
-    numbers = matrix_to_rotvec(pose.rotations).ravel().tolist()
     status = _quoted(format_status(pose.held, pose.warming_up))
-    text = _JSON % (pose.index, pose.time_s, status, *numbers)
+    text = _JSON % (pose.index, pose.time_s, status, rotvec_text(pose))
     for key, values in (("trans", pose.translation), ("contacts", pose.contacts)):
         if values is not None:
             text += f',"{key}":[{",".join(f"{value:.6f}" for value in values.tolist())}]'
@@ -71,10 +71,10 @@ def encode_binary(pose: PoseFrame, newest: int = 2) -> bytes:
         flags |= 0 if pose.contacts is None else _CONTACTS
         contacts = np.zeros(len(CONTACTS)) if pose.contacts is None else pose.contacts
         place = _PLACE.pack(*pose.translation.tolist(), *contacts.tolist())
-    quats = matrix_to_quat(pose.rotations).ravel().tolist()
+    numbers = quats(pose).ravel().tolist()
     index = pose.index & 0xFFFFFFFF  # wraps after two years at 60 Hz
     version, held = 2 if place else 1, held_bits(pose.held)
-    return _BINARY.pack(MAGIC, version, flags, held, len(JOINTS), pose.time_s, index, *quats) + place
+    return _BINARY.pack(MAGIC, version, flags, held, len(JOINTS), pose.time_s, index, *numbers) + place
 
 
 def decode_binary(datagram: bytes) -> PoseFrame:
@@ -91,13 +91,13 @@ def decode_binary(datagram: bytes) -> PoseFrame:
             f"pose datagram of version {version} with {joints} joints in {len(datagram)} bytes; supported "
             "are versions 1 and 2 with 24"
         )
-    quats = np.array(numbers).reshape(-1, 4)
-    norms = np.linalg.norm(quats, axis=-1, keepdims=True)
+    received = np.array(numbers).reshape(-1, 4)
+    norms = np.linalg.norm(received, axis=-1, keepdims=True)
     if not np.isfinite(time_s) or not np.all(np.abs(norms - 1.0) < 1e-3):
         raise EdgeposeError(
             f"damaged pose datagram: time or quaternions of frame {index} are not valid numbers"
         )
-    rotations = quat_to_matrix(quats / norms).astype(np.float32)
+    rotations = quat_to_matrix(received / norms).astype(np.float32)
     names = frozenset(name for i, name in enumerate(PLACEMENTS) if held >> i & 1)
     place = _PLACE.unpack_from(datagram, _BINARY.size) if version > 1 else ()
     return PoseFrame(

@@ -96,8 +96,8 @@ class VmcSink(DatagramSink):
         x_m, height_m, z_m = pelvis_position(pose, self._offsets) * TO_UNITY + 0.0  # no negative zeros
         root = _ROOT + struct.pack(">7f", x_m, 0, z_m, 0, 0, 0, 1)
         positions[0] = 0.0, height_m, 0.0
-        numbers = np.column_stack([positions, x, -y, -z, w]).astype(">f4")
-        bones = [head + row.tobytes() for head, row in zip(_BONE_HEADS, numbers, strict=True)]
+        numbers = np.column_stack([positions, x, -y, -z, w]).astype(">f4").tobytes()
+        bones = [head + numbers[28 * i : 28 * i + 28] for i, head in enumerate(_BONE_HEADS)]
         # Relative, because single precision cannot hold fractions of a second of Unix time.
         time_s = _TIME + struct.pack(">f", pose.time_s - self._start_s)
         return osc_bundle([_OK, time_s, root, *bones[:_HALF]]), osc_bundle([time_s, *bones[_HALF:]])
