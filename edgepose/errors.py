@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -46,6 +47,8 @@ def as_edgepose_error(error: Exception) -> EdgeposeError:
     elif isinstance(error, OSError) and error.filename is not None and error.strerror:
         name = str(error.filename)  # the system's answer about a file, such as a name that is too long
         reported = EdgeposeError(f"{name if len(name) <= 200 else f'{name[:200]}...'}: {error.strerror}")
+    elif isinstance(error, OSError) and error.errno == errno.ENOSPC:  # of standard output, without a name
+        reported = EdgeposeError("cannot write the result: the disk is full")
     else:
         reported = EdgeposeError(
             f"unexpected error ({type(error).__name__}: {text}); please report it, with the output of "

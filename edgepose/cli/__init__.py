@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import os
 import signal
@@ -111,6 +112,11 @@ def _terminate(number: int, frame: FrameType | None) -> NoReturn:
     raise KeyboardInterrupt
 
 
+def _drop_standard_output() -> None:
+    """Drop what standard output has not taken: its buffer must not be flushed again at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+
+
 def main() -> NoReturn:
     """Run the command line, and report an error as one line on stderr.
 
@@ -139,10 +145,12 @@ def main() -> NoReturn:
     except (click.Abort, KeyboardInterrupt):
         say("edgepose: stopped")
         sys.exit(exit_codes.INTERRUPTED)
-    except BrokenPipeError:  # stdout: its buffer must not be flushed again at exit
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    except BrokenPipeError:  # stdout
+        _drop_standard_output()
         sys.exit(exit_codes.FAILED)
     except Exception as error:
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+            _drop_standard_output()
         say(traceback.format_exc().rstrip() if debug else f"edgepose: {as_edgepose_error(error)}")
         sys.exit(exit_codes.FAILED)
     finally:

@@ -241,7 +241,8 @@ def _motion(path: Path, lines: Iterator[tuple[int, str]], width: int) -> tuple[f
             values.extend(numbers(path, number, words, width))
             frames, whole = frames + 1, line.endswith("\n")
         if frames != announced or not frames:
-            problem = f"{path}: {announced} frames are announced, {frames} are there (cut short?)"
+            cut = " (cut short?)" if frames < announced else ""
+            problem = f"{path}: {announced} frames are announced, {frames} are there{cut}"
             # A last row without line end may lack digits.
             frames -= frames < announced and not whole
     except EdgeposeError as error:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import json
-import os
 import shutil
-import signal
 import subprocess
 import time
 import urllib.request
@@ -39,17 +37,28 @@ class Browser:
     def __init__(self, folder: Path, size: str = "800,500") -> None:
         command = [CHROMIUM, "--no-sandbox", "--headless", "--enable-unsafe-swiftshader", "--disable-gpu"]
         command += ["--remote-debugging-port=0", f"--window-size={size}", f"--user-data-dir={folder}"]
-        # In a group of its own: Debian's command is a script, and the browser does not end with it.
+        # In a group of its own, which ends with this program however that ends: Debian's command is a script,
+        # and the browser does not end with it.
         self.process = subprocess.Popen(
-            [*command, "about:blank"], stderr=subprocess.DEVNULL, start_new_session=True
+            ["sh", "-c", '"$@" & read closed; kill -9 0', "sh", *command, "about:blank"],
+            stdin=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
         )
-        told = folder / "DevToolsActivePort"
+        self._count = 0
+        try:
+            self.socket = connect(self._page(folder / "DevToolsActivePort"), max_size=None)
+        except BaseException:
+            self._end()
+            raise
+
+    def _page(self, told: Path) -> str:
+        """The address of the page's debugger, which the browser tells in a file."""
         until(lambda: told.exists() and "\n" in told.read_text(), "the browser")
         port = told.read_text().splitlines()[0]
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/json") as answer:
             page = next(target for target in json.load(answer) if target["type"] == "page")
-        self.socket = connect(page["webSocketDebuggerUrl"], max_size=None)
-        self._count = 0
+        return str(page["webSocketDebuggerUrl"])
 
     def call(self, method: str, **words: object) -> dict:
         self._count += 1
@@ -70,5 +79,8 @@ class Browser:
 
     def close(self) -> None:
         self.socket.close()
-        os.killpg(self.process.pid, signal.SIGKILL)
+        self._end()
+
+    def _end(self) -> None:
+        self.process.stdin.close()
         self.process.wait()

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import termios
 import time
+from pathlib import Path
 
 import pytest
 
@@ -112,6 +113,16 @@ def test_every_command_works_without_standard_error():
     )
     assert done.returncode == 0
     assert b"birnn" in done.stdout
+
+
+@pytest.mark.parametrize("words", [["models", "--json"], ["--help"]])
+def test_standard_output_on_a_full_disk(words):
+    with Path("/dev/full").open("w") as full:
+        result = processes.run(
+            [sys.executable, "-m", "edgepose", *words], stdout=full, stderr=subprocess.PIPE
+        )
+    assert result.returncode == 1
+    assert result.stderr == b"edgepose: cannot write the result: the disk is full\n"
 
 
 def test_standard_output_that_is_closed(wearer):
