@@ -159,19 +159,7 @@ class OutputConfig:
         Raises:
             ConfigError: an output is unknown, given twice or in the wrong place, or a value is invalid.
         """
-        if unknown := outputs.keys() - SINKS.keys():
-            raise ConfigError(f"unknown output {min(unknown)!r}; outputs are {', '.join(SINKS)}")
-        sinks = sinks or {}
-        if own := sinks.keys() & SINKS.keys():
-            raise ConfigError(f"{min(own)} is not an output of another package: give --{min(own)}")
-        given = [*targets, *((name, outputs[name]) for name in SINKS if name in outputs), *sinks.items()]
-        several = [(name, value if isinstance(value, list) else [value]) for name, value in given]
-        flat = ((name, value) for name, values in several for value in values)
-        pairs = [(name, _target(name, value)) for name, value in flat if value not in (None, False)]
-        for i, (name, target) in enumerate(pairs):
-            if (name, target) in pairs[:i]:
-                what = "" if target is True else " with the same target"
-                raise ConfigError(f"the output {name} is given twice{what}")
+        pairs = _pairs(targets, outputs, sinks or {})
         check_receivers(("", name, target) for name, target in pairs)
         if rotations not in ROTATION_FORMATS:
             raise ConfigError(
@@ -229,6 +217,25 @@ class OutputConfig:
     def _files(self) -> list[tuple[str, str]]:
         files = [(name, target) for name, target in self.targets if name in SINKS and SINKS[name].suffix]
         return [(name, SINKS[name].file(target)) for name, target in files]
+
+
+def _pairs(
+    targets: Iterable[tuple[str, Any]], outputs: Mapping[str, Any], sinks: Mapping[str, str | list[str]]
+) -> list[tuple[str, Any]]:
+    """Return the name and the parsed target of each output; see `OutputConfig`."""
+    if unknown := outputs.keys() - SINKS.keys():
+        raise ConfigError(f"unknown output {min(unknown)!r}; outputs are {', '.join(SINKS)}")
+    if own := sinks.keys() & SINKS.keys():
+        raise ConfigError(f"{min(own)} is not an output of another package: give --{min(own)}")
+    given = [*targets, *((name, outputs[name]) for name in SINKS if name in outputs), *sinks.items()]
+    several = [(name, value if isinstance(value, list) else [value]) for name, value in given]
+    flat = ((name, value) for name, values in several for value in values)
+    pairs = [(name, _target(name, value)) for name, value in flat if value not in (None, False)]
+    for i, (name, target) in enumerate(pairs):
+        if (name, target) in pairs[:i]:
+            what = "" if target is True else " with the same target"
+            raise ConfigError(f"the output {name} is given twice{what}")
+    return pairs
 
 
 def _target(name: str, value: Any) -> Any:
