@@ -211,7 +211,7 @@ def calibrate(
 
     The wearer holds a pose for a few seconds, live (--port, --can, --listen, --connect, --ble) or in a
     recording (--file). The calibration, which `edgepose run` needs, contains the direction that the wearer
-    faces and the orientation of each sensor on its segment. Repeat it after a sensor was taken off or slipped.
+    faces and the orientation of each sensor on its segment. Repeat it after one came off or slipped.
 
     IN are recordings to calibrate from, each by itself, instead of a source: files, patterns and folders.
     --out then names a folder for the calibrations.
