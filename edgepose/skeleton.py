@@ -37,6 +37,20 @@ TIPS = {10: (0, 0, 0.06), 11: (0, 0, 0.06), 15: (0, 0.18, 0), 22: (0.08, 0, 0), 
 """End points of the bones without a joint at their end: joint, and tip in its frame, metres."""
 
 
+def global_rotations(local: ArrayLike) -> Array:
+    """Return the global joint rotations R_TB (..., 24, 3, 3) of a posed body.
+
+    Args:
+        local: (..., 24, 3, 3) rotation of each joint relative to its parent; joint 0 relative to T.
+    """
+    local = np.asarray(local, float)
+    rotations = np.empty_like(local)
+    rotations[..., 0, :, :] = local[..., 0, :, :]
+    for j, parent in enumerate(PARENTS[1:], start=1):
+        rotations[..., j, :, :] = rotations[..., parent, :, :] @ local[..., j, :, :]
+    return rotations
+
+
 def forward_kinematics(
     local: ArrayLike, offsets: ArrayLike, translation: ArrayLike | None = None
 ) -> tuple[Array, Array]:
@@ -50,19 +64,16 @@ def forward_kinematics(
     Returns:
         (..., 24, 3, 3) global rotations R_TB and (..., 24, 3) positions in T, metres.
     """
-    local, offsets = np.asarray(local, float), np.asarray(offsets, float)
-    rotations = np.empty_like(local)
-    positions = np.empty(local.shape[:-1])
-    rotations[..., 0, :, :] = local[..., 0, :, :]
+    rotations, offsets = global_rotations(local), np.asarray(offsets, float)
+    positions = np.empty(rotations.shape[:-1])
     positions[..., 0, :] = offsets[0] if translation is None else offsets[0] + np.asarray(translation, float)
     for j, parent in enumerate(PARENTS[1:], start=1):
-        rotations[..., j, :, :] = rotations[..., parent, :, :] @ local[..., j, :, :]
         positions[..., j, :] = positions[..., parent, :] + rotations[..., parent, :, :] @ offsets[j]
     return rotations, positions
 
 
 def local_from_global(rotations: ArrayLike) -> Array:
-    """Return the local rotations (..., 24, 3, 3) for global ones: the inverse of `forward_kinematics`."""
+    """Return the local rotations (..., 24, 3, 3) for global ones: the inverse of `global_rotations`."""
     rotations = np.asarray(rotations, float)
     local = np.swapaxes(rotations[..., list(PARENTS), :, :], -1, -2) @ rotations
     local[..., 0, :, :] = rotations[..., 0, :, :]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from edgepose.analysis.metrics import joint_angle_error, position_error, sip_error
 from edgepose.inference import archive
-from edgepose.skeleton import UNOBSERVED, default_body, forward_kinematics, local_from_global
+from edgepose.skeleton import UNOBSERVED, default_body, global_rotations, local_from_global
 from edgepose_export.evaluation.evaluate import Mode, modes_of, run_archive, takes_of
 
 Array = NDArray[np.float64]
@@ -32,17 +32,13 @@ ACTOR = slice(0, 2)
 def without_constants(poses: Sequence[Array], true: Sequence[Array]) -> list[Array]:
     """Return local poses (T, 24, 3, 3) of one actor without the constant part of their errors."""
     joints = list(UNOBSERVED)
-    predicted, reference = ([_rotations(pose) for pose in some] for some in (poses, true))
+    predicted, reference = ([global_rotations(pose) for pose in some] for some in (poses, true))
     errors = [p[:, joints].swapaxes(-1, -2) @ t[:, joints] for p, t in zip(predicted, reference, strict=True)]
     u, _, v = np.linalg.svd(np.concatenate(errors).mean(axis=0))
     u[..., -1] *= np.linalg.det(u @ v)[:, None]
     for rotations in predicted:
         rotations[:, joints] = rotations[:, joints] @ (u @ v)
     return [local_from_global(rotations) for rotations in predicted]
-
-
-def _rotations(pose: Array) -> Array:
-    return forward_kinematics(pose, np.zeros((24, 3)))[0]
 
 
 def errors(poses: Sequence[Array], true: Sequence[Array]) -> Array:

@@ -22,7 +22,7 @@ from edgepose.imu import Recording, SensorData
 from edgepose.inference import archive
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.rotations import Array
-from edgepose.skeleton import default_body, forward_kinematics, local_from_global
+from edgepose.skeleton import default_body, global_rotations, local_from_global
 from edgepose_export.mocap import Motion, read_motion, resample
 from edgepose_export.mocap.zeroing import Evidence, find_zero
 from edgepose_export.synthesis.heading_routine import with_exercises
@@ -138,7 +138,7 @@ def main(model: str, rigs: int) -> None:
             nearest = np.round(times[rows] * RATE).astype(int).clip(max=len(motion.rotations) - 1)
             poses.append(found[rows])
             true.append(local_from_global(motion.rotations[nearest]))
-            bone_errors.append(np.degrees(errors(bones[rows], forward_kinematics(true[-1], offsets)[0])))
+            bone_errors.append(np.degrees(errors(bones[rows], global_rotations(true[-1]))))
         summaries[name] = summary(np.concatenate(poses), np.concatenate(true), offsets, 60.0)
         mean = np.concatenate(bone_errors).mean(axis=0)
         bone_lines.append(f"{name:38}" + "".join(f"{h:7.1f}/{t:4.1f}" for h, t in mean))

@@ -24,7 +24,7 @@ from edgepose.pipeline.added_sensors import AddedSensorStage
 from edgepose.pipeline.dropout import assumed_bones, extrapolate_dropouts
 from edgepose.placements import PLACEMENTS, SITES
 from edgepose.pose import PoseFrame
-from edgepose.skeleton import forward_kinematics
+from edgepose.skeleton import global_rotations
 from edgepose_export.evaluation.evaluate import Mode, modes_of, run_archive
 from edgepose_export.evaluation.real_wearers import FOLDER, WALKER, Wearer, read_walker, walker_columns
 from edgepose_export.training.dataset import RATE, Take, read_take
@@ -74,7 +74,7 @@ def lacking(take: Take, names: Sequence[str]) -> Take:
 def with_added(local: Array, take: Take, names: Sequence[str]) -> Array:
     """Return poses (T, 24, 3, 3) of a take with the true bones of further sensors."""
     stage, joints = AddedSensorStage(names), [SITES[name] for name in names]
-    true, _ = forward_kinematics(take.pose, np.zeros((24, 3)))
+    true = global_rotations(take.pose)
     quats, held = np.zeros((len(names), 4)), np.zeros(len(names), bool)
     return np.stack(
         [

@@ -22,7 +22,7 @@ from edgepose.calibration import POSES
 from edgepose.calibration.slip import Slip, SlipMonitor
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.rotations import Array
-from edgepose.skeleton import default_body, forward_kinematics
+from edgepose.skeleton import global_rotations
 
 ANGLES_DEG = (20.0, 25.0, 30.0, 35.0, 40.0, 50.0)
 AXES = 4
@@ -34,7 +34,7 @@ def bones_of(path: Path) -> Array:
     with np.load(path, allow_pickle=False) as arrays:
         poses, rate = arrays["poses"].astype(float), float(arrays["mocap_framerate"])
     local = rot.rotvec_to_matrix(poses[:: max(1, round(rate / RATE))].reshape(-1, 24, 3))
-    return forward_kinematics(local, default_body().offsets)[0][:, list(BONES)]
+    return global_rotations(local)[:, list(BONES)]
 
 
 def runs(paths: Sequence[Path]) -> Mapping[str, Array]:

@@ -28,7 +28,7 @@ from edgepose.imu import Recording, SensorData
 from edgepose.orientation import OrientationEstimator
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
-from edgepose.skeleton import default_body, forward_kinematics, local_from_global
+from edgepose.skeleton import default_body, forward_kinematics, global_rotations, local_from_global
 from edgepose_export.mocap import Motion, read_motion, resample
 from edgepose_export.synthesis.imu_errors import BMI270, raw
 from edgepose_export.synthesis.virtual_imus import random_mounting, virtual_imus, with_hold
@@ -60,7 +60,7 @@ def read(path: Path) -> Motion:
         poses, place = arrays["poses"].astype(float), arrays["trans"].astype(float)
         rate = float(arrays["mocap_framerate"])
     local = rot.rotvec_to_matrix(poses.reshape(-1, 24, 3))
-    return Motion(forward_kinematics(local, default_body().offsets)[0], place, rate, "bvh")
+    return Motion(global_rotations(local), place, rate, "bvh")
 
 
 def walks(motion: Motion) -> Iterator[Motion]:

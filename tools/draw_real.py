@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from edgepose import rotations as rot
 from edgepose.inference.model import Model
 from edgepose.placements import SITES
-from edgepose.skeleton import forward_kinematics
+from edgepose.skeleton import global_rotations
 from edgepose_export.evaluation.real_wearers import FOLDER, WALKER, read_walker
 from edgepose_export.synthesis.virtual_imus import straight_pose
 
@@ -59,7 +59,7 @@ def main(out: Path) -> None:
             ax.axvspan(*span, color="0.5" if part.startswith("N-pose") else "0.9", alpha=0.3, lw=0)
     for name, colour in MODELS.items():
         poses = Model(name).poses(take.orientation, take.acceleration)
-        world, _ = forward_kinematics(poses, np.zeros((24, 3)))
+        world = global_rotations(poses)
         for ax, bone in zip(axes, BONES, strict=True):
             angle = forward_angle(bone, world[:, SITES[bone]], facing)
             ax.plot(wearer.time_s, angle, color=colour, lw=1, label=name)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from edgepose import rotations as rot
 from edgepose.placements import BONES, PLACEMENTS, ROOT
-from edgepose.skeleton import default_body, forward_kinematics
+from edgepose.skeleton import default_body, forward_kinematics, global_rotations
 from edgepose_export.training.dataset import RATE, Take
 
 Array = NDArray[np.float64]
@@ -129,7 +129,7 @@ def lying(take: Take) -> Take:
 
 def sitting_askew(take: Take) -> Take:
     """Turn legs and feet by 25 deg to the left of the pelvis, and the head by 20 deg to the right."""
-    bones, _ = forward_kinematics(take.pose, np.zeros((24, 3)))
+    bones = global_rotations(take.pose)
     left, right = (rot.rotation_about_axis("y", np.radians(angle)) for angle in (25.0, -20.0))
     pose, angles = take.pose.copy(), np.zeros((len(take.pose), len(PLACEMENTS)))
     for hip in _HIPS:

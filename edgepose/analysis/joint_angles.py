@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import transpose
-from edgepose.skeleton import JOINTS, forward_kinematics
+from edgepose.skeleton import JOINTS, forward_kinematics, global_rotations
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ def joint_angles(local: Array) -> dict[str, Array]:
 
     The keys of limbs have the form "left hip flexion".
     """
-    world, _ = forward_kinematics(local, np.zeros((len(JOINTS), 3)))
+    world = global_rotations(local)
     chest = world[:, JOINTS.index("spine3")]
     result = {}
     for side, out in (("left", 1.0), ("right", -1.0)):

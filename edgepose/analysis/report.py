@@ -30,7 +30,7 @@ from edgepose.analysis.way import draw_way, seen_from_above, way_of
 from edgepose.calibration.slip import Slip, SlipMonitor
 from edgepose.placements import BONES
 from edgepose.pose import PoseSequence, held_sensors, known_sensors, longest_holds
-from edgepose.skeleton import Body, forward_kinematics
+from edgepose.skeleton import Body, global_rotations
 from edgepose.utils.durable_files import write_whole
 
 Array = NDArray[np.float64]
@@ -274,7 +274,7 @@ def find_slips(poses: PoseSequence, body: Body) -> list[Slip]:
     """Return the sensors that seem to have turned on their limbs."""
     rows = np.arange(0, len(poses.rotations), max(1, round(poses.rate / SLIP_RATE)))
     rows = rows[~held_sensors([poses.held[row] for row in rows]).any(axis=1)]
-    bones = forward_kinematics(poses.rotations[rows], body.offsets)[0][:, list(BONES)]
+    bones = global_rotations(poses.rotations[rows])[:, list(BONES)]
     monitor = SlipMonitor(north=False, without=poses.about.get("without", "").split(", "))
     return [
         slip

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.rotations import matrix_to_euler_zxy, rotation_about_axis
-from edgepose.skeleton import JOINTS, forward_kinematics
+from edgepose.skeleton import JOINTS, global_rotations
 
 Array = NDArray[np.float64]
 
@@ -119,7 +119,7 @@ def body_orientations(local: Array) -> Array:
     Args:
         local: (T, 24, 3, 3) local rotations of SMPL's joints.
     """
-    world, _ = forward_kinematics(local, np.zeros((len(JOINTS), 3)))
+    world = global_rotations(local)
     return np.asarray(TO_OPENSIM @ world[:, _SMPL_JOINTS] @ _FRAMES)
 
 

@@ -17,7 +17,7 @@ from edgepose import rotations as rot
 from edgepose.imu import AddedFrame
 from edgepose.placements import SITES
 from edgepose.pose import PoseFrame
-from edgepose.skeleton import JOINTS, PARENTS, forward_kinematics, local_from_global
+from edgepose.skeleton import JOINTS, PARENTS, global_rotations, local_from_global
 
 Array = NDArray[np.float64]
 
@@ -36,8 +36,6 @@ _FOLLOWING = frozenset(
 _CHEST = SITES["chest"]
 _SPINE = {JOINTS.index("spine1"): 1.0 / 3.0, JOINTS.index("spine2"): 2.0 / 3.0}
 """Shares of the chest's correction that the bones between pelvis and chest get."""
-
-_NO_OFFSETS = np.zeros((len(JOINTS), 3))
 
 
 class AddedSensorStage:
@@ -68,7 +66,7 @@ class AddedSensorStage:
             measured: of the same frame, calibrated.
         """
         assert measured.bones is not None
-        bones, _ = forward_kinematics(pose.rotations, _NO_OFFSETS)
+        bones = global_rotations(pose.rotations)
         live = ~measured.held & np.isfinite(measured.bones).all(axis=(1, 2))
         predicted = bones[self._joints]
         wanted = np.where(live[:, None, None], rot.transpose(predicted) @ measured.bones, np.eye(3))

@@ -20,7 +20,7 @@ from edgepose.sip.energy import (
 )
 from edgepose.sip.kinematics import TURNS
 from edgepose.sip.parameterisation import coordinates
-from edgepose.skeleton import forward_kinematics
+from edgepose.skeleton import global_rotations
 
 Array = NDArray[np.float64]
 
@@ -119,7 +119,7 @@ def _start(problem: Problem) -> Array:
     parameters[:, 3:] = rig.mean
     nearest = int(np.argmin(TURNS[bones].sum(axis=1)))
     mean = rot.rotvec_to_matrix(coordinates(rig, parameters[:1]))
-    from_pelvis = forward_kinematics(mean, np.zeros((24, 3)))[0][0, bones[nearest]]
+    from_pelvis = global_rotations(mean)[0, bones[nearest]]
     parameters[:, :3] = rot.matrix_to_rotvec(problem.orientation[:, nearest] @ from_pelvis.T)
     return parameters
 

@@ -11,7 +11,7 @@ from edgepose import rotations as rot
 from edgepose.errors import EdgeposeError
 from edgepose.placements import PLACEMENTS
 from edgepose.sip.measurements import Measurements, orientation_at
-from edgepose.skeleton import forward_kinematics
+from edgepose.skeleton import global_rotations
 
 if TYPE_CHECKING:
     from edgepose.inference.model import Estimate, Model
@@ -78,7 +78,7 @@ def network_prior(model: Model, network_frames: Measurements, time_s: Array) -> 
     found = model.estimate(network_frames.orientation[:, columns], acceleration)
     rotations, std, place = _resampled(found, network_frames.time_s, time_s)
     joints = np.flatnonzero(std.any(axis=0))
-    orientation = forward_kinematics(rotations, np.zeros((24, 3)))[0][:, joints]
+    orientation = global_rotations(rotations)[:, joints]
     # `std` is that of the angle, whose three components have a third of its square each.
     precision = np.sqrt(3.0) / np.hypot(std[:, joints], _LEAST_DEVIATION)
     return NetworkPrior(joints, rotations, orientation, precision, place)

@@ -11,7 +11,7 @@ from edgepose import rotations as rot
 from edgepose.calibration import GRAVITY
 from edgepose.errors import EdgeposeError
 from edgepose.placements import BONES, PLACEMENTS
-from edgepose.skeleton import forward_kinematics
+from edgepose.skeleton import global_rotations
 from edgepose_export.cli.evaluate import evaluate
 from edgepose_export.datasets import read_dip, read_published, read_totalcapture, read_vicon
 from edgepose_export.evaluation.evaluate import takes_of
@@ -25,7 +25,7 @@ def truth():
     """Poses (T, 72), the bones' orientations (T, 6, 3, 3), accelerations in T (T, 6, 3)."""
     rng = np.random.default_rng(1)
     gt = np.cumsum(0.05 * rng.normal(size=(FRAMES, 72)), axis=0)
-    bones = forward_kinematics(rot.rotvec_to_matrix(gt.reshape(-1, 24, 3)), np.zeros((24, 3)))[0]
+    bones = global_rotations(rot.rotvec_to_matrix(gt.reshape(-1, 24, 3)))
     return gt, bones[:, list(BONES)], rng.normal(size=(FRAMES, 6, 3))
 
 
@@ -255,14 +255,10 @@ def write_vicon(folder, bones, hang=0.0):
 @pytest.fixture
 def true_bones(truth):
     """Global rotations (T, 24, 3, 3) of the truth with what Vicon's skeleton does not have at rest."""
-    bones = forward_kinematics(rot.rotvec_to_matrix(truth[0].reshape(-1, 24, 3)), np.zeros((24, 3)))[0]
+    bones = global_rotations(rot.rotvec_to_matrix(truth[0].reshape(-1, 24, 3)))
     bones[:, [10, 11]] = bones[:, [7, 8]]
     bones[:, [20, 21, 22, 23]] = bones[:, [18, 19, 18, 19]]
     return bones
-
-
-def global_rotations(take):
-    return forward_kinematics(take.pose, np.zeros((24, 3)))[0]
 
 
 def test_vicons_truth_where_dips_is_absent(totalcapture, true_bones):
@@ -273,7 +269,7 @@ def test_vicons_truth_where_dips_is_absent(totalcapture, true_bones):
     (take,) = read_published(folder)
     assert take.name == "s1_acting1"
     assert take.pose.shape == (FRAMES, 24, 3, 3)
-    np.testing.assert_allclose(global_rotations(take), true_bones, atol=1e-5)
+    np.testing.assert_allclose(global_rotations(take.pose), true_bones, atol=1e-5)
     np.testing.assert_allclose(take.orientation, true_bones[:, list(BONES)], atol=1e-5)
 
 
@@ -283,7 +279,7 @@ def test_vicons_truth_may_go_on_after_the_sensors(totalcapture, true_bones):
     as_sensors = true_bones[np.maximum(np.arange(FRAMES + 5) - 3, 0) % FRAMES]
     write_vicon(folder / "S1" / "acting1", as_sensors)
     (take,) = read_published(folder)
-    np.testing.assert_allclose(global_rotations(take), as_sensors[: FRAMES + 3], atol=1e-5)
+    np.testing.assert_allclose(global_rotations(take.pose), as_sensors[: FRAMES + 3], atol=1e-5)
     np.testing.assert_allclose(take.orientation, as_sensors[: FRAMES + 3, list(BONES)], atol=1e-5)
 
 

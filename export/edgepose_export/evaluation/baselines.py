@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edgepose import rotations as rot
 from edgepose.inference.features import network_input
 from edgepose.placements import BONES, ROOT
-from edgepose.skeleton import JOINTS, PARENTS, UNOBSERVED, forward_kinematics, local_from_global
+from edgepose.skeleton import JOINTS, PARENTS, UNOBSERVED, global_rotations, local_from_global
 from edgepose_export.mocap.straight_pose import straight_pose
 from edgepose_export.training.dataset import Take
 
@@ -85,7 +85,7 @@ def interpolated_from_straight(take: Take) -> Array:
     """Return local poses (T, 24, 3, 3) as `interpolated`, with the offsets that fit the straight pose."""
     pose = straight_pose()
     held = take._replace(orientation=pose[None, list(BONES)])
-    return interpolated(take, rot.transpose(_globals(interpolated(held))[0]) @ pose)
+    return interpolated(take, rot.transpose(global_rotations(interpolated(held))[0]) @ pose)
 
 
 class Baselines(NamedTuple):
@@ -112,7 +112,10 @@ def learn(takes: Iterable[Take], every: int = 10) -> Baselines:
     for take in takes:
         part = take._replace(orientation=take.orientation[::every], pose=take.pose[::every])
         local = part.pose.astype(float)
-        sums += local.sum(0), (rot.transpose(_globals(interpolated(part))) @ _globals(local)).sum(0)
+        sums += (
+            local.sum(0),
+            (rot.transpose(global_rotations(interpolated(part))) @ global_rotations(local)).sum(0),
+        )
         count += len(local)
         frames = np.arange(seen, seen + len(take.pose))
         seen += len(frames)
@@ -129,10 +132,6 @@ def learn(takes: Iterable[Take], every: int = 10) -> Baselines:
 def _inputs(take: Take) -> NDArray[np.float32]:
     orientation, acceleration = torch.tensor(take.orientation), torch.tensor(take.acceleration)
     return network_input(orientation.float(), acceleration.float()).numpy()
-
-
-def _globals(local: Array) -> Array:
-    return forward_kinematics(local, np.zeros((24, 3)))[0]
 
 
 def _constant(pose: Array, take: Take) -> Array:

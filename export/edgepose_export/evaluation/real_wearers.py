@@ -25,7 +25,7 @@ from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.wearer_pipeline import WearerPipeline
 from edgepose.placements import SITES
 from edgepose.sip.measurements import mounts_from_hold, orientation_at
-from edgepose.skeleton import default_body, forward_kinematics
+from edgepose.skeleton import default_body, global_rotations
 from edgepose.sources import open_source
 from edgepose_export.evaluation import baselines
 from edgepose_export.evaluation.evaluate import Table
@@ -252,7 +252,7 @@ def _sitter_tables(folder: Path, methods: Mapping[str, Method]) -> dict[str, Tab
 def walker_columns(wearer: Wearer, local: Array, span: Span) -> dict[str, Metric]:
     """Return angles to the true bones, deg, and jitter, km/s^3, of poses (T, 24, 3, 3) in a part."""
     frames = wearer.during(span)
-    bones, _ = forward_kinematics(local[frames], np.zeros((24, 3)))
+    bones = global_rotations(local[frames])
     errors = {
         name: np.degrees(rot.geodesic_angle(bones[:, SITES[name]], truth[frames]))
         for name, truth in wearer.truth.items()
@@ -265,7 +265,7 @@ def walker_columns(wearer: Wearer, local: Array, span: Span) -> dict[str, Metric
 
 def thigh_columns(wearer: Wearer, local: Array, joint: int) -> dict[str, Metric]:
     """Return the angle from vertical, deg, of a thigh in poses (T, 24, 3, 3), by part."""
-    up = forward_kinematics(local, np.zeros((24, 3)))[0][:, joint, :, 1]
+    up = global_rotations(local)[:, joint, :, 1]
     tilt = np.degrees(np.arctan2(np.hypot(up[:, 0], up[:, 2]), up[:, 1]))
     return {part: measure(tilt[wearer.during(span)]) for part, span in SITTER.parts.items()}
 
@@ -273,7 +273,7 @@ def thigh_columns(wearer: Wearer, local: Array, joint: int) -> dict[str, Metric]
 def gait_columns(wearer: Wearer, local: Array) -> dict[str, Metric]:
     """Return the thighs' strides per second on the straight walk, and jitter in some parts, km/s^3."""
     walk = wearer.during(STRAIGHT_WALK)
-    bones, _ = forward_kinematics(local[walk], np.zeros((24, 3)))
+    bones = global_rotations(local[walk])
     columns = {
         f"{side}, Hz": measure(_strides(bones[:, joint, :, 1])) for side, joint in (("left", 1), ("right", 2))
     }

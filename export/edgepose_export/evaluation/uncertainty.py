@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from edgepose.rotations import geodesic_angle
-from edgepose.skeleton import JOINTS, forward_kinematics
+from edgepose.skeleton import JOINTS, global_rotations
 from edgepose_export.evaluation.evaluate import Mode, groups, run_with_std
 from edgepose_export.training.dataset import Take
 
@@ -65,7 +65,7 @@ def errors_and_deviations(
 def _relative_to_root(local: Array) -> Array:
     local = local.copy()
     local[:, 0] = np.eye(3)
-    return forward_kinematics(local, np.zeros((24, 3)))[0]
+    return global_rotations(local)
 
 
 def scales(errors: Array, deviations: Array) -> Array:

@@ -18,7 +18,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.base import MAX_VALUE
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.pose import CONTACTS
-from edgepose.skeleton import PARENTS, forward_kinematics
+from edgepose.skeleton import PARENTS, global_rotations
 from edgepose.utils.safe_npz import BROKEN, open_npz
 from edgepose.utils.similar_names import choices
 from edgepose_export.synthesis.contacts import PLACE
@@ -112,7 +112,7 @@ def read_take(path: Path, root: Path | None = None) -> Take:
     inertial = rot.quat_to_matrix(quats)
     orientation = INERTIAL_FROM_BODY.T @ inertial
     local = rot.rotvec_to_matrix(poses)
-    bones = forward_kinematics(local[0], np.zeros((24, 3)))[0][list(BONES)]
+    bones = global_rotations(local[0])[list(BONES)]
     if not (rot.geodesic_angle(orientation[0], bones) < 0.01).all():
         raise EdgeposeError(
             f"{path}: the sensors are not aligned with the bones; use edgepose synthesize without --mounting"

@@ -31,7 +31,7 @@ from edgepose.inference import archive
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.placements import PLACEMENTS
 from edgepose.sinks.udp import decode_binary
-from edgepose.skeleton import JOINTS, PARENTS
+from edgepose.skeleton import JOINTS, global_rotations
 from firmware_protocols import native_can
 from firmware_protocols.native import encode
 from firmware_protocols.native_packet import Packet
@@ -59,13 +59,6 @@ def whole(path: Path) -> tuple[np.ndarray, np.ndarray, list[str], np.ndarray]:
 
 def numbers(path: Path) -> list[list[str]]:
     return [line.split(",") for line in path.read_text().splitlines()]
-
-
-def global_rotations(local: np.ndarray) -> np.ndarray:
-    result = local.copy()
-    for joint in range(1, len(JOINTS)):
-        result[:, joint] = result[:, PARENTS[joint]] @ local[:, joint]
-    return result
 
 
 def calibrated(wearer, file: Path) -> tuple[np.ndarray, np.ndarray]:

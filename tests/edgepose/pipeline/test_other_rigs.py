@@ -27,7 +27,7 @@ from edgepose.pipeline.rig_comparison import unlike_six
 from edgepose.placements import PLACEMENTS, ROOT, SENSORS, SITES
 from edgepose.pose import PoseFrame
 from edgepose.sip.measurements import mounts_from_hold, orientation_at
-from edgepose.skeleton import JOINTS, forward_kinematics
+from edgepose.skeleton import JOINTS, global_rotations
 from edgepose.sources import open_source
 from edgepose.sources.sensor_map import read_map
 from firmware_protocols.registry import PROTOCOLS
@@ -82,7 +82,7 @@ def walk(calibration: cal.Calibration, recording: Recording, end_s: float = END_
     recording = recording._replace(sensors=sensors)
     pipeline = Pipeline(calibration, model())
     poses = list(pipeline.poses([(end_s, list(iter_samples(recording)))]))
-    bones, _ = forward_kinematics(np.stack([pose.rotations for pose in poses]), np.zeros((24, 3)))
+    bones = global_rotations(np.stack([pose.rotations for pose in poses]))
     return Walk(poses, bones, pipeline)
 
 
@@ -153,12 +153,12 @@ def test_an_added_sensor_that_never_sends_costs_nothing_else(six: Walk) -> None:
 def test_neck_collars_and_spine_go_with_a_measured_chest() -> None:
     rng = np.random.default_rng(5)
     local = rot.rotvec_to_matrix(rng.normal(0.0, 0.2, (24, 3)))
-    bones, _ = forward_kinematics(local, np.zeros((24, 3)))
+    bones = global_rotations(local)
     turn = rot.rotvec_to_matrix([0.3, 0.1, -0.2])
     chest = SITES["chest"]
     measured = AddedFrame(np.zeros((1, 4)), np.array([False]), (bones[chest] @ turn)[None])
     pose = AddedSensorStage(["chest"]).correct(PoseFrame(0, 0.0, local, np.ones(24)), measured)
-    found, _ = forward_kinematics(pose.rotations, np.zeros((24, 3)))
+    found = global_rotations(pose.rotations)
     turned = {chest, *map(JOINTS.index, ("neck", "left_collar", "right_collar", "spine1", "spine2"))}
     for joint in set(range(24)) - turned:
         np.testing.assert_allclose(found[joint], bones[joint], atol=1e-9)

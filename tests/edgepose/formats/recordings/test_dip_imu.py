@@ -17,7 +17,7 @@ from edgepose.formats.recordings.registry import read_recording as read_npz
 from edgepose.imu import Recording
 from edgepose.placements import BONES, PLACEMENTS
 from edgepose.rotations import Z_UP_TO_T, quat_to_matrix, rotvec_to_matrix
-from edgepose.skeleton import forward_kinematics
+from edgepose.skeleton import global_rotations
 
 FRAMES = 12
 PLACES = [7, 8, 11, 12, 0, 2]
@@ -27,7 +27,7 @@ PLACES = [7, 8, 11, 12, 0, 2]
 def content() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(1)
     gt = np.cumsum(0.05 * rng.normal(size=(FRAMES, 72)), axis=0)
-    bones = forward_kinematics(rotvec_to_matrix(gt.reshape(-1, 24, 3)), np.zeros((24, 3)))[0]
+    bones = global_rotations(rotvec_to_matrix(gt.reshape(-1, 24, 3)))
     result = {"imu_ori": np.zeros((FRAMES, 17, 3, 3)), "imu_acc": np.zeros((FRAMES, 17, 3)), "gt": gt}
     result["imu_ori"][:, PLACES] = bones[:, list(BONES)]
     result["imu_acc"][:, PLACES] = rng.normal(size=(FRAMES, 6, 3))
