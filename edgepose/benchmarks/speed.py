@@ -159,12 +159,7 @@ def whole_walk(engine: Engine) -> Latency:
         listener.bind(("127.0.0.1", 0))
         with UdpSink("127.0.0.1", listener.getsockname()[1], "binary") as sink:
             summary = run(
-                WearerPipeline(
-                    FrameSynchronizer(RATE),
-                    HeadingRezero(calibration()),
-                    [sink],
-                    place=PlaceStage(default_body()),
-                ),
+                WearerPipeline(calibration(), RATE, [sink], place=PlaceStage(default_body())),
                 source(),
                 engine,
             )

@@ -16,8 +16,6 @@ from edgepose.calibration.rezero import HeadingRezero
 from edgepose.config import WearerConfig
 from edgepose.diagnostics.rig_monitor import RigMonitor
 from edgepose.errors import FileFormatError, prefix_errors
-from edgepose.orientation.stage import OrientationStage
-from edgepose.pipeline.added_sensors import AddedSensorStage
 from edgepose.pipeline.calibrated_settings import age_days, check_settings, with_calibrated_settings
 from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.network import Network
@@ -26,7 +24,7 @@ from edgepose.pipeline.pose_resampler import PoseResampler
 from edgepose.pipeline.remote_control import Request, Requests
 from edgepose.pipeline.rig_comparison import changes, missing_heading_reset, missing_quantities, unlike_six
 from edgepose.pipeline.run_report import RunReport, known_before, latency
-from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline, drift_corrector
+from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline, orientation_stage
 from edgepose.sinks.open import open_outputs
 from edgepose.sources import open_source
 from edgepose.sources.live import unix_now
@@ -86,7 +84,7 @@ class OpenWearer:
                 )
             )
             self._requests = Requests(stack, config.control, by_key)
-            self._orient = OrientationStage(calibration.filter, calibration.north, calibration.names)
+            self._orient = orientation_stage(calibration)
         self._sinks: list[Sink] = []
 
     def open_outputs(self, stack: ExitStack, network: Network, stopped: Callable[[], bool]) -> None:
@@ -150,15 +148,14 @@ class OpenWearer:
         if not self._config.no_place:
             poll = partial(self._requests.poll, "origin")
             place = PlaceStage(outputs.body, poll, self.notify, self._calibration.without)
-        added, without = self._calibration.added.names, self._calibration.without
-        self._clock = FrameSynchronizer(
-            rate, grid=several and source.file is None, added=added, without=without
-        )
-        return WearerPipeline(
-            self._clock,
-            headings,
+        pipeline = WearerPipeline(
+            self._calibration,
+            rate,
             self._sinks,
-            self._orient,
+            grid=several and source.file is None,
+            orient=self._orient,
+            headings=headings,
+            drift_correction=not self._config.no_drift_correction,
             notify=self.notify if source.live else lambda text: None,
             on_pose=on_pose,
             misfits=MisfitDetector(self._calibration, self._differences),
@@ -167,10 +164,9 @@ class OpenWearer:
             look_ahead_s=future / rate if source.live else None,
             place=place,
             resampler=None if outputs.rate is None else PoseResampler(outputs.rate, rate),
-            added=AddedSensorStage(added) if added else None,
-            without=without,
-            drift=None if self._config.no_drift_correction else drift_corrector(self._calibration),
         )
+        self._clock = pipeline.clock
+        return pipeline
 
     def _next_ready_s(self) -> float:
         return -inf if self._clock is None else self._clock.next_ready_s()

@@ -7,14 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edgepose.calibration import Calibration
-from edgepose.calibration.rezero import HeadingRezero
 from edgepose.errors import EdgeposeError
 from edgepose.imu import ImuSample
-from edgepose.orientation.stage import OrientationStage
-from edgepose.pipeline.added_sensors import AddedSensorStage
-from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.place_stage import PlaceStage
-from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline, drift_corrector
+from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
 from edgepose.pose import PoseFrame
 from edgepose.sinks.base import Sink
 from edgepose.skeleton import DEFAULT_HEIGHT, default_body
@@ -95,18 +91,12 @@ class Pipeline:
             EdgeposeError: the source ended in an error; all poses before it have been yielded.
         """
         buffer, engine = _PoseBuffer(), self._model.engine()
-        calibration = self._calibration
-        added = calibration.added.names
-        orient = OrientationStage(calibration.filter, calibration.north, calibration.names)
         pipeline = WearerPipeline(
-            FrameSynchronizer(self._model.rate_hz, added=added, without=calibration.without),
-            HeadingRezero(calibration),
+            self._calibration,
+            self._model.rate_hz,
             [buffer],
-            orient,
-            place=PlaceStage(self._body, without=calibration.without) if self._follow else None,
-            added=AddedSensorStage(added) if added else None,
-            without=calibration.without,
-            drift=drift_corrector(calibration) if self._correct_drift else None,
+            drift_correction=self._correct_drift,
+            place=PlaceStage(self._body, without=self._calibration.without) if self._follow else None,
         )
         self.summary = pipeline.summary
         failure: EdgeposeError | None = None

@@ -19,9 +19,10 @@ from edgepose.calibration.sensor_to_segment import added_bones
 from edgepose.calibration.slip import Slip
 from edgepose.diagnostics.rig_monitor import RigMonitor
 from edgepose.errors import EdgeposeError
-from edgepose.imu import ImuFrame, ImuSample
+from edgepose.imu import ImuFrame
 from edgepose.inference.engine import EngineInput, EngineOutput, check_finite
 from edgepose.orientation.drift import DriftCorrector
+from edgepose.orientation.stage import OrientationStage
 from edgepose.pipeline.added_sensors import AddedSensorStage
 from edgepose.pipeline.dropout import assumed_bones, extrapolate_dropouts
 from edgepose.pipeline.dropout_monitor import DropoutMonitor
@@ -98,9 +99,9 @@ def pose_frame(output: EngineOutput, without: Sequence[str] = ()) -> PoseFrame:
     return PoseFrame(frame.index, frame.time_s, output.rotations, output.std, None, held, output.warming_up)
 
 
-def drift_corrector(calibration: Calibration) -> DriftCorrector | None:
-    """Return the correction of a rig's heading drift; None if its sensors share a north."""
-    return None if calibration.north else DriftCorrector(POSES["straight"], PLACEMENTS, ROOT)
+def orientation_stage(calibration: Calibration) -> OrientationStage:
+    """Return the stage that orients a rig's samples as its calibration's were."""
+    return OrientationStage(calibration.filter, calibration.north, calibration.names)
 
 
 class WearerPipeline:
@@ -114,10 +115,14 @@ class WearerPipeline:
 
     def __init__(
         self,
-        clock: FrameSynchronizer,
-        headings: HeadingRezero,
+        calibration: Calibration,
+        rate: float,
         sinks: list[Sink],
-        orient: Callable[[list[ImuSample]], list[ImuSample]] = lambda samples: samples,
+        *,
+        grid: bool = False,
+        orient: OrientationStage | None = None,
+        headings: HeadingRezero | None = None,
+        drift_correction: bool = True,
         notify: Callable[[str], None] = lambda text: None,
         on_pose: Callable[[RunSummary], None] = lambda summary: None,
         misfits: MisfitDetector | None = None,
@@ -126,17 +131,18 @@ class WearerPipeline:
         look_ahead_s: float | None = None,
         place: PlaceStage | None = None,
         resampler: PoseResampler | None = None,
-        added: AddedSensorStage | None = None,
-        without: Sequence[str] = (),
-        drift: DriftCorrector | None = None,
     ) -> None:
-        """Join the stages.
+        """Assemble the stages of a calibrated rig.
 
         Args:
-            clock: makes frames from samples.
-            headings: provides the calibration for each frame; frames without one produce no pose.
+            calibration: of the wearer; it names the rig's sensors and their filter.
+            rate: frames per second.
             sinks: outputs, written in this order.
-            orient: adds orientations to raw samples.
+            grid: see `FrameSynchronizer`.
+            orient: adds orientations to raw samples; None for the calibration's filter.
+            headings: provides the calibration for each frame; frames without one produce no pose. None
+                for those of `calibration`.
+            drift_correction: correct the headings of sensors that share no north.
             notify: called with one message per sensor that drops out or comes back.
             on_pose: called after each pose has been written.
             misfits: checks whether the calibration fits the wearer.
@@ -147,22 +153,26 @@ class WearerPipeline:
                 own pace; see `PoseWriter`.
             place: follows the wearer through the room; None leaves the poses without translation.
             resampler: changes the rate of the poses that are written; None keeps that of the frames.
-            added: measured bones besides those of the six sensors, if the rig has them.
-            without: those of the six sensors that the rig lacks.
-            drift: corrects the headings of sensors that share no north; None leaves them as they are.
         """
-        self.summary, self.clock = RunSummary(), clock
+        added, without = calibration.added.names, calibration.without
+        self.summary = RunSummary()
+        self.clock = FrameSynchronizer(rate, grid=grid, added=added, without=without)
         self.arrived = self._started = time.perf_counter()
-        self._headings, self._orient, self._notify = headings, orient, notify
+        self._orient = orientation_stage(calibration) if orient is None else orient
+        self._headings = HeadingRezero(calibration) if headings is None else headings
+        self._drift: DriftCorrector | None = None
+        if drift_correction and not calibration.north:
+            self._drift = DriftCorrector(POSES["straight"], PLACEMENTS, ROOT)
+        self._notify = notify
         self._on_pose, self._misfits, self._rig, self._warn = on_pose, misfits, rig, warn
         if misfits is not None:
             self.summary.slips = misfits.slips
         self._sinks = SinkGroup(sinks, warn)
         self._writer, self._place = PoseWriter(self._sinks, look_ahead_s, warn, resampler), place
-        self._added, self._without = added, without
-        self._dropouts = DropoutMonitor([] if added is None else added.names, without)
+        self._added = AddedSensorStage(added) if added else None
+        self._without = without
+        self._dropouts = DropoutMonitor(added, without)
         self._reported_unused = 0
-        self._drift = drift
         self._source_s = 0.0  # time on the source's clock at 0 of the clock of `arrived`
         self._bones: NDArray[np.float64] | None = None  # those of the previous frame
 

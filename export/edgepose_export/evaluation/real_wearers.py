@@ -17,11 +17,9 @@ from numpy.typing import NDArray
 from edgepose import rotations as rot
 from edgepose.analysis.metrics import Metric, aligned, jitter, measure
 from edgepose.calibration import Calibration, calibrate, check_hold, hold_from_recording, trim
-from edgepose.calibration.rezero import HeadingRezero
 from edgepose.errors import EdgeposeError
 from edgepose.formats.recordings.registry import read_recording, read_sensors
 from edgepose.inference.model import Model
-from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.wearer_pipeline import WearerPipeline
 from edgepose.placements import SITES
 from edgepose.sip.measurements import mounts_from_hold, orientation_at
@@ -162,7 +160,7 @@ def calibrated(path: Path, about: _Recording, rate: float) -> tuple[Calibration,
         raise EdgeposeError(f"{path}: ends at {last_s:.1f} s; the parts to measure go on after {end_s:g} s")
     hold = check_hold(trim(hold_from_recording(recording), *about.hold), "use the original file")
     calibration = calibrate(hold, pose="straight", body_frame=about.facing, created="")
-    pipeline = WearerPipeline(FrameSynchronizer(rate), HeadingRezero(calibration), [])
+    pipeline = WearerPipeline(calibration, rate, [])
     with open_source(file=path) as source:
         inputs = [each for batch in source for each in pipeline.process(batch)]
     inputs += pipeline.flush()

@@ -11,7 +11,6 @@ import pytest
 
 from edgepose import rotations as rot
 from edgepose.calibration import POSES, apply_calibration, load_calibration
-from edgepose.calibration.rezero import HeadingRezero
 from edgepose.formats.recordings.base import iter_samples
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import GRAVITY, ImuFrame, ImuSample
@@ -20,8 +19,7 @@ from edgepose.orientation.drift import DriftCorrector
 from edgepose.orientation.drift.corrector import FASTEST
 from edgepose.orientation.drift.estimator import ODDS, DriftEstimator
 from edgepose.orientation.drift.evidence import Block
-from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
-from edgepose.pipeline.wearer_pipeline import WearerPipeline, drift_corrector
+from edgepose.pipeline.wearer_pipeline import WearerPipeline
 from edgepose.placements import PLACEMENTS, ROOT
 from edgepose.sources import Batch
 
@@ -299,9 +297,7 @@ def samples(wearer) -> list[ImuSample]:
 
 def inputs(wearer, samples: list[ImuSample], size: int, *, north: bool = False) -> Iterator[EngineInput]:
     calibration = replace(load_calibration(wearer.calibration), north=north)
-    pipeline = WearerPipeline(
-        FrameSynchronizer(), HeadingRezero(calibration), [], drift=drift_corrector(calibration)
-    )
+    pipeline = WearerPipeline(calibration, 60.0, [])
     for k in range(0, len(samples), size):
         part = samples[k : k + size]
         yield from pipeline.process(Batch(part[-1].time_s, part))

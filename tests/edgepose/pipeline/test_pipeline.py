@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 
 from edgepose.calibration import load_calibration
-from edgepose.calibration.rezero import HeadingRezero
 from edgepose.errors import EdgeposeError, ModelError
 from edgepose.formats.poses.registry import read_poses
 from edgepose.imu import ImuFrame
 from edgepose.inference import archive
 from edgepose.inference.engine import EngineOutput, StreamEngine
-from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.run import run
 from edgepose.pipeline.wearer_pipeline import LATENCIES, RunSummary, WearerPipeline, pose_frame
 from edgepose.placements import PLACEMENTS
@@ -60,8 +58,8 @@ def walk(wearer, module):
         **options,
     ):
         engine = StreamEngine(module, past, future)
-        headings = HeadingRezero(load_calibration(wearer.calibration))
-        walk = WearerPipeline(FrameSynchronizer(), headings, list(sinks), on_pose=on_pose, warn=warn)
+        calibration = load_calibration(wearer.calibration)
+        walk = WearerPipeline(calibration, 60.0, list(sinks), on_pose=on_pose, warn=warn)
         with open_source(file=wearer.short) as source:
             summary = run(walk, change(source), engine, **options)
         walk.close()

@@ -9,12 +9,10 @@ import pytest
 
 import edgepose
 from edgepose.calibration import load_calibration
-from edgepose.calibration.rezero import HeadingRezero
 from edgepose.formats.recordings.base import iter_samples
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.imu import ImuSample
 from edgepose.inference.engine import Engine, MultiWearerEngine, StreamEngine
-from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.multi_wearer import Wearer, run_together
 from edgepose.pipeline.place_stage import LOWER_BODY, PlaceStage
 from edgepose.pipeline.run import run
@@ -68,8 +66,8 @@ def follow(wearer, model):
     def go(
         samples: Iterable[ImuSample], stage: PlaceStage, engine: Engine | None = None
     ) -> tuple[Poses, RunSummary]:
-        sink, headings = Poses(), HeadingRezero(load_calibration(wearer.calibration))
-        pipeline = WearerPipeline(FrameSynchronizer(), headings, [sink], place=stage)
+        sink = Poses()
+        pipeline = WearerPipeline(load_calibration(wearer.calibration), 60.0, [sink], place=stage)
         batches = (Batch(sample.time_s, [sample]) for sample in samples)
         summary = run(pipeline, batches, engine or model.engine())
         assert summary.error is None
@@ -81,8 +79,8 @@ def follow(wearer, model):
 def test_every_pose_has_the_place_that_the_tracker_finds(follow, wearer, samples, model):
     sink, summary = follow(samples, PlaceStage(BODY))
     assert len(sink.poses) == 180
-    headings, clock = HeadingRezero(load_calibration(wearer.calibration)), FrameSynchronizer()
-    pipeline, tracker, engine = WearerPipeline(clock, headings, []), PlaceTracker(BODY), model.engine()
+    pipeline = WearerPipeline(load_calibration(wearer.calibration), 60.0, [])
+    tracker, engine = PlaceTracker(BODY), model.engine()
     inputs = [*pipeline.process(Batch(samples[-1].time_s, samples)), *pipeline.flush()]
     outputs = [output for each in inputs for output in engine.push(*each)]
     for pose, output in zip(sink.poses, outputs, strict=True):
@@ -96,9 +94,7 @@ def test_every_pose_has_the_place_that_the_tracker_finds(follow, wearer, samples
 
 def test_without_the_stage_there_is_no_place(wearer, model, samples):
     sink = Poses()
-    pipeline = WearerPipeline(
-        FrameSynchronizer(), HeadingRezero(load_calibration(wearer.calibration)), [sink]
-    )
+    pipeline = WearerPipeline(load_calibration(wearer.calibration), 60.0, [sink])
     summary = run(pipeline, [Batch(samples[-1].time_s, samples)], model.engine())
     assert {(pose.translation, pose.contacts) for pose in sink.poses} == {(None, None)}
     assert summary.way_m is None
@@ -106,8 +102,7 @@ def test_without_the_stage_there_is_no_place(wearer, model, samples):
 
 def test_an_archive_without_a_head_leaves_contacts_unknown(wearer, tiny, samples):
     sink = Poses()
-    headings = HeadingRezero(load_calibration(wearer.calibration))
-    pipeline = WearerPipeline(FrameSynchronizer(), headings, [sink], place=PlaceStage(BODY))
+    pipeline = WearerPipeline(load_calibration(wearer.calibration), 60.0, [sink], place=PlaceStage(BODY))
     engine = StreamEngine(tiny(NetworkShape("rnn", 8, "global-6d", "passed")), 0, 0)
     run(pipeline, [Batch(samples[-1].time_s, samples)], engine)
     assert np.isfinite(sink.translations).all()
@@ -155,12 +150,7 @@ def test_several_wearers_have_a_place_each(wearer, tiny):
         wearers = [
             Wearer(
                 source,
-                WearerPipeline(
-                    FrameSynchronizer(),
-                    HeadingRezero(load_calibration(wearer.calibration)),
-                    [sink],
-                    place=stage,
-                ),
+                WearerPipeline(load_calibration(wearer.calibration), 60.0, [sink], place=stage),
                 lambda text: None,
             )
             for source, sink, stage in zip((one, other), sinks, stages, strict=True)

@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 
 from edgepose.calibration import load_calibration
-from edgepose.calibration.rezero import HeadingRezero
 from edgepose.cli.conflicts import check_all_files
 from edgepose.cli.options.wearer import read_rigs
 from edgepose.errors import EdgeposeError
@@ -25,7 +24,6 @@ from edgepose.formats.poses.registry import read_poses
 from edgepose.formats.recordings.csv import write_csv
 from edgepose.formats.recordings.registry import read_recording
 from edgepose.inference.engine import StreamEngine
-from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.run import run
 from edgepose.pipeline.wearer_pipeline import WearerPipeline
 from edgepose.placements import PLACEMENTS
@@ -330,10 +328,9 @@ def test_wearers_get_the_poses_that_each_gets_alone(
     assert sum(no_contacts in line for line in json.loads(result.stdout)["messages"]) == 1
     lengths = []
     for name, file in files.items():
-        headings = HeadingRezero(load_calibration(wearer.calibration))
         with open_source(file=file) as source, CsvSink(tmp_path / "alone.csv", "matrix") as sink:
             run(
-                WearerPipeline(FrameSynchronizer(), headings, [sink]),
+                WearerPipeline(load_calibration(wearer.calibration), 60.0, [sink]),
                 source,
                 StreamEngine(tiny(shape), *window),
             )

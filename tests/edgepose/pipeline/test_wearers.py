@@ -8,9 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from edgepose.calibration import load_calibration
-from edgepose.calibration.rezero import HeadingRezero
 from edgepose.inference.engine import MultiWearerEngine
-from edgepose.pipeline.frame_synchronizer import FrameSynchronizer
 from edgepose.pipeline.multi_wearer import Wearer, run_together
 from edgepose.pipeline.wearer_pipeline import WearerPipeline
 from edgepose.pose import PoseFrame
@@ -55,8 +53,7 @@ def join(wearer):
     """Makes a wearer of a source that has been entered, and of a sink."""
 
     def make(source: Source, sink: Sink, tell: Callable[[str], None] = lambda text: None) -> Wearer:
-        headings = HeadingRezero(load_calibration(wearer.calibration))
-        return Wearer(source, WearerPipeline(FrameSynchronizer(), headings, [sink]), tell)
+        return Wearer(source, WearerPipeline(load_calibration(wearer.calibration), 60.0, [sink]), tell)
 
     return make
 
