@@ -18,6 +18,9 @@ FILTERS = ("none", "kalman", "vqf")
 GRAVITY = 9.81
 """Specific force measured by a sensor at rest, m/s^2; in I along +Z."""
 
+HOLD_PERIODS = 2.5
+"""Age of a sensor's last sample, in its periods, above which its values are repetitions."""
+
 GAP_S = 60.0
 """Silence of all sensors after which frames restart instead of repeating the last values, seconds."""
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from edgepose.errors import EdgeposeError
 from edgepose.imu import GAP_S, AddedFrame, ImuFrame, ImuSample
-from edgepose.pipeline.sensor_samples import Entry, SensorSamples, mean_force, slerp
+from edgepose.pipeline.sensor_samples import Entry, SensorSamples, SensorState
 from edgepose.placements import PLACEMENTS, SENSORS
 
 START_TIMEOUT_S = 3.0
@@ -24,8 +24,7 @@ START_TIMEOUT_S = 3.0
 STALE_S = 0.5
 """Longest silence of a sensor that is still waited for, seconds."""
 
-_HOLD_PERIODS = 2.5  # age of a sensor's last sample, in its periods, at which the sensor is held
-_IDENTITY, _NO_FORCE = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+_NO_FORCE = (0.0, 0.0, 0.0)
 
 Interpolation = Literal["slerp", "hold"]
 
@@ -254,66 +253,23 @@ class FrameSynchronizer:
     def _frame(self, tick_s: float, now_s: float) -> ImuFrame:
         assert self._t0 is not None
         start_s = self._t0 + (self._tick - 1) / self._rate
-        orientation, force, held = [], [], []
-        ready_s = -inf
-        for sensor, is_missing in zip(self._sensors, self._missing, strict=True):
-            if is_missing:
-                orientation.append(_IDENTITY)
-                force.append(_NO_FORCE)
-                held.append(True)
-                continue
-            pending = sensor.pending
-            before = sensor.last
-            inside = []
-            while pending and pending[0].time_s <= tick_s:
-                inside.append(sensor.take())
-            last = sensor.last
-            assert last is not None, "t0 is not before any sensor's first sample"
-            age_s = tick_s - last.time_s
-            longest_s = max(_HOLD_PERIODS * sensor.period_s, 1.0 / self._rate)
-            is_held = age_s > longest_s
-            quat, mean = last.quat, last.force
-            if not is_held:
-                ready_s = max(ready_s, last.arrival_s)
-                # A later sample would not have been waited for; using it would depend on timing.
-                if pending and age_s > 0.0 and pending[0].time_s - tick_s <= sensor.wait_s:
-                    following = pending[0]
-                    ready_s = max(ready_s, following.arrival_s)
-                    if self._slerp:
-                        quat = slerp(quat, following.quat, age_s / (following.time_s - last.time_s))
-                    inside.append(following)
-                if before is not None and inside and inside[0].time_s - before.time_s <= longest_s:
-                    inside.insert(0, before)
-                if inside:
-                    mean = mean_force(inside, start_s, tick_s)
-            orientation.append(quat)
-            force.append(mean)
-            held.append(is_held)
+        states = self._states(self._sensors, tick_s)
+        ready_s = max(state.arrival_s for state in states)
         return ImuFrame(
             self._index,
             tick_s,
-            np.array(orientation),
-            np.array(force),
-            np.array(held),
+            np.array([state.quat for state in states]),
+            np.array([state.force(start_s, tick_s) for state in states]),
+            np.array([state.is_held for state in states]),
             ready_s if ready_s > -inf else min(now_s, tick_s),
             self._added_frame(tick_s) if self._added else None,
         )
 
     def _added_frame(self, tick_s: float) -> AddedFrame:
-        orientation, held = [], []
-        for sensor in self._added.values():
-            pending = sensor.pending
-            while pending and pending[0].time_s <= tick_s:
-                sensor.take()
-            last = sensor.last
-            quat, is_held = _IDENTITY, True
-            if last is not None:
-                quat, age_s = last.quat, tick_s - last.time_s
-                is_held = age_s > max(_HOLD_PERIODS * sensor.period_s, 1.0 / self._rate)
-                if not is_held and self._slerp and age_s > 0.0 and pending:
-                    following = pending[0]
-                    if following.time_s - tick_s <= sensor.wait_s:
-                        quat = slerp(quat, following.quat, age_s / (following.time_s - last.time_s))
-            orientation.append(quat)
-            held.append(is_held)
-        return AddedFrame(np.array(orientation), np.array(held))
+        states = self._states(self._added.values(), tick_s)
+        return AddedFrame(
+            np.array([state.quat for state in states]), np.array([state.is_held for state in states])
+        )
+
+    def _states(self, sensors: Iterable[SensorSamples], tick_s: float) -> list[SensorState]:
+        return [sensor.advance(tick_s, 1.0 / self._rate, self._slerp) for sensor in sensors]

@@ -10,7 +10,7 @@ from collections import deque
 from math import asin, inf, sin, sqrt
 from typing import NamedTuple
 
-from edgepose.imu import Quaternion, Vector3
+from edgepose.imu import HOLD_PERIODS, Quaternion, Vector3
 
 _WAIT_PERIODS, _WAIT_S = 1.5, 0.010  # see `SensorSamples.wait_s`
 _PERIOD_RANGE_S = (0.001, 0.2)
@@ -31,6 +31,31 @@ class Entry(NamedTuple):
     quat: Quaternion
     force: Vector3
     arrival_s: float
+
+
+class SensorState(NamedTuple):
+    """A sensor at a tick.
+
+    Attributes:
+        quat: unit quaternion w, x, y, z, sensor to inertial.
+        is_held: its last sample is too old, or there is none: `quat` is a repetition.
+        arrival_s: time on the source's clock at which the newest sample that counts came, seconds.
+        last_force: specific force of its last sample, m/s^2.
+        entries: samples from which the force is computed, oldest first; empty if there is nothing new.
+    """
+
+    quat: Quaternion
+    is_held: bool
+    arrival_s: float
+    last_force: Vector3
+    entries: list[Entry]
+
+    def force(self, start_s: float, tick_s: float) -> Vector3:
+        """Return the mean specific force in the inertial frame from `start_s` to the tick, m/s^2."""
+        return _mean_force(self.entries, start_s, tick_s) if self.entries else self.last_force
+
+
+_UNSEEN = SensorState((1.0, 0.0, 0.0, 0.0), True, -inf, (0.0, 0.0, 0.0), [])
 
 
 class SensorSamples:
@@ -69,7 +94,38 @@ class SensorSamples:
         self.pending.insert(index, entry)
         return True
 
-    def take(self) -> Entry:
+    def advance(self, tick_s: float, frame_s: float, interpolate: bool) -> SensorState:
+        """Move on to a tick, and return the sensor's state there.
+
+        Args:
+            tick_s: time of the tick on the source's clock, seconds; not before the last one.
+            frame_s: time between ticks, seconds.
+            interpolate: the orientation is one between the samples before and after the tick, instead of that
+                of the last sample.
+        """
+        before, pending, entries = self.last, self.pending, []
+        while pending and pending[0].time_s <= tick_s:
+            entries.append(self._take())
+        last = self.last
+        if last is None:
+            return _UNSEEN
+        age_s = tick_s - last.time_s
+        longest_s = max(HOLD_PERIODS * self.period_s, frame_s)
+        if age_s > longest_s:
+            return SensorState(last.quat, True, -inf, last.force, [])
+        quat, arrival_s = last.quat, last.arrival_s
+        # A later sample would not have been waited for; using it would depend on timing.
+        if pending and age_s > 0.0 and pending[0].time_s - tick_s <= self.wait_s:
+            following = pending[0]
+            arrival_s = max(arrival_s, following.arrival_s)
+            if interpolate:
+                quat = _slerp(quat, following.quat, age_s / (following.time_s - last.time_s))
+            entries.append(following)
+        if before is not None and entries and entries[0].time_s - before.time_s <= longest_s:
+            entries.insert(0, before)
+        return SensorState(quat, False, arrival_s, last.force, entries)
+
+    def _take(self) -> Entry:
         """Move the oldest pending entry to `last`, update the period, and return the entry."""
         entry = self.pending.popleft()
         # Updated here and not in `add`: the period must not depend on how far samples run ahead of the ticks.
@@ -90,7 +146,7 @@ class SensorSamples:
         return _WAIT_PERIODS * self.period_s + _WAIT_S
 
 
-def mean_force(entries: list[Entry], start_s: float, end_s: float) -> Vector3:
+def _mean_force(entries: list[Entry], start_s: float, end_s: float) -> Vector3:
     """Mean over the time from start to end of a force that is linear between entries and constant beyond.
 
     It is a mean over time, not over samples: with 5 samples in 3 frames, the mean over samples would jitter
@@ -118,7 +174,7 @@ def mean_force(entries: list[Entry], start_s: float, end_s: float) -> Vector3:
     return ((x + weight * fx) / total, (y + weight * fy) / total, (z + weight * fz) / total)
 
 
-def slerp(p: Quaternion, q: Quaternion, share: float) -> Quaternion:
+def _slerp(p: Quaternion, q: Quaternion, share: float) -> Quaternion:
     """Unit quaternion on the shorter arc from p (share 0) to q (share 1)."""
     pw, px, py, pz = p
     qw, qx, qy, qz = q

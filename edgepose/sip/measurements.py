@@ -17,7 +17,7 @@ from edgepose.calibration import GRAVITY, Calibration
 from edgepose.calibration.checks import GAP_LIMIT_S
 from edgepose.calibration.sensor_to_segment import held_bone
 from edgepose.errors import EdgeposeError
-from edgepose.imu import GAP_S, Recording, SensorData
+from edgepose.imu import GAP_S, HOLD_PERIODS, Recording, SensorData
 from edgepose.placements import SITES
 
 Array = NDArray[np.float64]
@@ -25,7 +25,6 @@ Array = NDArray[np.float64]
 FEWEST, MOST = 3, len(SITES)
 """Smallest and largest number of sensors."""
 
-_HOLD_PERIODS = 2.5  # as in `pipeline.frame_synchronizer`
 _LEAST_HOLD = 10  # samples
 
 
@@ -217,7 +216,7 @@ def _frames(
 def _longest_interval(times: Array, rate: float) -> float:
     """Return the interval between samples above which some are missing, s."""
     usual = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
-    return max(_HOLD_PERIODS * usual, 1.0 / rate) + 1e-6
+    return max(HOLD_PERIODS * usual, 1.0 / rate) + 1e-6
 
 
 def _silence(times: Array, wanted: Array, rate: float) -> Array:
