@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import pairwise
@@ -19,6 +18,7 @@ from edgepose.sip.levenberg_marquardt import SIP_EVALUATIONS, Minimum, inertial_
 from edgepose.sip.measurements import Measurements
 from edgepose.sip.network_prior import NetworkPrior
 from edgepose.sip.parameterisation import PoseParameterisation, coordinates, parameters_of
+from edgepose.utils.jobs import run_in_order
 
 Array = NDArray[np.float64]
 
@@ -98,7 +98,7 @@ def solve(
         on_progress: called after each evaluation; with more than one job, only after each chunk.
 
     Raises:
-        EdgeposeError: there is no frame, or a worker process died.
+        EdgeposeError: there is no frame, or a process was killed.
     """
     if not len(measurements.time_s):
         raise EdgeposeError("the recording has no frame in which all sensors report")
@@ -124,33 +124,9 @@ def _solutions(
         for number, problem in enumerate(problems, start=1):
             yield work(problem, on_step=partial(on_progress, number, count))
         return
-    from concurrent.futures import ProcessPoolExecutor
-    from concurrent.futures.process import BrokenProcessPool
-    from multiprocessing import get_context
-
-    # Not forked: a copy of a process with threads may hang.
-    with ProcessPoolExecutor(min(jobs, count), get_context("spawn"), _ignore_interrupts) as pool:
-        # A new process ignores Ctrl-C from its first moment on where this one does.
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-        try:
-            solutions = pool.map(work, problems)
-        finally:
-            signal.signal(signal.SIGINT, before)
-        try:
-            for number, solution in enumerate(solutions, start=1):
-                on_progress(number, count, solution.evaluations, float(solution.costs.sum(axis=1).mean()))
-                yield solution
-        except BrokenProcessPool as error:
-            raise EdgeposeError(
-                "a worker process died, perhaps for lack of memory; use fewer --jobs"
-            ) from error
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-def _ignore_interrupts() -> None:
-    """Ignore Ctrl-C, which reaches all processes of a terminal; the parent process handles it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number, solution in enumerate(run_in_order(work, problems, jobs), start=1):
+        on_progress(number, count, solution.evaluations, float(solution.costs.sum(axis=1).mean()))
+        yield solution
 
 
 def solve_chunk(

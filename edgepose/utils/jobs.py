@@ -1,4 +1,4 @@
-"""Many jobs of one kind, in this process or in several; a bad one does not stop the rest."""
+"""Many jobs of one kind, in this process or in several."""
 
 from __future__ import annotations
 
@@ -7,10 +7,15 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from typing import TypeVar
+
+from edgepose.errors import EdgeposeError
 
 JobT = TypeVar("JobT")
 ResultT = TypeVar("ResultT")
+
+_KILLED = "process was killed, perhaps for lack of memory; use fewer --jobs"
 
 
 def run_jobs(
@@ -20,7 +25,7 @@ def run_jobs(
     failed: Callable[[JobT, str], ResultT],
     stopped: Callable[[], bool] = lambda: False,
 ) -> Iterator[ResultT]:
-    """Do jobs, and yield their results as they finish.
+    """Do jobs, and yield their results as they finish; a bad one does not stop the rest.
 
     Args:
         work: does a job; a function of a module, with arguments that can be pickled. An error that it
@@ -36,27 +41,58 @@ def run_jobs(
             if stopped():
                 return
         return
+    with _submitted(work, jobs, workers) as submitted:
+        futures = dict(zip(submitted, jobs, strict=True))
+        for future in as_completed(futures):
+            if future.cancelled():
+                continue
+            try:
+                yield future.result()
+            except BrokenProcessPool:
+                yield failed(futures[future], f"its {_KILLED}")
+            if stopped():
+                for other in futures:
+                    other.cancel()
+
+
+def run_in_order(work: Callable[[JobT], ResultT], jobs: Sequence[JobT], workers: int) -> Iterator[ResultT]:
+    """Do jobs, and yield their results in the order of the jobs.
+
+    Args:
+        work: see `run_jobs`.
+        jobs: the jobs.
+        workers: number of processes; 1 works in this process.
+
+    Raises:
+        EdgeposeError: a process was killed.
+    """
+    if workers == 1 or len(jobs) < 2:
+        yield from map(work, jobs)
+        return
+    with _submitted(work, jobs, workers) as futures:
+        try:
+            for future in futures:
+                yield future.result()
+        except BrokenProcessPool as error:
+            raise EdgeposeError(f"a {_KILLED}") from error
+
+
+@contextmanager
+def _submitted(
+    work: Callable[[JobT], ResultT], jobs: Sequence[JobT], workers: int
+) -> Iterator[list[Future[ResultT]]]:
+    """Submit jobs to processes of their own; on leaving, finish those in progress and cancel the others."""
     # Forking a process with threads may hang; spawned processes behave alike on every system.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(workers, len(jobs)), context, _ignore_interrupts) as pool:
         # Worker processes inherit this, and so ignore Ctrl-C from the start.
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)
         try:
-            futures: dict[Future[ResultT], JobT] = {pool.submit(work, job): job for job in jobs}
+            futures = [pool.submit(work, job) for job in jobs]
         finally:
             signal.signal(signal.SIGINT, before)
         try:
-            for future in as_completed(futures):
-                if future.cancelled():
-                    continue
-                try:
-                    yield future.result()
-                except BrokenProcessPool:
-                    reason = "its process was killed, perhaps for lack of memory; use fewer --jobs"
-                    yield failed(futures[future], reason)
-                if stopped():
-                    for other in futures:
-                        other.cancel()
+            yield futures
         finally:
             # After an interrupt, jobs in progress are finished, so that no file is left incomplete.
             pool.shutdown(cancel_futures=True)

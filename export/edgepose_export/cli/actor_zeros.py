@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack
 from functools import partial, reduce
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edgepose.cli.terminal.messages import say
 from edgepose.errors import EdgeposeError
+from edgepose.utils.jobs import run_in_order
 
 if TYPE_CHECKING:
     from edgepose_export.mocap import Mapping as JointMapping
@@ -31,16 +29,10 @@ def find_zeros(
     files = [(actor, path) for actor, paths in actors.items() for path in paths]
     read = partial(evidence_of, t_pose=t_pose, mapping=mapping)
     gathered: dict[str, list[Evidence]] = {actor: [] for actor in actors}
-    with ExitStack() as stack:
-        apply = map
-        if jobs > 1:
-            pool = stack.enter_context(ProcessPoolExecutor(jobs, mp_context=get_context("spawn")))
-            apply = partial(pool.map, chunksize=8)
-        found = apply(read, (path for _, path in files))
-        for actor, _ in progress(files, "zeroing actors"):
-            evidence = next(found)
-            if evidence is not None:
-                gathered[actor].append(evidence)
+    found = run_in_order(read, [path for _, path in files], jobs)
+    for (actor, _), evidence in zip(files, progress(found, "zeroing actors", len(files)), strict=True):
+        if evidence is not None:
+            gathered[actor].append(evidence)
     zeros = {actor: find_zero(total(parts)) for actor, parts in gathered.items() if parts}
     unknown = sorted(actor for actor, zero in zeros.items() if zero.evidence == "none")
     if unknown:

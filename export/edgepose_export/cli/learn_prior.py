@@ -55,7 +55,7 @@ def learn_prior(inputs: tuple[Path, ...], out: Path, about: str, overwrite: bool
     known = {path: take_info(path.absolute().with_suffix("")) for path in found}
     files = [path for path, info in known.items() if info.part == "train"]
     poses, sources = [np.empty((0, 24, 3))], set()
-    for path in progress(files, "reading"):
+    for path in progress(files, "reading", len(files)):
         try:
             motion = read_motion(path)
             problem = fault(motion)

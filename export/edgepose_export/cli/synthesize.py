@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack
-from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,6 +12,7 @@ from edgepose.cli.options.float_range import FloatRange
 from edgepose.cli.options.outputs import overwrite_option
 from edgepose.cli.terminal.messages import say
 from edgepose.errors import EdgeposeError
+from edgepose.utils.jobs import run_jobs
 from edgepose.utils.output_targets import check_free
 from edgepose_export.cli.journal import Journal
 from edgepose_export.cli.recording_jobs import (
@@ -233,23 +230,21 @@ def _convert_all(
     from edgepose_export.cli.progress import progress
 
     failed = 0
-    with ExitStack() as stack:
-        if jobs == 1:
-            results = [partial(convert, *task) for task in tasks]
-        else:
-            # Spawned, because a forked copy of a process with threads may hang.
-            pool = stack.enter_context(ProcessPoolExecutor(jobs, mp_context=get_context("spawn")))
-            results = [pool.submit(convert, *task).result for task in tasks]
-        for result, task in progress(list(zip(results, tasks, strict=True)), "synthesizing"):
-            problem = result()
-            if problem:
-                failed += 1
-                say(f"skipped: {problem}")
-            elif journal:
-                journal.add(file_name(*task))
+    results = run_jobs(_convert, tasks, jobs, lambda task, reason: (task, f"{task[0]}: {reason}"))
+    for task, problem in progress(results, "synthesizing", len(tasks)):
+        if problem:
+            failed += 1
+            say(f"skipped: {problem}")
+        elif journal:
+            journal.add(file_name(*task))
     say(f"{files - failed} of {files} recordings written to {out}")
     if failed:
         raise NotAllConvertedError(failed, files)
+
+
+def _convert(task: tuple[Path, Job]) -> tuple[tuple[Path, Job], str | None]:
+    """Return a task, and what was wrong with its file."""
+    return task, convert(*task)
 
 
 class NotAllConvertedError(EdgeposeError):
