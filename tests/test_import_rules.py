@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -23,7 +24,7 @@ STATIONS = {"sources", "orientation", "calibration", "inference", "place", "sink
 def modules(package: Path) -> Iterator[tuple[str, ast.Module]]:
     for path in sorted(package.rglob("*.py")):
         yield (
-            ".".join(path.relative_to(ROOT).with_suffix("").parts),
+            ".".join(path.relative_to(package.parent).with_suffix("").parts),
             ast.parse(path.read_text(encoding="utf-8")),
         )
 
@@ -35,6 +36,19 @@ def imports(tree: ast.Module) -> Iterator[str]:
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def imported_at_once(node: ast.AST) -> Iterator[str]:
+    """Modules and names that are imported while the module itself is."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.Import | ast.ImportFrom):
+            yield from imports(child)
+        elif not isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef) and not is_for_types(child):
+            yield from imported_at_once(child)
+
+
+def is_for_types(node: ast.AST) -> bool:
+    return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
 
 
 def room(module: str) -> str:
@@ -79,15 +93,22 @@ def test_nothing_below_the_command_line_imports_click_or_prints():
 def test_torch_is_imported_only_where_models_are():
     for name, tree in modules(ROOT / "edgepose"):
         if room(name) not in ("inference", "benchmarks"):
-            typed = {
-                id(node)
-                for block in ast.walk(tree)
-                if isinstance(block, ast.If) and "TYPE_CHECKING" in ast.dump(block.test)
-                for node in ast.walk(block)
-            }
+            typed = {id(node) for block in ast.walk(tree) if is_for_types(block) for node in ast.walk(block)}
             for node in ast.walk(tree):
                 if isinstance(node, ast.Import) and id(node) not in typed:
                     assert not [alias for alias in node.names if alias.name.split(".")[0] == "torch"], name
+
+
+def test_modules_can_be_imported_in_any_order():
+    packages = (ROOT / "edgepose", ROOT / "firmware_protocols", ROOT / "export" / "edgepose_export")
+    trees = {name.removesuffix(".__init__"): tree for package in packages for name, tree in modules(package)}
+    needs = {
+        name: {target if target in trees else target.rpartition(".")[0] for target in imported_at_once(tree)}
+        & (trees.keys() - {name})
+        for name, tree in trees.items()
+    }
+    assert any(needs.values())
+    TopologicalSorter(needs).prepare()  # raises CycleError
 
 
 def test_the_top_of_the_package_is_small():

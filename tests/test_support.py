@@ -8,8 +8,6 @@ import sys
 
 from tests.support import processes
 
-MODULES = "import sys; print(*sorted(name for name in sys.modules if name.startswith('edgepose')))"
-
 
 def both(*words: str, **options: object) -> list[tuple[int, str, str]]:
     """Exit code, output and messages of a new process, and of a forked one."""
@@ -27,12 +25,6 @@ def test_words_codes_and_streams_are_the_same(tmp_path):
     for words in (("--version",), ("models",), ("no-such-command",), ("convert", "-", "--to", "csv")):
         new, forked = both("-m", "edgepose", *words, input="", cwd=tmp_path)
         assert new == forked
-
-
-def test_it_begins_without_a_module_of_edgepose(tmp_path):
-    (tmp_path / "modules.py").write_text(MODULES)
-    new, forked = both(str(tmp_path / "modules.py"))
-    assert new == forked == (0, "\n", "")
 
 
 def test_it_can_be_killed():

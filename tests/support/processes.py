@@ -27,7 +27,7 @@ _OWN_PYTHON = ("LANG", "LC_", "LD_", "MKL_", "OMP_", "PYTHON")
 
 
 class Popen(subprocess.Popen):
-    """`subprocess.Popen`, but modules and scripts are forked from a Python that has imported PyTorch.
+    """`subprocess.Popen`, but modules and scripts are forked from a warm Python, see `warm_python`.
 
     Started as always: `-c` and `-X`, other variables of the interpreter, a `preexec_fn` that pickle refuses.
     """

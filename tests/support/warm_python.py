@@ -1,7 +1,8 @@
-"""A Python that has imported the libraries of edgepose, and forks a process for each command of the tests.
+"""A Python that has imported edgepose and its libraries, and forks a process for each command of the tests.
 
-Importing PyTorch takes longer than most tests. A forked process has it already. It imports all modules of
-edgepose as a new one does, with its own arguments, folder, environment, standard streams and session.
+Importing PyTorch takes longer than most tests, and edgepose's own modules longer than most commands. A forked
+process has them already. It has its own arguments, folder, environment, standard streams and session.
+`test_import_rules.py` proves that modules can be imported in any order.
 """
 
 from __future__ import annotations
@@ -12,17 +13,36 @@ import importlib
 import json
 import os
 import pickle
+import pkgutil
 import runpy
 import socket
 import sys
 import threading
+import weakref
 from pathlib import Path
 from typing import Any
 
 LIBRARIES = (
-    *("can", "click", "filterpy.kalman", "multiprocessing.pool", "numpy"),
-    *("scipy.linalg", "scipy.signal", "scipy.spatial", "serial", "torch"),
+    *("can", "click", "concurrent.futures.process", "filterpy.kalman", "matplotlib.backends.backend_agg"),
+    *("matplotlib.figure", "multiprocessing.pool", "numpy", "scipy.linalg", "scipy.optimize", "scipy.signal"),
+    *("scipy.spatial", "serial", "torch"),
 )
+PACKAGES = ("edgepose", "edgepose_export", "firmware_protocols")
+
+
+def warm_up() -> None:
+    """Import all modules that commands need; a command does not free their objects at its end."""
+    for library in LIBRARIES:
+        importlib.import_module(library)
+    for package in PACKAGES:
+        folders = importlib.import_module(package).__path__
+        for module in pkgutil.walk_packages(folders, f"{package}."):
+            if not module.name.endswith("__main__"):
+                importlib.import_module(module.name)
+    for finalizer in list(weakref.finalize._registry):
+        finalizer.atexit = False
+    gc.collect()
+    gc.freeze()
 
 
 def serve(channel: socket.socket) -> dict[str, Any]:
@@ -115,8 +135,5 @@ def _stream(file: int, *mode: Any, **text: Any) -> Any:
 
 
 if __name__ == "__main__":
-    for library in LIBRARIES:
-        importlib.import_module(library)
-    gc.collect()
-    gc.freeze()
+    warm_up()
     become(serve(socket.socket(fileno=int(sys.argv[1]))))
