@@ -34,13 +34,13 @@ WAYS_M = (3.0, 7.0)
 
 
 def place_errors(found: Array, true: Array) -> dict[str, Array]:
-    """Return errors of a path (T, 3): in % of the way, after 10 s, and of the height since the start."""
+    """Return errors of a path (T, 3): in % of the distance, after 10 s, and of the height since the start."""
     steps = np.linalg.norm(np.diff(true[:, [0, 2]], axis=0), axis=1)
-    way, error = np.concatenate([[0.0], np.cumsum(steps)]), found - true
+    distance, error = np.concatenate([[0.0], np.cumsum(steps)]), found - true
     columns = {}
     for length in WAYS_M:
-        ends = np.searchsorted(way, way + length)
-        starts = np.flatnonzero(ends < len(way))[::10]
+        ends = np.searchsorted(distance, distance + length)
+        starts = np.flatnonzero(ends < len(distance))[::10]
         moved = (error[ends[starts]] - error[starts])[:, [0, 2]]
         columns[f"% of {length:g} m"] = 100.0 * np.linalg.norm(moved, axis=1) / length
     frames = round(10.0 * RATE)
@@ -99,11 +99,11 @@ def real() -> None:
         parts = {**about.parts, **({"walk": wearers.STRAIGHT_WALK} if name == "sitter" else {})}
         for part, (start, end) in parts.items():
             inside = path[(measured.time_s >= start) & (measured.time_s < end)]
-            way = np.linalg.norm((inside[-1] - inside[0])[[0, 2]])
+            moved_m = np.linalg.norm((inside[-1] - inside[0])[[0, 2]])
             heights = (
                 f"{inside[:, 1].mean():.3f} m high, from {inside[:, 1].min():.3f} to {inside[:, 1].max():.3f}"
             )
-            print(f"{name}, {part}: pelvis {heights}; {way:.2f} m away from the start of this part")
+            print(f"{name}, {part}: pelvis {heights}; {moved_m:.2f} m away from the start of this part")
 
 
 def _real_measurements(file: str, about: Any) -> Measurements:

@@ -74,13 +74,13 @@ def walks(motion: Motion) -> Iterator[Motion]:
     edge = round(EDGE_S * motion.rate)
     for (a, b), (c, d) in pairwise(stands):
         first, last = max((a + b) // 2, b - edge), min((c + d) // 2, c + edge)
-        way = motion.translation[c] - motion.translation[b]
+        displacement = motion.translation[c] - motion.translation[b]
         facing = [np.arctan2(*motion.rotations[k, 0, [0, 2], 2]) for k in (first, last)]
-        ahead = np.arctan2(way[0], way[2])
+        ahead = np.arctan2(displacement[0], displacement[2])
         angles = np.array([facing[1] - facing[0], ahead - facing[0], ahead - facing[1]])
         turn, *aside = np.degrees(np.abs(np.angle(np.exp(1j * angles))))
         if (
-            np.hypot(way[0], way[2]) > SHORTEST_M
+            np.hypot(displacement[0], displacement[2]) > SHORTEST_M
             and c - b < LONGEST_S * motion.rate
             and turn < MOST_TURN_DEG
             and max(aside) < MOST_ASIDE_DEG

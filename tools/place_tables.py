@@ -20,7 +20,7 @@ from edgepose.inference import archive
 from edgepose_export.evaluation import plots
 from edgepose_export.evaluation.evaluate import takes_of
 from edgepose_export.evaluation.paths import BOTH, KINDS, measured, summarise
-from edgepose_export.evaluation.paths import Path as Way
+from edgepose_export.evaluation.paths import Path as Walked
 from edgepose_export.evaluation.real_paths import Models, cells, real_paths, sitter_row, walker_row
 from edgepose_export.evaluation.real_wearers import FOLDER
 from edgepose_export.training.dataset import parts_of
@@ -90,23 +90,23 @@ def main() -> None:
     folders = {part: folder for folder in given.data for part in set(parts_of(folder).values())}
     accuracy = [["part", "model", "row", *COLUMNS]]
     kinds = [["model", *KINDS]]
-    drawn: dict[str, list[Way]] = {}
+    drawn: dict[str, list[Walked]] = {}
     for model, (module, metadata) in models.items():
         paths = {
             part: list(measured(module, metadata, takes_of(folders[part], part)))
             for part in HELD_OUT
             if part in folders
         }
-        paths["sports"] = [way for part in GROUPS["sports"] for way in paths.get(part, [])]
-        for part, ways in paths.items():
-            table = summarise(way.errors for way in ways)
+        paths["sports"] = [path for part in GROUPS["sports"] for path in paths.get(part, [])]
+        for part, walked in paths.items():
+            table = summarise(path.errors for path in walked)
             accuracy += rows_of(part, f"`{model}`", table, list(table))
-        everything = [way for part in HELD_OUT for way in paths.get(part, [])]
-        means = summarise({BOTH: way.kinds} for way in everything)[BOTH]
+        everything = [path for part in HELD_OUT for path in paths.get(part, [])]
+        means = summarise({BOTH: path.kinds} for path in everything)[BOTH]
         found = [means.get(kind) for kind in KINDS]
         kinds.append([f"`{model}`", *(f"{m.mean:.1f} ({m.frames})" if m else "-" for m in found)])
         drawn = drawn or {
-            part: sorted(paths[part], key=lambda way: -len(way.true))[:4] for part in DRAWN if part in paths
+            part: sorted(paths[part], key=lambda path: -len(path.true))[:4] for part in DRAWN if part in paths
         }
     plots.path_plot(IMAGES / "paths.png", drawn, BOTH)
     tables |= {"accuracy": page_table(accuracy), "kinds": page_table(kinds)}

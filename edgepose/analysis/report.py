@@ -26,7 +26,7 @@ from edgepose.analysis.joint_angles import (
     joint_angles,
     walking_bouts,
 )
-from edgepose.analysis.way import draw_way, seen_from_above, way_of
+from edgepose.analysis.path import draw_path, path_of, seen_from_above
 from edgepose.calibration.slip import Slip, SlipMonitor
 from edgepose.placements import BONES
 from edgepose.pose import PoseSequence, held_sensors, known_sensors, longest_holds
@@ -84,7 +84,7 @@ def write_report(
         _image(_strip(poses, times, body), "Figures at instants of the recording"),
         "<h2>Steps</h2>",
         *_steps(bouts, times, poses),
-        *_way(poses, bouts, body),
+        *_path(poses, bouts, body),
         "<h2>Angles over time</h2>",
         _image(_plots(times, angles, held, bouts), "Joint angles over time"),
         "<p class='note'>Light: left, dark: right. Grey: walking. Dotted, on hatching: not measured, because "
@@ -244,18 +244,18 @@ def _steps(bouts: Sequence[WalkingBout], times: Array, poses: PoseSequence) -> l
     return [_table(("walking", ""), rows)]
 
 
-def _way(poses: PoseSequence, bouts: Sequence[WalkingBout], body: Body) -> list[str]:
-    """Tabulate and draw the way; empty if the translation is unknown."""
+def _path(poses: PoseSequence, bouts: Sequence[WalkingBout], body: Body) -> list[str]:
+    """Tabulate and draw the path; empty if the translation is unknown."""
     if poses.translation is None:
         return []
-    way = way_of(poses.translation, poses.rate)
-    walking = [way.speed[bout.frames[0] : bout.frames[-1] + 1] for bout in bouts]
+    path = path_of(poses.translation, poses.rate)
+    walking = [path.speed[bout.frames[0] : bout.frames[-1] + 1] for bout in bouts]
     low, high = poses.translation[:, 1].min(), poses.translation[:, 1].max()
     rows = [
-        ("length", f"{way.length_m:.1f} m"),
-        ("from start to end", f"{way.apart_m:.1f} m"),
+        ("length", f"{path.distance_m:.1f} m"),
+        ("from start to end", f"{path.apart_m:.1f} m"),
         *([("speed of walking", f"{np.concatenate(walking).mean():.2f} m/s")] if bouts else []),
-        ("highest speed", f"{way.speed.max():.2f} m/s"),
+        ("highest speed", f"{path.speed.max():.2f} m/s"),
         ("height of the pelvis", f"{low:.2f} to {high:.2f} m"),
     ]
     note = (
@@ -263,9 +263,9 @@ def _way(poses: PoseSequence, bouts: Sequence[WalkingBout], body: Body) -> list[
         "not count for the length."
     )
     return [
-        "<h2>Way</h2>",
-        _table(("way of the pelvis", ""), rows),
-        _image(draw_way(poses, body), "Path seen from above"),
+        "<h2>Path</h2>",
+        _table(("path of the pelvis", ""), rows),
+        _image(draw_path(poses, body), "Path seen from above"),
         f"<p class='note'>{note}</p>",
     ]
 

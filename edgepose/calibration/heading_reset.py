@@ -38,7 +38,7 @@ class HeadingReset(NamedTuple):
         offset: (N,) rotation about Z from each sensor's inertial frame to the common one, rad, -pi to pi.
         error_deg: (N,) uncertainty of each, degrees. Side by side, mounting and pose: the remaining tilt,
             which no rotation about Z can remove. Motion: RMS spread of the directions of its movements.
-            Steps: estimated from the ways.
+            Steps: estimated from the displacements.
         warnings: one line each, naming the sensor.
         names: of the sensors.
     """

@@ -24,7 +24,8 @@ TURN_LIMIT_DEG = 20.0
 POSE_LIMIT_DEG = 25.0
 
 _LEGS = [PLACEMENTS.index(name) for name in ("left_lower_leg", "right_lower_leg")]
-_WAY_ERROR_DEG, _LEAN_ERROR_DEG = 3.0, 6.0  # of the best ways, and of the plane in which a lower leg swings
+# Errors of the best displacements, and of the plane in which a lower leg swings.
+_DIRECTION_ERROR_DEG, _LEAN_ERROR_DEG = 3.0, 6.0
 
 
 def headings_from_steps(moving: Hold, upright: Array, must_stop: bool = True) -> HeadingReset:
@@ -37,7 +38,7 @@ def headings_from_steps(moving: Hold, upright: Array, must_stop: bool = True) ->
 
     Raises:
         WeakMotionError: no stand before or after the steps, too short a way, a turn, backward steps,
-            another pose at the end, or sensors whose ways differ.
+            another pose at the end, or sensors whose displacements differ.
         CalibrationError: a sensor measures no acceleration, or lost samples.
     """
     check_reported(moving)
@@ -48,7 +49,7 @@ def headings_from_steps(moving: Hold, upright: Array, must_stop: bool = True) ->
     if uncertain := over(reset.error_deg, ERROR_LIMIT_DEG):
         lengths = ", ".join(f"{length:.1f}" for length in walk.lengths_m)
         raise WeakMotionError(
-            f"no heading from these steps: the way of {uncertain} does not fit the others "
+            f"no heading from these steps: the displacement of {uncertain} does not fit the others "
             f"(in m: {lengths}); {ADVICE}"
         )
     return reset
@@ -73,15 +74,15 @@ def _check_end(end: Hold, upright: Array) -> None:
 
 
 def _headings(walk: Walk, moving: Hold, upright: Array) -> HeadingReset:
-    """Return the headings in which the ways are forward, for the lower legs also their leaning.
+    """Return the headings in which the displacements are forward, for the lower legs also their leaning.
 
     Raises:
         WeakMotionError: the wearer walked backwards.
     """
-    forward = np.exp(1j * np.arctan2(walk.ways[:, 1], walk.ways[:, 0]))
-    # Without errors, all ways would be level and of one length. The error across cannot be seen.
-    wrong_m = np.hypot(walk.lengths_m - walk.length_m, walk.ways[:, 2]) / np.sqrt(2.0)
-    error_deg = np.hypot(np.degrees(np.arctan2(wrong_m, walk.length_m)), _WAY_ERROR_DEG)
+    forward = np.exp(1j * np.arctan2(walk.displacements[:, 1], walk.displacements[:, 0]))
+    # Without errors, all displacements would be level and of one length. The error across cannot be seen.
+    wrong_m = np.hypot(walk.lengths_m - walk.length_m, walk.displacements[:, 2]) / np.sqrt(2.0)
+    error_deg = np.hypot(np.degrees(np.arctan2(wrong_m, walk.length_m)), _DIRECTION_ERROR_DEG)
     surplus = 0.0
     for i in _LEGS:
         direction, spread_deg, one_way = main_direction(leans(moving[i].quat, upright[i]))
@@ -95,7 +96,7 @@ def _headings(walk: Walk, moving: Hold, upright: Array) -> HeadingReset:
     if surplus < 0.0:  # heels rise behind
         raise WeakMotionError(f"no heading from these steps: the wearer walked backwards; {ADVICE}")
     warnings = [
-        f"the heading of {name} is only known to {error:.0f} deg: its way differs from the others'"
+        f"the heading of {name} is only known to {error:.0f} deg: its displacement differs from the others'"
         for name, error in zip(PLACEMENTS, error_deg, strict=True)
         if ERROR_WARNING_DEG < error <= ERROR_LIMIT_DEG
     ]

@@ -1,4 +1,4 @@
-"""Ways of sensors during a walk, from their accelerations integrated twice between two stands."""
+"""Displacements of sensors during a walk, from their accelerations integrated twice between two stands."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LONGEST_S, LONGEST_OPEN_S = 10.0, 4.5
 """Longest walk from stand to stand, and longest used part of one without a stop; errors grow with time."""
 
 SHORTEST_M = 0.4
-"""Shortest way that counts, metres."""
+"""Shortest distance that counts, metres."""
 
 ADVICE = "let the arms hang, take two or three calm steps straight ahead, and stand still as before"
 
@@ -40,35 +40,35 @@ class Walk(NamedTuple):
         start_s: its start, on the clock of the samples, seconds.
         end_s: its end.
         stops: whether the wearer stands still after it.
-        ways: (6, 3) way of each sensor in its own inertial frame, metres; without a stop, its mean over the
-            last stride.
+        displacements: (6, 3) displacement of each sensor in its own inertial frame, metres; without a stop,
+            its mean over the last stride.
     """
 
     start_s: float
     end_s: float
     stops: bool
-    ways: Array
+    displacements: Array
 
     @property
     def lengths_m(self) -> Array:
-        """Lengths (6,) of the level ways, metres."""
-        return np.linalg.norm(self.ways[:, :2], axis=1)
+        """Level distances (6,), metres."""
+        return np.linalg.norm(self.displacements[:, :2], axis=1)
 
     @property
     def length_m(self) -> float:
-        """Length of the level way of most sensors, metres."""
+        """Level distance of most sensors, metres."""
         return float(np.median(self.lengths_m))
 
 
 def find_walk(moving: Hold, must_stop: bool) -> Walk:
-    """Return the longest way from stand to stand; without one, that of the first seconds after a stand.
+    """Return the longest walk from stand to stand; without one, that of the first seconds after a stand.
 
     Args:
         moving: samples with orientation of a wearer who stands, walks and stands.
         must_stop: refuse a walk without a stand after it.
 
     Raises:
-        WeakMotionError: there is no stand before the walk, or none after it, or the way is too short.
+        WeakMotionError: there is no stand before the walk, or none after it, or the walk is too short.
         CalibrationError: a sensor measures no acceleration, or lost samples.
     """
     sensors = [_complete(sensor) for sensor in moving]
@@ -92,7 +92,9 @@ def find_walk(moving: Hold, must_stop: bool) -> Walk:
     if opened and opened[0] not in [start for start, _ in closed]:
         raise WeakMotionError(f"the wearer did not stand still after the steps; {ADVICE}")
     length_m = 0.0 if longest is None else longest.length_m
-    raise WeakMotionError(f"no heading from these steps: the way of {length_m:.1f} m is too short; {ADVICE}")
+    raise WeakMotionError(
+        f"no heading from these steps: the distance of {length_m:.1f} m is too short; {ADVICE}"
+    )
 
 
 def _complete(sensor: SensorHold) -> SensorHold:
@@ -130,8 +132,8 @@ def _walk(sensors: Hold, start_s: float, end_s: float, stops: bool) -> Walk:
         raise CalibrationError(
             f"silent during the steps: {', '.join(lossy)}; check power and link, and repeat"
         )
-    ways = [_way(sensor, start_s, end_s, stops) for sensor in sensors]
-    return Walk(start_s, end_s, stops, np.array(ways))
+    displacements = [_displacement(sensor, start_s, end_s, stops) for sensor in sensors]
+    return Walk(start_s, end_s, stops, np.array(displacements))
 
 
 def _longest_gap(time_s: Array, start_s: float, end_s: float) -> float:
@@ -141,8 +143,8 @@ def _longest_gap(time_s: Array, start_s: float, end_s: float) -> float:
     return float(np.diff(time_s[begin:end]).max(initial=0.0))
 
 
-def _way(sensor: SensorHold, start_s: float, end_s: float, stops: bool) -> Array:
-    """Return the way (3,) of one sensor in its inertial frame, metres."""
+def _displacement(sensor: SensorHold, start_s: float, end_s: float, stops: bool) -> Array:
+    """Return the displacement (3,) of one sensor in its inertial frame, metres."""
     time_s = sensor.time_s
     force = rot.quat_rotate(sensor.quat, sensor.acc)
     rows = (time_s >= start_s) & (time_s <= end_s)
@@ -154,8 +156,8 @@ def _way(sensor: SensorHold, start_s: float, end_s: float, stops: bool) -> Array
     velocity = _integral(force[rows] - before - share * (after - before), t)
     if stops:
         velocity -= share * velocity[-1]
-    way = _integral(velocity, t)
-    return np.asarray(way[-1] if stops else way[t > t[-1] - _STRIDE_S].mean(axis=0))
+    position = _integral(velocity, t)
+    return np.asarray(position[-1] if stops else position[t > t[-1] - _STRIDE_S].mean(axis=0))
 
 
 def _integral(rows: Array, t: Array) -> Array:

@@ -1,4 +1,4 @@
-"""The place of one wearer in a run: added to each pose, reset on request, and summed to the way walked."""
+"""The place of one wearer in a run: added to each pose, reset on request; and the distance walked."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from math import inf
 
 from edgepose.inference.engine import EngineOutput
-from edgepose.place import Place, PlaceTracker, Way
+from edgepose.place import DistanceWalked, Place, PlaceTracker
 from edgepose.pose import PoseFrame
 from edgepose.skeleton import Body
 
@@ -41,19 +41,19 @@ class PlaceStage:
         self._lower_body = LOWER_BODY.difference(without)
         self._reset_at_s = inf
         self._place: Place | None = None
-        self._way = Way()
+        self._distance = DistanceWalked()
 
     @property
-    def way_m(self) -> float:
-        """Way walked so far, metres, see `Way`."""
-        return self._way.length_m
+    def distance_m(self) -> float:
+        """Distance walked so far, metres, see `DistanceWalked`."""
+        return self._distance.distance_m
 
     def add_to(self, pose: PoseFrame, output: EngineOutput) -> PoseFrame:
         """Return a pose with translation and contacts, given the network's output for it."""
         self._reset_if_due(pose.time_s)
         if self._place is None or not pose.held >= self._lower_body:
             self._place = self._tracker.update(pose.time_s, pose.rotations, output.place)
-            self._way.add(self._place.translation)
+            self._distance.add(self._place.translation)
         return pose._replace(translation=self._place.translation, contacts=self._place.contacts)
 
     def _reset_if_due(self, time_s: float) -> None:
@@ -61,5 +61,5 @@ class PlaceStage:
         if time_s >= self._reset_at_s:
             self._reset_at_s, self._place = inf, None
             self._tracker.reset()
-            self._way.interrupt()
+            self._distance.interrupt()
             self._notify("place reset: the wearer is back at the origin, on the ground")

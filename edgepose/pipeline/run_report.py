@@ -113,8 +113,8 @@ class RunReport:
             lines.append(f"held     {named}")
         for slip in summary.slips:
             lines.append(f"slipped  {slip.placement} by about {slip.angle_deg:.0f} deg")
-        if summary.way_m is not None:
-            lines.append(f"way      {summary.way_m:.1f} m walked")
+        if summary.distance_m is not None:
+            lines.append(f"distance {summary.distance_m:.1f} m walked")
         if summary.corrections_deg is not None and any(summary.corrections_deg):
             angles = zip(PLACEMENTS, summary.corrections_deg, strict=True)
             # Those of sensors that the rig lacks are 0.
@@ -149,7 +149,7 @@ class RunReport:
             "skipped": self.skipped,
             "restarts": self.restarts,
             "slips": [{"placement": slip.placement, "angle_deg": slip.angle_deg} for slip in summary.slips],
-            "way_m": summary.way_m,
+            "way_m": summary.distance_m,
             "corrections_deg": None
             if summary.corrections_deg is None
             else dict(zip(PLACEMENTS, summary.corrections_deg, strict=True)),

@@ -54,7 +54,7 @@ class RunSummary:
         latency_s: time from the arrival of the newest packet here until the newest pose was sent, seconds.
         latencies_s: latencies of the newest LATENCIES poses, in no order, seconds.
         slips: sensors that have turned on their limbs, as far as found.
-        way_m: way walked, metres, see `PlaceStage`; None if the place is not followed.
+        distance_m: distance walked, metres, see `PlaceStage`; None if the place is not followed.
         corrections_deg: angles by which headings are turned back at present, degrees, in the order of
             PLACEMENTS; None if drift is not corrected.
         error: the error that ended the run early, if any.
@@ -69,7 +69,7 @@ class RunSummary:
     latency_s: float = 0.0
     latencies_s: array[float] = field(default_factory=lambda: array("f"), repr=False)
     slips: list[Slip] = field(default_factory=list)
-    way_m: float | None = None
+    distance_m: float | None = None
     corrections_deg: list[float] | None = None
     error: EdgeposeError | None = None
 
@@ -214,7 +214,7 @@ class WearerPipeline:
                 pose = self._added.correct(pose, frame.added)
             if self._place is not None:
                 pose = self._place.add_to(pose, output)
-                summary.way_m = self._place.way_m
+                summary.distance_m = self._place.distance_m
             self._writer.write(pose, age_s)
             summary.warming_up += output.warming_up
             if pose.held:

@@ -54,7 +54,7 @@ def folder(arrays, tmp_path_factory):
 # --- measures -----------------------------------------------------------------------------------------------
 
 
-def straight_way(speed):
+def straight_path(speed):
     """12 s along T's Z axis; the feet stand in turn, for half a second each."""
     t = np.arange(FRAMES) / 60.0
     true = np.stack([0 * t, 0.9 + 0 * t, speed * t], axis=1)
@@ -66,15 +66,15 @@ def straight_way(speed):
 
 
 def test_the_true_path_has_no_error_and_standing_feet_do_not_slide():
-    true, feet, planted = straight_way(1.0)
+    true, feet, planted = straight_path(1.0)
     row = errors(true, true, feet, planted)
     assert all(abs(values).max() < 1e-6 for values in row.values())
     shifted = errors(true + np.array([3.0, -1.0, 2.0]), true, feet, planted)
     assert all(abs(values).max() < 1e-6 for values in shifted.values())
 
 
-def test_errors_are_those_of_the_way():
-    true, feet, planted = straight_way(1.0)
+def test_errors_are_those_of_the_path():
+    true, feet, planted = straight_path(1.0)
     row = errors(true * [1.0, 1.0, 1.1], true, feet, planted)
     assert row["2 s"] == pytest.approx(20.0)
     assert row["10 s"] == pytest.approx(100.0)
@@ -85,14 +85,14 @@ def test_errors_are_those_of_the_way():
 
 
 def test_a_path_that_rises_has_an_error_of_height():
-    true, feet, planted = straight_way(1.0)
+    true, feet, planted = straight_path(1.0)
     row = errors(true + np.linspace(0.0, [0.0, 0.12, 0.0], FRAMES), true, feet, planted)
     assert row["at end"] == pytest.approx([11.0], abs=0.1)
     assert row["height"].mean() == pytest.approx(5.5, abs=0.1)
 
 
-def test_short_paths_have_no_long_ways():
-    true, feet, planted = straight_way(0.2)
+def test_short_paths_have_no_long_distances():
+    true, feet, planted = straight_path(0.2)
     row = errors(true, true, feet, planted)
     assert len(row["3 m"]) == 0 < len(row["1 m"])
 

@@ -20,7 +20,7 @@ _R_IT = cal.body_from_inertial(np.zeros((6, 4)), "heading:0").T
 
 def walker(
     *,
-    way_m: float = 1.4,
+    distance_m: float = 1.4,
     turn_deg: float = 0.0,
     stand_s: tuple[float, float] = (2.0, 2.0),
     drift: float = 0.0,
@@ -29,10 +29,10 @@ def walker(
     """Return the samples of six sensors of a wearer who faces X of the common frame.
 
     Args:
-        way_m: way straight ahead, metres; negative if the wearer walks backwards.
+        distance_m: distance straight ahead, metres; negative if the wearer walks backwards.
         turn_deg: turn to the left during the walk.
         stand_s: times of standing before and after the walk, seconds.
-        drift: error of the left forearm's acceleration across the way in the walk's second half, m/s^2.
+        drift: error of the left forearm's acceleration across the walk in the walk's second half, m/s^2.
         lifted_deg: angle by which the right forearm stays lifted at the end.
     """
     before, after = stand_s
@@ -51,7 +51,7 @@ def walker(
             angle = 0.8 * np.maximum(side * swing, 0.0)
         leant = rot.rotvec_to_matrix(np.outer(angle, [1.0, 0.0, 0.0]))
         quat = rot.quat_multiply(yaw, rot.matrix_to_quat(_R_IT @ leant @ pose @ _MOUNTED[i]))
-        place = np.stack([way_m * gone + 0.2 * np.sin(angle), 0.1 * side * swing, 0.02 * swing], axis=1)
+        place = np.stack([distance_m * gone + 0.2 * np.sin(angle), 0.1 * side * swing, 0.02 * swing], axis=1)
         force = np.gradient(np.gradient(place, t, axis=0), t, axis=0)
         force[:, 2] += cal.GRAVITY
         if i == 0:

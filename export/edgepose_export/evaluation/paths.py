@@ -1,6 +1,6 @@
 """Accuracy of a wearer's path: takes with true positions, run through `edgepose.place` as in a run.
 
-Errors are distances between the true way of the pelvis and the estimated one over the same time. As `run`
+Errors are distances between the true path of the pelvis and the estimated one over the same time. As `run`
 does, everything is estimated on the default body and frame by frame.
 """
 
@@ -27,10 +27,10 @@ SECONDS = (2.0, 5.0, 10.0)
 """Times after which the error is measured."""
 
 METRES = (1.0, 3.0, 5.0, 7.0)
-"""Lengths of the ways over which the error is measured."""
+"""Distances over which the error is measured."""
 
 EVERY = 10
-"""Frames from the start of a measured time or way to the next."""
+"""Frames from the start of a measured time or distance to the next."""
 
 KIND_S = 2.0
 """Length of the parts that each have one kind of motion, seconds."""
@@ -57,7 +57,7 @@ class Path(NamedTuple):
         true: (T, 3) true positions of the pelvis, metres.
         estimates: (T, 3) estimated positions by row of the tables.
         errors: errors by row of the tables.
-        kinds: error over ways of `KIND_S`, cm, by kind of motion, see `kind_of`; only of the row `BOTH`.
+        kinds: error over times of `KIND_S`, cm, by kind of motion, see `kind_of`; only of the row `BOTH`.
     """
 
     name: str
@@ -91,8 +91,8 @@ TRUTH = "truth"
 """The row of the true path; its feet, too, roll and slide while they are in contact."""
 
 LEGEND = """\
-means; count: measured times, ways, frames, takes
-2 s, ...: error after this time, cm; 1 m, ...: error over a way this long, %
+means; count: measured times, distances, frames, takes
+2 s, ...: error after this time, cm; 1 m, ...: error over this distance, %
 height: error of the height against the first second, cm; at end: in the last
 slide: movement of a sole in a contact with the ground, cm per second of contact
 no heads: the lower foot stands still; velocity: the network's velocity alone;
@@ -140,11 +140,11 @@ def measured(
         if take.place is None or take.translation is None:
             continue
         poses, place = streamed(module, take, metadata["future"])
-        ways, true = estimates(poses, place), take.translation.astype(float)
+        paths, true = estimates(poses, place), take.translation.astype(float)
         planted = take.place[:, :2] > 0.5
-        rows = {name: errors(way, true, soles(poses), planted) for name, way in ways.items()}
+        rows = {name: errors(path, true, soles(poses), planted) for name, path in paths.items()}
         rows[TRUTH] = errors(true, true, soles(take.pose), planted)
-        yield Path(take.name, true, ways, rows, _errors_by_kind(ways[BOTH], true, take))
+        yield Path(take.name, true, paths, rows, _errors_by_kind(paths[BOTH], true, take))
 
 
 def soles(poses: Singles) -> Array:
@@ -156,23 +156,23 @@ def soles(poses: Singles) -> Array:
     return points
 
 
-def errors(way: Array, true: Array, feet: Array, planted: NDArray[np.bool_]) -> Row:
+def errors(path: Array, true: Array, feet: Array, planted: NDArray[np.bool_]) -> Row:
     """Return the errors of a path.
 
     Args:
-        way: (T, 3) estimated positions of the pelvis, metres.
+        path: (T, 3) estimated positions of the pelvis, metres.
         true: (T, 3) true ones.
         feet: (T, 2, 3) soles relative to the pelvis.
         planted: (T, 2) whether they truly are in contact with the ground.
     """
-    row = {f"{seconds:g} s": 100.0 * _after(way, true, seconds) for seconds in SECONDS}
-    row |= {f"{metres:g} m": 100.0 * _over(way, true, metres) for metres in METRES}
-    height = way[:, 1] - true[:, 1]
+    row = {f"{seconds:g} s": 100.0 * _after(path, true, seconds) for seconds in SECONDS}
+    row |= {f"{metres:g} m": 100.0 * _over(path, true, metres) for metres in METRES}
+    height = path[:, 1] - true[:, 1]
     second = round(RATE)
     height -= np.median(height[:second])
     row["height"] = 100.0 * np.abs(height)
     row["at end"] = 100.0 * np.abs(np.median(height[-second:], keepdims=True))
-    row["slide"] = 100.0 * _slides(way[:, None] + feet, planted)
+    row["slide"] = 100.0 * _slides(path[:, None] + feet, planted)
     return row
 
 
@@ -188,35 +188,35 @@ def _slides(feet: Array, planted: NDArray[np.bool_]) -> Array:
     return np.concatenate([np.empty(0), *slides])
 
 
-def _after(way: Array, true: Array, seconds: float) -> Array:
+def _after(path: Array, true: Array, seconds: float) -> Array:
     """Return the errors after a time, metres."""
     frames = round(seconds * RATE)
     start = np.arange(0, max(0, len(true) - frames), EVERY)
-    return _distance(way, true, start, start + frames)
+    return _distance(path, true, start, start + frames)
 
 
-def _over(way: Array, true: Array, metres: float) -> Array:
-    """Return the errors over ways of a length on the ground, as shares of it."""
+def _over(path: Array, true: Array, metres: float) -> Array:
+    """Return the errors over a distance on the ground, as shares of it."""
     steps = np.linalg.norm(np.diff(true[:, [0, 2]], axis=0), axis=1)
     gone = np.concatenate([[0.0], np.cumsum(steps)])
     start = np.arange(0, len(true), EVERY)
     end = np.searchsorted(gone, gone[start] + metres)
     inside = end < len(true)
-    return _distance(way, true, start[inside], end[inside]) / metres
+    return _distance(path, true, start[inside], end[inside]) / metres
 
 
-def _distance(way: Array, true: Array, start: NDArray[np.intp], end: NDArray[np.intp]) -> Array:
-    error = way - true
+def _distance(path: Array, true: Array, start: NDArray[np.intp], end: NDArray[np.intp]) -> Array:
+    error = path - true
     distance: Array = np.linalg.norm(error[end] - error[start], axis=1)
     return distance
 
 
-def _errors_by_kind(way: Array, true: Array, take: Take) -> Row:
+def _errors_by_kind(path: Array, true: Array, take: Take) -> Row:
     """Return the errors of a path after `KIND_S`, cm, by kind of motion."""
     assert take.place is not None, "takes without labels are not measured"
     frames = round(KIND_S * RATE)
     start = np.arange(0, max(0, len(true) - frames), EVERY)
-    values = 100.0 * _distance(way, true, start, start + frames)
+    values = 100.0 * _distance(path, true, start, start + frames)
     kinds = np.array([kind_of(take, slice(first, first + frames)) for first in start])
     return {kind: values[kinds == kind] for kind in KINDS if (kinds == kind).any()}
 
@@ -225,15 +225,15 @@ def kind_of(take: Take, span: slice) -> str:
     """Return the kind of motion, one of `KINDS`, in a part of a take of `KIND_S`, by its true motion."""
     assert take.place is not None, "takes without labels are not measured"
     assert take.translation is not None, "takes without labels are not measured"
-    way = np.linalg.norm(np.diff(take.translation[span][:, [0, 2]], axis=0), axis=1).sum()
+    distance = np.linalg.norm(np.diff(take.translation[span][:, [0, 2]], axis=0), axis=1).sum()
     across, _, ahead = take.place[span, len(CONTACTS) :].mean(axis=0)
     airborne = 1.0 - take.place[span, :4].max(axis=1).mean()
     heading = np.unwrap(yaw_of_matrix(take.pose[span, 0]))
-    if way > 2.0 * KIND_S:
+    if distance > 2.0 * KIND_S:
         return "running"
     if airborne > 0.15:
         return "jumping"
-    if way < 0.2 * KIND_S:
+    if distance < 0.2 * KIND_S:
         return "in place"
     if np.ptp(heading) > np.pi / 2.0:
         return "turning"

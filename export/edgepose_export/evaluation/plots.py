@@ -16,7 +16,7 @@ from edgepose.utils.durable_files import reason
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from edgepose_export.evaluation.paths import Path as Way
+    from edgepose_export.evaluation.paths import Path as Walked
     from edgepose_export.evaluation.real_paths import RealPath
     from edgepose_export.evaluation.uncertainty import Reliability
 
@@ -92,7 +92,7 @@ def reliability_plot(
     _save(figure, path, overwrite)
 
 
-def path_plot(path: Path, parts: Mapping[str, Sequence[Way]], row: str, overwrite: bool = True) -> None:
+def path_plot(path: Path, parts: Mapping[str, Sequence[Walked]], row: str, overwrite: bool = True) -> None:
     """Draw the starts of paths from above, one panel for each part: true ones in grey, estimates in colour.
 
     Args:
@@ -102,9 +102,9 @@ def path_plot(path: Path, parts: Mapping[str, Sequence[Way]], row: str, overwrit
         overwrite: whether an existing file may be replaced.
     """
     figure, axes = _panels(list(parts))
-    for ax, ways in zip(axes, parts.values(), strict=True):
-        for i, way in enumerate(ways):
-            true, estimate = (each[:PATH_FRAMES] - each[0] for each in (way.true, way.estimates[row]))
+    for ax, paths in zip(axes, parts.values(), strict=True):
+        for i, walked in enumerate(paths):
+            true, estimate = (each[:PATH_FRAMES] - each[0] for each in (walked.true, walked.estimates[row]))
             # The wearer's left is at the left of a wearer who walks up the page.
             ax.plot(-true[:, 0], true[:, 2], color="0.6", linewidth=3, label="true" if i == 0 else None)
             ax.plot(-estimate[:, 0], estimate[:, 2], linewidth=1.2, label="estimated" if i == 0 else None)

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 import edgepose
 from edgepose.analysis.joint_angles import ANGLES, LIMBS, joint_angles, walking_bouts
+from edgepose.analysis.path import path_of
 from edgepose.analysis.report import POINTS, extremes, write_report
-from edgepose.analysis.way import way_of
 from edgepose.cli import cli
 from edgepose.convert import Job, convert
 from edgepose.errors import EdgeposeError
@@ -209,26 +209,26 @@ def test_page_of_a_walk(command, tmp_path):
     assert "In 4 poses the window was filling." in page.words
 
 
-def test_the_way_there_and_back():
+def test_the_path_there_and_back():
     """At 1.2 m/s, with hips that sway by 3 cm in every stride of a second."""
     times = np.arange(0.0, 10.0, 1 / 60.0)
     forward = 1.2 * np.minimum(times, 10.0 - times)
     places = np.stack([0.03 * np.sin(2 * np.pi * times), np.full(600, 0.95), forward], axis=1)
-    way = way_of(places, 60.0)
-    assert way.length_m == pytest.approx(12.0, rel=0.03)
-    assert way.apart_m == pytest.approx(0.0, abs=0.05)
-    assert np.median(way.speed) == pytest.approx(1.2, rel=0.01)
-    assert way.speed.max() < 1.3
-    still = way_of(np.tile([3.0, 0.95, -2.0], (50, 1)), 60.0)
-    assert (still.length_m, still.apart_m, still.speed.max()) == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
+    path = path_of(places, 60.0)
+    assert path.distance_m == pytest.approx(12.0, rel=0.03)
+    assert path.apart_m == pytest.approx(0.0, abs=0.05)
+    assert np.median(path.speed) == pytest.approx(1.2, rel=0.01)
+    assert path.speed.max() < 1.3
+    still = path_of(np.tile([3.0, 0.95, -2.0], (50, 1)), 60.0)
+    assert (still.distance_m, still.apart_m, still.speed.max()) == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
     swaying = np.stack([0.05 * np.sin(times), np.full(600, 0.95), 0.05 * np.cos(3.0 * times)], axis=1)
-    assert way_of(swaying, 60.0).length_m < 0.15
-    assert way_of(places[:1], 60.0).length_m == 0.0
-    assert way_of(places[:2], 60.0).length_m == pytest.approx(0.02, rel=0.1)
+    assert path_of(swaying, 60.0).distance_m < 0.15
+    assert path_of(places[:1], 60.0).distance_m == 0.0
+    assert path_of(places[:2], 60.0).distance_m == pytest.approx(0.02, rel=0.1)
 
 
 @pytest.mark.parametrize("contacts", [False, True])
-def test_page_with_a_way(tmp_path, contacts):
+def test_page_with_a_path(tmp_path, contacts):
     """Straight to the left at 1.5 m/s, whatever the legs do."""
     local, rate = motion(WALK)
     touching = np.zeros(7, np.float32) if contacts else None

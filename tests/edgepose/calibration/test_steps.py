@@ -56,15 +56,15 @@ def test_steps_of_a_real_wearer():
 @pytest.mark.parametrize(
     ("wearer", "text"),
     [
-        ({"way_m": 0.2}, r"the way of 0\.2 m is too short; .* two or three calm steps"),
-        ({"way_m": -1.4}, "the wearer walked backwards"),
+        ({"distance_m": 0.2}, r"the distance of 0\.2 m is too short; .* two or three calm steps"),
+        ({"distance_m": -1.4}, "the wearer walked backwards"),
         ({"turn_deg": 40.0}, "the wearer turned by 40 deg"),
         ({"stand_s": (0.0, 2.0)}, "did not stand still before the steps"),
         ({"stand_s": (2.0, 0.0)}, "did not stand still after the steps"),
         ({"lifted_deg": 40.0}, r"another pose after them: right_forearm \(40 deg\)"),
         (
             {"drift": 3.0},
-            r"the way of left_forearm \(.*\) does not fit the others \(in m: .*\); let",
+            r"the displacement of left_forearm \(.*\) does not fit the others \(in m: .*\); let",
         ),
     ],
     ids=lambda value: str(value) if isinstance(value, dict) else "",
@@ -93,7 +93,7 @@ def test_rounded_times_do_not_reach_beyond_the_samples():
         SensorHold(*(column[:208] for column in s._replace(time_s=0.1 + s.time_s)[:-1]), s.name)
         for s in walker()
     ]
-    with pytest.raises(WeakMotionError, match=r"the way of 0\.0 m is too short"):
+    with pytest.raises(WeakMotionError, match=r"the distance of 0\.0 m is too short"):
         cal.headings_from_steps(moving, upright(moving))
 
 

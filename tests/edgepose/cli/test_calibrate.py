@@ -453,7 +453,7 @@ def test_headings_from_steps_in_a_recording(tmp_path: Path) -> None:
     walked = walk_file(tmp_path / "on.npz", (4.0, 0.0))
     result = run("--file", walked, *words, "--overwrite")
     assert "the wearer did not stand still after the steps: headings are less certain" in result.stderr
-    result = run("--file", walk_file(tmp_path / "back.npz", way_m=-1.4), *words, "--overwrite")
+    result = run("--file", walk_file(tmp_path / "back.npz", distance_m=-1.4), *words, "--overwrite")
     assert error_of(result).startswith("no heading from these steps: the wearer walked backwards; ")
     result = run("--file", walked, *words, "--motion", "+5:+50", "--overwrite")
     assert "choose --motion within that" in error_of(result)

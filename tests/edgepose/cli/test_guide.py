@@ -80,7 +80,10 @@ def test_steps_are_guided_and_repeated(capsys):
     upright = np.stack([sensor.quat[0] for sensor in walker()])
     with Guide() as guide:
         reset = record_steps(
-            batches_of({"way_m": 0.1}, {}), 10.0, guide, lambda moving: headings_from_steps(moving, upright)
+            batches_of({"distance_m": 0.1}, {}),
+            10.0,
+            guide,
+            lambda moving: headings_from_steps(moving, upright),
         )
     assert np.degrees(np.abs(np.angle(np.exp(1j * (reset.offset + HEADINGS))))).max() < 1.5
     lines = capsys.readouterr().out.splitlines()

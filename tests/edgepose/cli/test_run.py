@@ -202,9 +202,9 @@ def test_a_run_with_and_without_the_place(command, wearer, tmp_path):
     assert plain[0][-1] == "right_hand_std"
     assert whole[0][width] == "trans_x"
     assert [row[:width] for row in whole] == plain
-    assert "way " not in told["--no-place",]
-    (way_m,) = re.findall(r"^way      (\d+\.\d) m walked$", told[()], re.MULTILINE)
-    assert 1.0 < float(way_m) < 4.0
+    assert "distance " not in told["--no-place",]
+    (distance_m,) = re.findall(r"^distance (\d+\.\d) m walked$", told[()], re.MULTILINE)
+    assert 1.0 < float(distance_m) < 4.0
 
 
 def test_a_clock_that_began_anew_is_told(command, wearer, tmp_path):

@@ -1,4 +1,4 @@
-"""Where a wearer is during a run: the place in each pose, its reset, the way walked, and what goes wrong."""
+"""A wearer's place during a run: in each pose, its reset, the distance walked, and what goes wrong."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from edgepose.pipeline.place_stage import LOWER_BODY, PlaceStage
 from edgepose.pipeline.run import run
 from edgepose.pipeline.wearer_pipeline import RunSummary, WearerPipeline
 from edgepose.place import PlaceTracker
-from edgepose.place.way import STEP_M, Way
+from edgepose.place.distance import STEP_M, DistanceWalked
 from edgepose.placements import PLACEMENTS
 from edgepose.pose import PoseFrame
 from edgepose.rotations import quat_multiply
@@ -89,7 +89,7 @@ def test_every_pose_has_the_place_that_the_tracker_finds(follow, wearer, samples
         np.testing.assert_array_equal(pose.contacts, output.place[:7])
     travelled = np.linalg.norm(sink.translations[-1, [0, 2]])
     assert travelled > 1.2
-    assert travelled - 1e-9 <= summary.way_m < travelled + 0.2
+    assert travelled - 1e-9 <= summary.distance_m < travelled + 0.2
 
 
 def test_without_the_stage_there_is_no_place(wearer, model, samples):
@@ -97,7 +97,7 @@ def test_without_the_stage_there_is_no_place(wearer, model, samples):
     pipeline = WearerPipeline(load_calibration(wearer.calibration), 60.0, [sink])
     summary = run(pipeline, [Batch(samples[-1].time_s, samples)], model.engine())
     assert {(pose.translation, pose.contacts) for pose in sink.poses} == {(None, None)}
-    assert summary.way_m is None
+    assert summary.distance_m is None
 
 
 def test_an_archive_without_a_head_leaves_contacts_unknown(wearer, tiny, samples):
@@ -140,7 +140,7 @@ def parts(samples: list[ImuSample], size: int) -> Iterator[list[ImuSample]]:
 
 
 def test_several_wearers_have_a_place_each(wearer, tiny):
-    """Of one body and one recording, one is put back to the origin on the way."""
+    """Of one body and one recording, one is put back to the origin on the walked."""
     shape = NetworkShape("rnn", 8, "global-6d", "passed", place=True)
     asked = iter([[]] * 100 + [[0.0]])
     stages = [PlaceStage(BODY), PlaceStage(BODY, lambda: next(asked, []))]
@@ -172,7 +172,7 @@ def test_several_wearers_have_a_place_each(wearer, tiny):
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.5])
 def test_a_reset_puts_the_wearer_back_to_the_origin(follow, samples, delay_s):
-    """Of several requests the earliest counts; the way walked goes on."""
+    """Of several requests the earliest counts; the distance walked goes on."""
     said: list[str] = []
     asked = iter([[]] * 120 + [[delay_s + 0.2, delay_s], [delay_s + 0.1] if delay_s else []])
     sink, summary = follow(samples, PlaceStage(BODY, lambda: next(asked, []), said.append))
@@ -182,26 +182,26 @@ def test_a_reset_puts_the_wearer_back_to_the_origin(follow, samples, delay_s):
     assert sink.translations[at, [0, 2]].tolist() == [0.0, 0.0]
     assert np.linalg.norm(plain.translations[at, [0, 2]]) > 0.5
     assert said == ["place reset: the wearer is back at the origin, on the ground"]
-    assert abs(summary.way_m - whole.way_m) < 0.2
+    assert abs(summary.distance_m - whole.distance_m) < 0.2
 
 
-# --- the way ------------------------------------------------------------------------------------------------
+# --- the distance -------------------------------------------------------------------------------------------
 
 
-def test_the_way_is_that_of_walking_not_of_swaying():
-    way, time_s = Way(), np.arange(0, 600, 1 / 60)
+def test_the_distance_is_that_of_walking_not_of_swaying():
+    walked, time_s = DistanceWalked(), np.arange(0, 600, 1 / 60)
     sway = 0.03 * np.sin(2 * np.pi * 0.3 * time_s)
     for x in sway:
-        way.add(np.array([x, 0.9, 0.0]))
-    assert way.length_m <= 0.06
-    way = Way()
+        walked.add(np.array([x, 0.9, 0.0]))
+    assert walked.distance_m <= 0.06
+    walked = DistanceWalked()
     for s in np.arange(0, 10, 0.02):
-        way.add(np.array([0.03 * np.sin(9 * s), 0.9 + 0.03 * np.sin(18 * s), s]))
-    assert way.length_m == pytest.approx(10.0, abs=0.3)
-    way.interrupt()
-    way.add(np.array([0.0, 0.9, 0.0]))
-    way.add(np.array([0.0, 0.9, -2 * STEP_M]))
-    assert way.length_m == pytest.approx(10.0 + 2 * STEP_M, abs=0.3)
+        walked.add(np.array([0.03 * np.sin(9 * s), 0.9 + 0.03 * np.sin(18 * s), s]))
+    assert walked.distance_m == pytest.approx(10.0, abs=0.3)
+    walked.interrupt()
+    walked.add(np.array([0.0, 0.9, 0.0]))
+    walked.add(np.array([0.0, 0.9, -2 * STEP_M]))
+    assert walked.distance_m == pytest.approx(10.0 + 2 * STEP_M, abs=0.3)
 
 
 # --- faults -------------------------------------------------------------------------------------------------
@@ -297,8 +297,8 @@ def test_while_no_leg_is_measured_the_wearer_stays(follow, samples, others):
 
 
 @pytest.mark.parametrize(("height_m", "ratio"), [(1.75 * 0.9, 0.9), (1.75 * 1.1, 1.1)])
-def test_a_wrong_height_costs_its_share_of_the_way(follow, samples, height_m, ratio):
+def test_a_wrong_height_costs_its_share_of_the_distance(follow, samples, height_m, ratio):
     _, true = follow(samples, PlaceStage(BODY))
     sink, wrong = follow(samples, PlaceStage(default_body(height_m)))
-    assert wrong.way_m / true.way_m == pytest.approx(ratio, abs=0.06)
+    assert wrong.distance_m / true.distance_m == pytest.approx(ratio, abs=0.06)
     assert np.isfinite(sink.translations).all()

@@ -342,7 +342,7 @@ def test_wearers_get_the_poses_that_each_gets_alone(
         np.testing.assert_allclose(ours.rotations, theirs.rotations, atol=1e-5)
         lengths.append(len(ours.frames))
         assert f"{name}: poses    {len(ours.frames)} in " in result.stderr
-        assert re.search(rf"^{name}: way      \d+\.\d m walked$", result.stderr, re.MULTILINE)
+        assert re.search(rf"^{name}: distance \d+\.\d m walked$", result.stderr, re.MULTILINE)
     assert lengths == [180, 90, 1]
 
 

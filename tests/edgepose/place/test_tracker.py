@@ -79,7 +79,7 @@ def test_a_turn_in_place_moves_nobody():
     assert abs(path[:, 1] - 0.86).max() < 0.005
 
 
-def test_a_body_that_is_scaled_wrongly_costs_its_part_of_the_way():
+def test_a_body_that_is_scaled_wrongly_costs_its_part_of_the_distance():
     moved = walk()
     tall = follow(moved, PlaceTracker(default_body(1.1 * BODY.height_m)))
     way = (tall - tall[0])[-1, 2] / (moved.pelvis[-1] - moved.pelvis[0])[2]

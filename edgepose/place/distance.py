@@ -1,4 +1,4 @@
-"""Length of the way that a wearer walks."""
+"""The distance that a wearer has walked."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ STEP_M = 0.25
 """Least change of place that counts as walking, metres: a body that stands or sits sways by less."""
 
 
-class Way:
-    """Length of the way of a wearer: that of the polygon over the ground whose corners are `STEP_M` apart."""
+class DistanceWalked:
+    """Length of the polygon over the ground whose corners a wearer passes, each `STEP_M` from the last."""
 
     def __init__(self) -> None:
         """Start without a position."""
@@ -22,8 +22,8 @@ class Way:
         self._corner: tuple[float, float] | None = None
 
     @property
-    def length_m(self) -> float:
-        """Length so far, metres."""
+    def distance_m(self) -> float:
+        """Distance so far, metres."""
         return self._to_corner_m + self._beyond_m
 
     def add(self, position: Array) -> None:
@@ -37,4 +37,4 @@ class Way:
 
     def interrupt(self) -> None:
         """Go on from wherever the next position is."""
-        self._to_corner_m, self._beyond_m, self._corner = self.length_m, 0.0, None
+        self._to_corner_m, self._beyond_m, self._corner = self.distance_m, 0.0, None

@@ -1,4 +1,4 @@
-"""The way of a wearer through the room: distance, speed, and a picture from above."""
+"""The path of a wearer through the room: distance, speed, and a picture from above."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose.analysis.figures import INK, PREDICTION
-from edgepose.place import Way as WalkedWay
+from edgepose.place import DistanceWalked
 from edgepose.pose import CONTACTS, PoseSequence
 from edgepose.skeleton import JOINTS, Body, forward_kinematics
 
 Array = NDArray[np.float64]
 
 SMOOTH_S = 0.5
-"""Time over which positions are averaged, seconds, so that jitter is no way."""
+"""Time over which positions are averaged, seconds, so that jitter adds no distance."""
 
 TOUCHING = 0.5
 """Probability of contact above which a foot leaves a print."""
@@ -25,24 +25,24 @@ SMALLEST_M = 1.0
 """Smallest width and height of the picture, metres."""
 
 
-class Way(NamedTuple):
-    """A way over level ground.
+class Path(NamedTuple):
+    """A path over level ground.
 
     Attributes:
-        path: (T, 2) smoothed position of the pelvis, see `seen_from_above`, metres.
+        positions: (T, 2) smoothed position of the pelvis, see `seen_from_above`, metres.
         speed: (T,) metres per second.
-        length_m: length of the way walked, without sway, as a run reports it.
+        distance_m: distance walked, without sway, as a run reports it.
         apart_m: distance from its start to its end.
     """
 
-    path: Array
+    positions: Array
     speed: Array
-    length_m: float
+    distance_m: float
     apart_m: float
 
 
-def way_of(translation: Array, rate: float) -> Way:
-    """Return the way for positions of the pelvis (T, 3), metres, at `rate` Hz."""
+def path_of(translation: Array, rate: float) -> Path:
+    """Return the path for positions of the pelvis (T, 3), metres, at `rate` Hz."""
     from scipy.signal import savgol_filter
 
     path = seen_from_above(translation)
@@ -50,12 +50,12 @@ def way_of(translation: Array, rate: float) -> Way:
     if width > 2:
         path = savgol_filter(path, width, polyorder=1, axis=0)
     if len(path) < 2:
-        return Way(path, np.zeros(len(path)), 0.0, 0.0)
+        return Path(path, np.zeros(len(path)), 0.0, 0.0)
     speed = np.linalg.norm(np.gradient(path, axis=0), axis=1) * rate
-    walked = WalkedWay()
+    walked = DistanceWalked()
     for position in translation:
         walked.add(position)
-    return Way(path, speed, walked.length_m, float(np.linalg.norm(path[-1] - path[0])))
+    return Path(path, speed, walked.distance_m, float(np.linalg.norm(path[-1] - path[0])))
 
 
 def seen_from_above(positions: Array) -> Array:
@@ -63,7 +63,7 @@ def seen_from_above(positions: Array) -> Array:
     return positions[..., [2, 0]]
 
 
-def draw_way(poses: PoseSequence, body: Body) -> bytes:
+def draw_path(poses: PoseSequence, body: Body) -> bytes:
     """Draw the path of the pelvis seen from above, with the prints of the feet, as PNG.
 
     Args:
