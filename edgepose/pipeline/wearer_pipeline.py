@@ -160,17 +160,15 @@ class WearerPipeline:
         self.arrived = self._started = time.perf_counter()
         self._orient = orientation_stage(calibration) if orient is None else orient
         self._headings = HeadingRezero(calibration) if headings is None else headings
-        self._drift: DriftCorrector | None = None
-        if drift_correction and not calibration.north:
-            self._drift = DriftCorrector(POSES["straight"], PLACEMENTS, ROOT)
+        corrects = drift_correction and not calibration.north
+        self._drift = DriftCorrector(POSES["straight"], PLACEMENTS, ROOT) if corrects else None
         self._notify = notify
         self._on_pose, self._misfits, self._rig, self._warn = on_pose, misfits, rig, warn
         if misfits is not None:
             self.summary.slips = misfits.slips
         self._sinks = SinkGroup(sinks, warn)
         self._writer, self._place = PoseWriter(self._sinks, look_ahead_s, warn, resampler), place
-        self._added = AddedSensorStage(added) if added else None
-        self._without = without
+        self._added, self._without = AddedSensorStage(added) if added else None, without
         self._dropouts = DropoutMonitor(added, without)
         self._reported_unused = 0
         self._source_s = 0.0  # time on the source's clock at 0 of the clock of `arrived`
