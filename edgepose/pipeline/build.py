@@ -159,7 +159,7 @@ class OpenWearer:
             notify=self.notify if source.live else lambda text: None,
             on_pose=on_pose,
             misfits=MisfitDetector(self._calibration, self._differences),
-            rig=RigMonitor(self._calibration.names, phase, wearers),
+            rig=RigMonitor(self._calibration.names, phase, wearers if source.live else 1),
             warn=self.notify,
             look_ahead_s=future / rate if source.live else None,
             place=place,

@@ -24,6 +24,7 @@ NEVER_BELOW = (0, 1, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14)
 """Indices of the points that cannot be below the ground: all but the toes, whose joints are not measured."""
 
 _LEG_LENGTH = 0.846
+_IDENTITY = np.eye(3)
 _SKIN = {
     **dict.fromkeys(("left_ankle", "right_ankle", "left_foot", "right_foot"), 0.0),
     "pelvis": 0.09,
@@ -34,6 +35,35 @@ _SKIN = {
 }
 """Height of a point above a surface that the body touches there, metres, for legs of `_LEG_LENGTH`. As
 everywhere in edgepose, the toes' joints of a standing wearer are at height 0, so soles do not count."""
+
+
+def _path(joint: str) -> list[int]:
+    """Return a joint and the joints between it and the pelvis."""
+    path = [JOINTS.index(joint)]
+    while PARENTS[path[-1]] >= 0:
+        path.append(PARENTS[path[-1]])
+    return path[:-1]
+
+
+_CARRIERS = sorted({PARENTS[j] for name in POINTS for j in _path(name)})
+"""Joints whose rotations move a point."""
+
+
+def _ancestors() -> list[NDArray[np.intp]]:
+    """Return for each carrier, and the identity after them, the parent, its parent's parent, and so on.
+
+    Each array goes up twice as far as the one before; beyond the pelvis is the identity.
+    """
+    identity = len(_CARRIERS)
+    parents = [_CARRIERS.index(PARENTS[j]) if PARENTS[j] >= 0 else identity for j in _CARRIERS]
+    ancestors = [np.array([*parents, identity])]
+    while (further := ancestors[-1][ancestors[-1]]).min() < identity:
+        ancestors.append(further)
+    return ancestors
+
+
+_ANCESTORS = _ancestors()
+_MOVING = np.array(_CARRIERS)
 
 
 class BodyPoints:
@@ -48,52 +78,26 @@ class BodyPoints:
         """Store the lengths of a body."""
         self.scale = body.leg_length_m / _LEG_LENGTH
         self.skin: list[float] = [_SKIN[name] * self.scale for name in POINTS]
-        offsets = body.offsets.tolist()
-        carries = [name in POINTS for name in JOINTS]
-        self._steps: list[tuple[int, int, Point, Point | None]] = []
-        names: list[list[str]] = [[] for _ in JOINTS]
-        for j in range(len(JOINTS) - 1, 0, -1):  # children come before their parents
-            if carries[j]:
-                parent = PARENTS[j]
-                carries[parent] = True
-                point = self._point(JOINTS[j], offsets)
-                self._steps.append((j, parent, offsets[j], point))
-                names[parent] += [JOINTS[j]] * (point is not None) + names[j]
-        names[0].append(JOINTS[0])
-        self._order = [names[0].index(name) for name in POINTS]
-
-    @staticmethod
-    def _point(joint: str, offsets: list[Point]) -> Point | None:
-        """Return the point that stands for a joint in the frame of its parent; None if there is none."""
-        x, y, z = offsets[JOINTS.index(joint)]
-        if joint.endswith("_ankle"):  # the sole, which is not rotated by the foot
-            y += offsets[JOINTS.index(joint.replace("ankle", "foot"))][1]
-        return [x, y, z] if joint in POINTS else None
+        lengths = np.zeros((len(POINTS), len(_CARRIERS), 3))  # from joint to joint, in the frames of carriers
+        for row, name in zip(lengths, POINTS, strict=True):
+            for j in _path(name):
+                row[_CARRIERS.index(PARENTS[j])] = body.offsets[j]
+            if name.endswith("_ankle"):  # the sole, which is not rotated by the foot
+                j, foot = JOINTS.index(name), JOINTS.index(name.replace("ankle", "foot"))
+                row[_CARRIERS.index(PARENTS[j]), 1] += body.offsets[foot, 1]
+        self._lengths = lengths.reshape(len(POINTS), -1)
 
     def positions(self, rotations: Input) -> list[Point]:
         """Return the positions of the 15 `POINTS` relative to the pelvis, along the axes of T, metres.
 
-        Plain floats are used on purpose: numpy on a few points at a time takes twice as long.
-
         Args:
             rotations: (24, 3, 3) local rotations, joint 0 relative to T.
         """
-        matrices = rotations.tolist()
-        carried: list[list[Point]] = [[] for _ in matrices]
-        for j, parent, offset, point in self._steps:
-            if point is not None:
-                carried[parent].append(point)
-            if carried[j]:
-                carried[parent] += _moved(matrices[j], offset, carried[j])
-        points = [*_moved(matrices[0], [0.0, 0.0, 0.0], carried[0]), [0.0, 0.0, 0.0]]
-        return [points[i] for i in self._order]
-
-
-def _moved(matrix: list[list[float]], offset: Point, points: list[Point]) -> list[Point]:
-    """Return points that are rotated and then shifted."""
-    (a, b, c), (d, e, f), (g, h, i) = matrix
-    u, v, w = offset
-    return [
-        [a * x + b * y + c * z + u, d * x + e * y + f * z + v, g * x + h * y + i * z + w]
-        for x, y, z in points
-    ]
+        # Transposed, so that the products are rows; the chains of all joints grow twice as long in each step.
+        chains = np.empty((len(_CARRIERS) + 1, 3, 3))
+        chains[:-1] = rotations[_MOVING].transpose(0, 2, 1)
+        chains[-1] = _IDENTITY
+        for ancestors in _ANCESTORS:
+            chains = chains @ chains[ancestors]
+        positions: list[Point] = (self._lengths @ chains[:-1].reshape(-1, 3)).tolist()
+        return positions

@@ -79,12 +79,12 @@ class PlaceTracker:
             rotations: (24, 3, 3) local rotations, joint 0 relative to T.
             place: (10,) the network's contacts and velocity, see `EngineOutput.place`; None without them.
         """
-        points = self._points.positions(rotations)
         numbers: list[float] | None = None if place is None else place.tolist()
         if numbers is not None and not math.isfinite(sum(numbers)):
             place = numbers = None
-        if math.isfinite(sum([x + y + z for x, y, z in points])) and math.isfinite(time_s):
-            self._follow(time_s, points, rotations[0], numbers)
+        # A square is finite if all numbers are, and none is huge.
+        if math.isfinite(np.vdot(rotations, rotations)) and math.isfinite(time_s):
+            self._follow(time_s, self._points.positions(rotations), rotations[0], numbers)
         contacts = None if place is None else np.asarray(place[: len(CONTACTS)], np.float32)
         return Place(np.array(self._position), contacts)
 

@@ -155,12 +155,21 @@ def _moving_deviation(values: Array, n: int) -> Array:
     result = np.full(len(values), np.inf)
     if len(values) < n:
         return result
-    centred = values - values.mean(axis=0)
-    sums = np.cumsum(np.pad(centred, ((1, 0), (0, 0))), axis=0)
-    squares = np.cumsum(np.pad(np.square(centred), ((1, 0), (0, 0))), axis=0)
-    mean, square = (sums[n:] - sums[:-n]) / n, (squares[n:] - squares[:-n]) / n
-    result[n - 1 :] = np.sqrt(np.maximum(square - np.square(mean), 0.0).sum(axis=1))
+    centred = np.ascontiguousarray(values.T)  # a sum along memory takes a third of the time
+    centred -= centred.mean(axis=1, keepdims=True)
+    total = 0.0
+    for column in centred:
+        mean, square = _moving_sum(column, n) / n, _moving_sum(column * column, n) / n
+        total = total + np.maximum(square - mean * mean, 0.0)
+    result[n - 1 :] = np.sqrt(total)
     return result
+
+
+def _moving_sum(values: Array, n: int) -> Array:
+    """Return the sums of n successive values (T,), T - n + 1 of them."""
+    sums = np.cumsum(values)
+    sums[n:] -= sums[:-n].copy()
+    return sums[n - 1 :]
 
 
 def _rest(rows: Array, end_s: float) -> Rest:
