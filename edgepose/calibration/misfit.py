@@ -55,6 +55,7 @@ class MisfitDetector:
         self._frames: deque[ImuFrame] = deque()  # of the last REST_S
         self._looking = True
         self._compared = False
+        self._rest: Array | None = None  # the newest one that was compared with the pose
         self._nearest: PoseFit | None = None  # of the rests so far
         self._warned_no_pose = False
         self._impossible = ImpossibleBones()
@@ -127,8 +128,11 @@ class MisfitDetector:
         return [f"warning: {', '.join(names)}: {problem}" for problem, names in wrong.items()]
 
     def _check_pose(self, passed_s: float) -> list[str]:
-        rest = _rest(self._frames, ~self._calibration.missing)
+        worn, newest = ~self._calibration.missing, self._frames[-1].orientation
+        lasts = self._rest is not None and _angles_deg(self._rest, newest)[worn].max() < REST_DEG
+        rest = None if lasts else _rest(self._frames, worn)
         if rest is not None:
+            self._rest = rest
             fit = fit_pose(self._calibration, rest)
             self._looking = fit.swapped is None and not fit.good
             if fit.swapped is not None:

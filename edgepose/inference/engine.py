@@ -135,10 +135,10 @@ class WindowEngine:
 
 
 class _StreamState:
-    """One wearer's network state, and the tags of the frames that wait for poses."""
+    """One wearer's network state, its shapes, and the tags of the frames that wait for poses."""
 
-    def __init__(self, state: Any) -> None:
-        self.state = state
+    def __init__(self, state: Any, shapes: tuple[Any, ...] = ()) -> None:
+        self.state, self.shapes = state, shapes
         self.tags: deque[Any] = deque()
         self.done = 0
 
@@ -244,10 +244,14 @@ class MultiWearerEngine:
         self._network, self._past, self._isolate = as_runtime(module, place), past, isolate_wearers
         at_rest = EngineInput(None, *_at_rest())
         for count in {1, wearers}:
-            self._streams = [_StreamState(self._network.start(1, future)) for _ in range(count)]
+            self._streams = self._new_streams(count, future)
             for _ in range(WARM_UP + future):
                 self.push(dict.fromkeys(range(count), at_rest))
-        self._streams = [_StreamState(self._network.start(1, future)) for _ in range(wearers)]
+        self._streams = self._new_streams(wearers, future)
+
+    def _new_streams(self, count: int, future: int) -> list[_StreamState]:
+        states = [self._network.start(1, future) for _ in range(count)]
+        return [_StreamState(state, self._network.shapes(state)) for state in states]
 
     def push(self, inputs: Mapping[int, EngineInput]) -> dict[int, list[EngineOutput]]:
         """Process the next frame of some wearers; return the poses that are ready, by wearer."""
@@ -255,8 +259,7 @@ class MultiWearerEngine:
         for wearer, engine_input in inputs.items():
             stream = self._streams[wearer]
             stream.tags.append(engine_input.frame)
-            shapes = self._network.shapes(stream.state)
-            groups[(wearer, *shapes) if self._isolate else shapes].append(wearer)
+            groups[(wearer, *stream.shapes) if self._isolate else stream.shapes].append(wearer)
         outputs = {}
         for wearers in groups.values():
             outputs.update(self._step(wearers, inputs))
@@ -276,9 +279,10 @@ class MultiWearerEngine:
         state = self._network.join([stream.state for stream in streams])
         results, state = self._network.stream(orientation, acceleration, state)
         states = self._network.split(state, len(streams))
+        shapes = self._network.shapes(states[0])
         outputs = {}
         for i, (wearer, arrays) in enumerate(zip(wearers, results.of_wearers(), strict=True)):
-            streams[i].state = states[i]
+            streams[i].state, streams[i].shapes = states[i], shapes
             outputs[wearer] = streams[i].outputs(*arrays, self._past)
         return outputs
 

@@ -157,11 +157,11 @@ def _moving_deviation(values: Array, n: int) -> Array:
         return result
     centred = np.ascontiguousarray(values.T)  # a sum along memory takes a third of the time
     centred -= centred.mean(axis=1, keepdims=True)
-    total = 0.0
+    variance = np.zeros(len(values) - n + 1)
     for column in centred:
         mean, square = _moving_sum(column, n) / n, _moving_sum(column * column, n) / n
-        total = total + np.maximum(square - mean * mean, 0.0)
-    result[n - 1 :] = np.sqrt(total)
+        variance += np.maximum(square - mean * mean, 0.0)
+    result[n - 1 :] = np.sqrt(variance)
     return result
 
 
