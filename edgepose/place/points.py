@@ -95,9 +95,9 @@ class BodyPoints:
         """
         # Transposed, so that the products are rows; the chains of all joints grow twice as long in each step.
         chains = np.empty((len(_CARRIERS) + 1, 3, 3))
-        chains[:-1] = rotations[_MOVING].transpose(0, 2, 1)
+        chains[:-1] = rotations.take(_MOVING, 0).transpose(0, 2, 1)
         chains[-1] = _IDENTITY
         for ancestors in _ANCESTORS:
-            chains = chains @ chains[ancestors]
+            chains = chains @ chains.take(ancestors, 0)
         positions: list[Point] = (self._lengths @ chains[:-1].reshape(-1, 3)).tolist()
         return positions
