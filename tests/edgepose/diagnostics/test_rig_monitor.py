@@ -7,14 +7,16 @@ from edgepose.formats.recordings.base import iter_samples
 from edgepose.formats.recordings.registry import read_recording
 
 
-@pytest.mark.parametrize(("rigs", "expected_s"), [(1, 8.0), (10, 10.0)])
-def test_a_fault_is_reported_once_and_later_if_there_are_many_rigs(wearer, rigs, expected_s):
+@pytest.mark.parametrize(
+    ("rigs", "phase", "expected_s"), [(1, 0.0, 8.0), (10, 0.0, 10.0), (20, 0.0, 10.0), (20, 0.02, 10.4)]
+)
+def test_a_fault_is_reported_once_and_later_if_there_are_many_rigs(wearer, rigs, phase, expected_s):
     """The wearer stands for six seconds, in which equal data mean nothing."""
     recording = read_recording(wearer.recording)
     doubled = recording._replace(
         sensors=recording.sensors | {"head": recording.sensors["pelvis"]}
     )  # the same data twice
-    monitor, reported = RigMonitor(rigs=rigs), {}
+    monitor, reported = RigMonitor(phase=phase, rigs=rigs), {}
     start_s = None
     for sample in iter_samples(doubled):
         start_s = sample.time_s if start_s is None else start_s
