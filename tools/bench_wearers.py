@@ -32,7 +32,6 @@ from typing import NamedTuple
 import click
 import numpy as np
 import simulate
-import torch
 
 from edgepose.calibration import Calibration, save
 from edgepose.inference import archive
@@ -80,6 +79,9 @@ class ProgramRun(NamedTuple):
 
 def network_us(model: str, wearers: int) -> float:
     """Return the network's processor time per frame and wearer, microseconds, as the median over rounds."""
+    import torch  # not above: the simulator, a process of its own, starts without it
+
+    torch.set_num_threads(1)
     info = archive.read_info(archive.find_archive(model))
     module = archive.load(info)
     quantise_weights(module, info)
@@ -298,7 +300,6 @@ def main(
     counts: tuple[int, ...], models: tuple[str, ...], seconds: float, core: int, picture: Path | None
 ) -> None:
     """Run the command line."""
-    torch.set_num_threads(1)
     others = os.sched_getaffinity(0) - {core}
     if not others:
         raise click.ClickException("this machine has only one core; the simulator needs another one")
