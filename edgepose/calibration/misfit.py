@@ -50,6 +50,7 @@ class MisfitDetector:
             compare: called once; returns a line on each other difference from when the calibration was made.
         """
         self._calibration, self._compare = calibration, compare
+        self._worn = ~calibration.missing
         self._start_s: float | None = None
         self._next_s = -np.inf
         self._frames: deque[ImuFrame] = deque()  # of the last REST_S
@@ -84,7 +85,7 @@ class MisfitDetector:
         self._next_s = frame.time_s + _EVERY_S
         passed_s = frame.time_s - self._start_s
         lines += self._check_bones(frame, bones)
-        pair = self._same_limb.update(frame.time_s, frame.orientation, frame.held | self._calibration.missing)
+        pair = self._same_limb.update(frame.time_s, frame.orientation, frame.held | ~self._worn)
         lines += [] if pair is None else [f"warning: {' and '.join(pair)} {SAME_LIMB}"]
         if not self._compared and passed_s >= COMPARE_S:
             lines += self._comparison()
@@ -102,7 +103,7 @@ class MisfitDetector:
         return [f"warning: {line}" for line in self._compare()]
 
     def _check_slips(self, frame: ImuFrame, bones: Array) -> list[str]:
-        if (frame.held & ~self._calibration.missing).any():
+        if True in frame.held.tolist() and (frame.held & self._worn).any():
             return []
         found = self._slip_monitor.update(frame.time_s, bones)
         if not found or self._swapped:
@@ -128,7 +129,7 @@ class MisfitDetector:
         return [f"warning: {', '.join(names)}: {problem}" for problem, names in wrong.items()]
 
     def _check_pose(self, passed_s: float) -> list[str]:
-        worn, newest = ~self._calibration.missing, self._frames[-1].orientation
+        worn, newest = self._worn, self._frames[-1].orientation
         lasts = self._rest is not None and _angles_deg(self._rest, newest)[worn].max() < REST_DEG
         rest = None if lasts else _rest(self._frames, worn)
         if rest is not None:
@@ -166,7 +167,7 @@ def _slip(name: str, angle_deg: float) -> str:
 
 def _rest(frames: deque[ImuFrame], worn: NDArray[np.bool_]) -> Array | None:
     """Mean orientations (6, 4) of frames in which none of the worn sensors turned; None if one did."""
-    silent = any((frame.held & worn).any() for frame in frames)
+    silent = np.any([frame.held for frame in frames], axis=0)[worn].any()
     if silent or frames[-1].time_s - frames[0].time_s < REST_S - _EVERY_S:
         return None
     # A cheap check that catches most motion.

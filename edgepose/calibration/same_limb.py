@@ -35,7 +35,7 @@ class SameLimb:
         """Start with no steps."""
         self._next_s = -np.inf
         self._before: Array | None = None  # (6, 6, 4) sensors against each other
-        self._first: dict[tuple[int, int], Array] = {}  # since when a pair has moved as one
+        self._first: Array | None = None  # the same, when each pair began to move as one
         self._steps = dict.fromkeys(combinations(range(len(PLACEMENTS)), 2), 0)
 
     def update(self, time_s: float, orientation: Array, held: NDArray[np.bool_]) -> tuple[str, str] | None:
@@ -53,13 +53,17 @@ class SameLimb:
         self._before = now
         if before is None or np.count_nonzero(~held) < 3:
             return None
+        if self._first is None:
+            self._first = now.copy()
+        turned = (_angles_deg(now, self._first) > RIGID_DEG) | held | held[:, None]
+        self._first[turned] = now[turned]
         moved = (_angles_deg(now, before) > MOVED_DEG) | held  # against a silent sensor nothing shows
+        still = np.count_nonzero(~moved, axis=1) - ~moved.diagonal()  # against how many each did not turn
         for i, j in self._steps:
-            first = self._first.setdefault((i, j), now[i, j])
-            if held[i] or held[j] or _angles_deg(now[i, j], first) > RIGID_DEG:
-                self._first[i, j], self._steps[i, j] = now[i, j], 0
+            if turned[i, j]:
+                self._steps[i, j] = 0
             else:
-                self._steps[i, j] += bool(np.delete(moved[i], [i, j]).all())
+                self._steps[i, j] += bool(still[i] == (not moved[i, j]))
             if self._steps[i, j] >= STEPS:
                 self._steps = {}  # one wrong sensor may look like others
                 return PLACEMENTS[i], PLACEMENTS[j]
