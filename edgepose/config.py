@@ -28,7 +28,7 @@ from edgepose.utils.text_files import read_toml
 from edgepose.utils.toml_values import NUMBER, SWITCH, TEXT, TEXTS, WHOLE, checked_value, texts_by_name
 
 ANY_OUTPUT = "give at least one output, such as --csv FILE, --udp HOST:PORT or --view"
-ONE_SOURCE = "give one source: --port PORT, --can BUS, --listen, --connect or --ble ADDRESS, or --file PATH"
+ONE_SOURCE = "give one source: --port PORT, --can BUS, --listen, --connect, --ble ADDRESS or --hid NAME, or --file PATH"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +48,7 @@ class SourceConfig:
         listen: addresses of this machine to receive datagrams on, HOST:PORT, separated by commas.
         connect: devices to connect to over TCP, HOST:PORT, separated by commas.
         ble: Bluetooth addresses of Movella DOT sensors, separated by commas.
+        hid: USB receivers by serial number or path, separated by commas, or "slimevr" for the only one.
     """
 
     port: str | None = None
@@ -62,6 +63,7 @@ class SourceConfig:
     listen: str | None = None
     connect: str | None = None
     ble: str | None = None
+    hid: str | None = None
 
     def __post_init__(self) -> None:
         """Raise ConfigError unless the fields name exactly one source and are in their ranges."""
@@ -88,7 +90,7 @@ class SourceConfig:
     @property
     def lines(self) -> tuple[str | None, ...]:
         """Names of the live lines, by kind."""
-        return self.port, self.can, self.listen, self.connect, self.ble
+        return self.port, self.can, self.listen, self.connect, self.ble, self.hid
 
     @property
     def name(self) -> str:
@@ -348,6 +350,7 @@ _KEYS = {
     "listen": TEXT,
     "connect": TEXT,
     "ble": TEXT,
+    "hid": TEXT,
     "filter": TEXT,
     "no-mag": SWITCH,
     "calibration": TEXT,

@@ -98,8 +98,9 @@ class Protocol:
     Attributes:
         name: the name that users type.
         transport: "bytes" on a serial line, over TCP or in datagrams, frames on a "can" bus, or "udp" if the
-            format exists in datagrams only.
-        default_bitrate: usual baud or bit rate of the devices as delivered, bit/s; 0 for "udp".
+            format exists in datagrams only, or "hid" on a USB receiver, whose reports a program may also pass
+            on as datagrams.
+        default_bitrate: usual baud or bit rate of the devices as delivered, bit/s; 0 for "udp" and "hid".
         description: one line that describes the sensors and the format.
         decoder: creates a decoder. Two protocols may share one and then differ by name only: detection
             reports the first of them.
@@ -118,7 +119,7 @@ class Protocol:
     """
 
     name: str
-    transport: Literal["bytes", "can", "udp"]
+    transport: Literal["bytes", "can", "udp", "hid"]
     default_bitrate: int
     description: str
     decoder: Callable[[], Decoder]

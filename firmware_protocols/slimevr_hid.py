@@ -120,13 +120,14 @@ def encode(sample: Sample) -> bytes:
 
 PROTOCOL = Protocol(
     name="slimevr-hid",
-    transport="udp",
+    transport="hid",
     default_bitrate=0,
-    description="SlimeVR's USB receiver: its reports as datagrams, passed on by a program",
+    description="SlimeVR trackers by radio, through their USB receiver; ids are the receiver's",
     decoder=SlimevrHidDecoder,
     encoder=uncounted(encode),
     ids=range(6),
     common_heading=False,
     lacks=["time"],
+    setup="pair them with the receiver",
     page="slimevr-hid",
 )

@@ -40,7 +40,7 @@ def _row(protocol: Protocol) -> Sequence[str]:
     return (
         protocol.description,
         f"[`{protocol.name}`]({page})",
-        {"bytes": "serial", "can": "CAN", "udp": "UDP"}[protocol.transport],
+        {"bytes": "serial", "can": "CAN", "udp": "UDP", "hid": "USB HID"}[protocol.transport],
         str(protocol.default_bitrate or "-"),
         _first_id(protocol),
         protocol.setup or "-",

@@ -51,7 +51,7 @@ def _over(names: Sequence[str], angle_deg: Array, limit_deg: float) -> str:
 def next_command(source: SourceConfig, out: str) -> str:
     """Return the command that uses the calibration."""
     words = ["edgepose", "run"]
-    for flag in ("file", "port", "baud", "can", "bitrate", "listen", "connect", "ble", "sensors"):
+    for flag in ("file", "port", "baud", "can", "bitrate", "listen", "connect", "ble", "hid", "sensors"):
         value = getattr(source, flag)
         words += [] if value is None else [f"--{flag}", str(value)]
     words += [] if source.protocol == "auto" else ["--protocol", source.protocol]

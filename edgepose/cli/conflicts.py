@@ -19,16 +19,22 @@ if TYPE_CHECKING:
     from edgepose.config import WearerConfig
     from edgepose.sources.sensor_map import SensorMap
 
+_KINDS = {"bytes": "port", "frames": "bus", "datagrams": "address", "reports": "receiver"}
+"""Names of lines by the unit of their data."""
+
+_SHARED = ("bus", "receiver")
+"""Lines that several programs can read, each all of it."""
+
 
 def check_lines(wearers: Sequence[WearerConfig]) -> None:
-    """Raise EdgeposeError if two wearers use one line, unless it is a bus on which they have separate ids."""
+    """Raise EdgeposeError if two wearers use one line, unless it can be shared and they have separate ids."""
     with_lines = [(wearer, _lines(wearer)) for wearer in wearers]
     for (wearer, lines), (other, other_lines) in combinations(with_lines, 2):
         for line in lines.keys() & other_lines.keys():
             ids = lines[line] + other_lines[line]
             separate = lines[line] and other_lines[line] and None not in ids and len(set(ids)) == len(ids)
             if not separate:
-                hint = ", or ids of its own in a sensor map" if line.startswith("bus") else ""
+                hint = ", or ids of its own in a sensor map" if line.startswith(_SHARED) else ""
                 raise EdgeposeError(
                     f"{wearer.path}, {other.path}: both use the {line}; give each its own{hint}"
                 )
@@ -108,14 +114,14 @@ def _lines(wearer: WearerConfig) -> dict[str, list[int | None]]:
         sensor_map = _sensor_map(wearer)
         specs = line_specs(
             *(source.port, source.baud, source.can, source.bitrate, source.fd, source.protocol),
-            *(sensor_map, source.listen, source.connect, source.ble),
+            *(sensor_map, source.listen, source.connect, source.ble, source.hid),
         )
     lines: dict[str, list[int | None]] = {}
     for spec in specs:
-        if spec.unit == "frames":
-            lines[f"bus {spec.name}"] = [] if sensor_map is None else list(sensor_map.places(spec.name))
-        else:  # it can only be opened once
-            lines[f"{'port' if spec.unit == 'bytes' else 'address'} {spec.name}"] = []
+        line = f"{_KINDS[spec.unit]} {spec.name}"
+        lines[line] = []
+        if sensor_map is not None and line.startswith(_SHARED):  # others can only be opened once
+            lines[line] = list(sensor_map.places(spec.name))
     return lines
 
 

@@ -157,6 +157,7 @@ def open_source(
         listen: addresses of this machine to receive datagrams on, HOST:PORT, separated by commas.
         connect: devices to connect to over TCP, HOST:PORT, separated by commas.
         ble: Bluetooth addresses of Movella DOT sensors, separated by commas.
+        hid: USB receivers by serial number or path, separated by commas, or "slimevr" for the only one.
         wanted: returns the time on the source's clock, seconds, until which samples of live lines may be
             gathered into one batch; by default they are delivered as they come.
         without: sensors that the rig lacks and that recordings need not hold.
@@ -164,8 +165,8 @@ def open_source(
     Raises:
         EdgeposeError: no input or more than one; an unknown protocol or kind of file; an invalid map.
     """
-    if file is not None and any(name is not None for name in (port, can, listen, connect, ble)):
-        raise EdgeposeError("give one input: --port, --can, --listen, --connect or --ble, or --file")
+    if file is not None and any(name is not None for name in (port, can, listen, connect, ble, hid)):
+        raise EdgeposeError("give one input: --port, --can, --listen, --connect, --ble or --hid, or --file")
     # Imported only here: each kind of input has dependencies of its own.
     from edgepose.sources.sensor_map import read_map
 
@@ -177,5 +178,5 @@ def open_source(
     from edgepose.sources.line_config import line_specs
     from edgepose.sources.live import LiveSource
 
-    lines = line_specs(port, baud, can, bitrate, fd, protocol, sensor_map, listen, connect, ble)
+    lines = line_specs(port, baud, can, bitrate, fd, protocol, sensor_map, listen, connect, ble, hid)
     return LiveSource(lines, lenient, blocking, wanted)

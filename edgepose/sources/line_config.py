@@ -40,6 +40,7 @@ class Lines(NamedTuple):
         listen: addresses to listen on for datagrams, HOST:PORT.
         connect: devices to connect to over TCP, HOST:PORT.
         ble: Bluetooth addresses of Movella DOT sensors.
+        hid: USB receivers, by serial number or path, or "slimevr".
     """
 
     port: Sequence[str] = ()
@@ -47,6 +48,7 @@ class Lines(NamedTuple):
     listen: Sequence[str] = ()
     connect: Sequence[str] = ()
     ble: Sequence[str] = ()
+    hid: Sequence[str] = ()
 
     @property
     def all(self) -> list[str]:
@@ -74,7 +76,7 @@ def line_specs(
     lines = Lines(
         *(
             _split_names(f"--{kind}", text)
-            for kind, text in zip(Lines._fields, (port, can, listen, connect, _upper(ble)), strict=True)
+            for kind, text in zip(Lines._fields, (port, can, listen, connect, _upper(ble), hid), strict=True)
         )
     )
     if sensor_map is not None:
@@ -83,7 +85,7 @@ def line_specs(
         _check_map(sensor_map, lines)
     count = len(lines.all)
     if not count:
-        raise ConfigError("give one input: --port, --can, --listen, --connect, --ble or --file")
+        raise ConfigError("give one input: --port, --can, --listen, --connect, --ble, --hid or --file")
     for bus in lines.can:
         if ":" not in bus:
             raise ConfigError(f"{bus}: give --can as INTERFACE:CHANNEL, such as socketcan:can0")
@@ -105,6 +107,8 @@ def line_specs(
             return tcp_line(name, found, placements)
         if kind == "ble":
             return ble_line(name, found, placements)
+        if kind == "hid":
+            return hid_line(name, found, placements)
         return udp_line(name, found, placements, None if sensor_map is None else sensor_map.senders(name))
 
     named = [(kind, name) for kind in Lines._fields for name in getattr(lines, kind)]
@@ -122,7 +126,7 @@ def _check_map(sensor_map: SensorMap, lines: Lines) -> None:
         if device.line is not None and device.line not in known:
             raise ConfigError(
                 f"{sensor_map.path}: {name}: {device.name} is not one of the lines given "
-                f"with --port, --can, --listen, --connect and --ble: {', '.join(lines.all)}"
+                f"with --port, --can, --listen, --connect, --ble and --hid: {', '.join(lines.all)}"
             )
         if device.sender is not None and not lines.listen:
             raise ConfigError(
@@ -284,6 +288,23 @@ def ble_line(name: str, protocol: str, placements: Callable[[Protocol], Placemen
 
 def _upper(addresses: str | None) -> str | None:
     return None if addresses is None else addresses.upper()
+
+
+def hid_line(name: str, protocol: str, placements: Callable[[Protocol], PlacementById]) -> LineSpec:
+    """Return the specification of a USB receiver.
+
+    Raises:
+        ConfigError: no such protocol.
+    """
+    protocols = candidate_protocols(protocol, "hid", live=True)
+
+    def open_receiver() -> Transport:
+        from edgepose.sources.hid_receiver import HidReceiver
+
+        return HidReceiver(name)
+
+    check = ("that it is the receiver", "that the trackers are on and paired with this receiver")
+    return LineSpec(name, open_receiver, protocols, placements, "reports", check)
 
 
 def _split_names(flag: str, text: str | None) -> Sequence[str]:

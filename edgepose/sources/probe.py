@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from edgepose.errors import ConfigError, EdgeposeError
-from edgepose.sources.line_config import BAUD, can_line, serial_line, tcp_line, udp_line
+from edgepose.sources.line_config import BAUD, can_line, hid_line, serial_line, tcp_line, udp_line
 from edgepose.sources.line_decoder import LISTEN_S
 from edgepose.sources.line_reader import LineDisconnectedError, LineSpec, discard_backlog
 from edgepose.sources.protocol_detection import DecodedChunks, Detector
@@ -26,7 +26,7 @@ class ProbeResult(NamedTuple):
 
     Attributes:
         protocol: name of the wire format; None if none could be decoded.
-        amount: bytes, frames or datagrams received.
+        amount: bytes, frames, datagrams or reports received.
         rates_hz: samples per second by sensor id.
         refused: input that could be understood but not used, see `Decoder.refused`; for a sender of datagrams
             also formats that fit equally well.
@@ -69,6 +69,15 @@ def probe_connection(name: str) -> ProbeResult:
         EdgeposeError: it cannot be connected to, or formats fit equally well.
     """
     return probe_line(tcp_line(name, "auto", lambda found: {}))
+
+
+def probe_receiver(name: str) -> ProbeResult:
+    """Probe a USB receiver.
+
+    Raises:
+        EdgeposeError: it cannot be opened.
+    """
+    return probe_line(hid_line(name, "auto", lambda found: {}))
 
 
 def probe_socket(name: str) -> dict[str, ProbeResult]:

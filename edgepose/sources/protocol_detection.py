@@ -15,12 +15,15 @@ from firmware_protocols.sample import Sample
 Chunk = bytes | list[Any]
 """Bytes of a stream, messages (`can.Message`) of a bus, or datagrams (`Datagram`)."""
 
-Transport = Literal["bytes", "can", "udp"]
-"""Kind of a line: a stream of bytes, a CAN bus, or a UDP socket."""
+Transport = Literal["bytes", "can", "udp", "hid"]
+"""Kind of a line: a stream of bytes, a CAN bus, a UDP socket, or a USB receiver."""
 
 
 class Datagram(NamedTuple):
-    """A UDP datagram, and the IP address of its sender, or the name that it gives itself."""
+    """A UDP datagram, and the IP address of its sender, or the name that it gives itself.
+
+    Also a transfer of a USB receiver, and the receiver's name.
+    """
 
     sender: str
     data: bytes
@@ -87,13 +90,13 @@ def candidate_protocols(name: str, transport: Transport, live: bool) -> list[Pro
 
     Args:
         name: name of a protocol, or "auto".
-        transport: kind of line. Datagrams may hold the packets of any protocol in bytes.
+        transport: kind of line. Datagrams may hold the packets of any protocol but those of CAN.
         live: the line has devices on it; listening cannot find those that have to be polled.
 
     Raises:
         ConfigError: no such protocol, it is for another transport, or a package for it is missing.
     """
-    possible = ("bytes", "udp") if transport == "udp" else (transport,)
+    possible = ("bytes", "udp", "hid") if transport == "udp" else (transport,)
     if name != "auto":
         protocol = protocol_named(name)
         if protocol.transport not in possible:
@@ -112,6 +115,7 @@ _LINES = {
     "bytes": "serial lines; use it with --port, --listen or --connect, or a log of one",
     "can": "CAN buses; use it with --can or a log of one",
     "udp": "datagrams; use it with --listen",
+    "hid": "USB receivers; use it with --hid, or --listen if a program passes their reports on",
 }
 """The lines of a protocol, for a message."""
 

@@ -16,7 +16,7 @@ from edgepose.utils.similar_names import choices
 from edgepose.utils.text_files import read_toml
 from firmware_protocols.registry import Protocol
 
-LINES = ("port", "can", "listen", "connect", "ble")
+LINES = ("port", "can", "listen", "connect", "ble", "hid")
 """Keys that name a line."""
 
 _DIRECTION = "(left|right|up|down|forward|back)"
@@ -34,6 +34,7 @@ class Device(NamedTuple):
         listen: the address at which its datagrams arrive, HOST:PORT; None for any line.
         connect: its address for TCP, HOST:PORT; None for any line.
         ble: its Bluetooth address; None for any line.
+        hid: its USB receiver, by serial number or path, or "slimevr"; None for any line.
         sender: IP address from which its datagrams come, or the MAC address that they state; None for any.
         id: its id on the line; None if it is the only device there.
         mounting: orientation in which it is worn, in the format of `edgepose calibrate`.
@@ -44,6 +45,7 @@ class Device(NamedTuple):
     listen: str | None = None
     connect: str | None = None
     ble: str | None = None
+    hid: str | None = None
     sender: str | None = None
     id: int | None = None
     mounting: str | None = None
@@ -51,7 +53,7 @@ class Device(NamedTuple):
     @property
     def name(self) -> str | None:
         """The line as the file names it; None for any."""
-        return self.port or self.can or self.listen or self.connect or self.ble
+        return self.port or self.can or self.listen or self.connect or self.ble or self.hid
 
     @property
     def line(self) -> str | None:
@@ -216,7 +218,9 @@ def _device(where: str, entry: object) -> Device:
     if given[1:]:
         raise ConfigError(f"{where}: give {' or '.join(given)}, not both")
     if not given and device.id is None and device.sender is None:
-        raise ConfigError(f"{where}: no device named; give its port, can, listen, connect, ble, sender or id")
+        raise ConfigError(
+            f"{where}: no device named; give its port, can, listen, connect, ble, hid, sender or id"
+        )
     if device.sender is not None:
         if given not in ([], ["listen"]):
             raise ConfigError(f"{where}: sender is for datagrams; it does not go with {given[0]}")

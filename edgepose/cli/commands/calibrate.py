@@ -52,7 +52,7 @@ PAGE_PORT = 8090
 _RESETS = ("live", "motion", "steps", "mounting")
 """Ways to reset headings that are no file."""
 
-_LINES = "--port, --can, --listen, --connect or --ble"
+_LINES = "--port, --can, --listen, --connect, --ble or --hid"
 
 
 def _body_frame(ctx: click.Context, param: click.Parameter, value: str | None) -> str | None:
@@ -209,7 +209,7 @@ def calibrate(
 ) -> None:
     """Find out how the sensors sit on their wearer.
 
-    The wearer holds a pose for a few seconds, live (--port, --can, --listen, --connect, --ble) or in a
+    The wearer holds a pose for a few seconds, live (--port, --can, --listen, --connect, --ble, --hid) or in a
     recording (--file). The calibration, which `edgepose run` needs, contains the direction that the wearer
     faces and the orientation of each sensor on its segment. Repeat it after one came off or slipped.
 

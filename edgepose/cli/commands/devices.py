@@ -1,4 +1,4 @@
-"""`edgepose devices`: list serial ports and CAN interfaces."""
+"""`edgepose devices`: list serial ports, CAN interfaces and USB receivers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import click
 
 from edgepose.cli.options.json_result import json_option, show_json
 from edgepose.cli.terminal.messages import say, show
-from edgepose.errors import EdgeposeError
+from edgepose.errors import ConfigError, EdgeposeError
 
 if TYPE_CHECKING:
     from edgepose.sources.probe import ProbeResult
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 def devices(
     names: tuple[str, ...], probe: bool, listen: str | None, connect: str | None, ble: bool, as_json: bool
 ) -> None:
-    """List the serial ports and CAN interfaces of this machine, or only the named ones.
+    """List the serial ports, CAN interfaces and USB receivers of this machine, or only the named ones.
 
     \b
     Examples:
@@ -102,6 +102,28 @@ def _show_local(lines: _Lines, names: tuple[str, ...], probe: bool) -> None:
         for name in buses:
             lines.add(name, "", _probe_bus if probe else None)
         lines.end("none found; adapters on a serial port are named slcan:PORT")
+    if not names:
+        _show_receivers(lines, probe)
+
+
+def _show_receivers(lines: _Lines, probe: bool) -> None:
+    """Show the USB receivers, if hidapi is installed."""
+    from edgepose.sources.hid_receiver import receivers
+
+    try:
+        found = receivers()
+    except ConfigError:
+        return
+    names = [receiver.name for receiver in found]
+    lines.begin("receivers", "USB receivers (edgepose run --hid NAME):", max(map(len, names), default=0))
+    for receiver in found:
+        description = "  ".join(dict.fromkeys((receiver.product, receiver.path)))
+        lines.add(receiver.name, description, _probe_receiver if probe else None)
+    lines.end("none found")
+
+
+_KINDS = ("ports", "buses", "listen", "connect", "ble", "receivers")
+"""Kinds of lines, as scripts get them."""
 
 
 class _Lines:
@@ -114,8 +136,7 @@ class _Lines:
 
     def __init__(self, as_json: bool) -> None:
         """Start without lines."""
-        kinds = ("ports", "buses", "listen", "connect", "ble")
-        self.found: dict[str, list[dict[str, Any]]] = {kind: [] for kind in kinds}
+        self.found: dict[str, list[dict[str, Any]]] = {kind: [] for kind in _KINDS}
         self.failed: list[str] = []
         self._show: Callable[[str], None] = (lambda text: None) if as_json else show
         self._kind, self._width = "ports", 0
@@ -249,6 +270,12 @@ def _probe_connection(name: str) -> list[Finding]:
     return [Finding(probe_connection(name), "bytes")]
 
 
+def _probe_receiver(name: str) -> list[Finding]:
+    from edgepose.sources.probe import probe_receiver
+
+    return [Finding(probe_receiver(name), "reports")]
+
+
 def _describe(finding: ProbeResult, unit: str, speed: str) -> str:
     if finding.protocol is None:
         if not finding.amount:
@@ -257,7 +284,7 @@ def _describe(finding: ProbeResult, unit: str, speed: str) -> str:
             return f"{finding.refused}{speed and ' (' + speed.strip() + ')'}"
         return (
             f"{finding.amount} {unit} arrived, in no known protocol"
-            f"{'' if unit == 'datagrams' else '; the device may be set to another speed'}"
+            f"{'; the device may be set to another speed' if unit in ('bytes', 'frames') else ''}"
         )
     ids = ", ".join(f"id {sensor} at {rate:.0f} Hz" for sensor, rate in finding.rates_hz.items())
     return f"--protocol {finding.protocol}{speed}: {ids}"

@@ -55,7 +55,7 @@ def record(source: SourceConfig, out: str, seconds: float | None, overwrite: boo
 
     kind = recorder.kind(out)
     streams = ",".join(filter(None, (source.port, source.connect)))
-    others = source.listen or source.ble or (source.can if kind == "port" else streams)
+    others = source.listen or source.ble or source.hid or (source.can if kind == "port" else streams)
     if kind == "port" and (not streams or "," in streams or others):
         raise click.UsageError(
             f"{out} stores the bytes of one line: give --port or --connect, or name it .csv or .npz"

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-_SOURCES = ("file", "port", "can", "listen", "connect", "ble")
+_SOURCES = ("file", "port", "can", "listen", "connect", "ble", "hid")
 
 _ARGUMENT: dict[str, Any] = {
     "nargs": -1,

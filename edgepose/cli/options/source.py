@@ -118,6 +118,12 @@ def source_options(command: Callable[..., Any]) -> Callable[..., Any]:
             "order of --port. Needs edgepose[ble].",
         ),
         click.option(
+            "--hid",
+            metavar="NAME[,NAME...]",
+            help="USB receivers of the trackers, by serial number or path as edgepose devices lists them, or "
+            "slimevr for the only one. Needs pip install 'edgepose[hid]'.",
+        ),
+        click.option(
             "--file",
             type=click.Path(path_type=Path),
             help="Read a file instead: a recording ("
