@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from importlib import import_module
 from typing import Any, NamedTuple
@@ -82,6 +82,11 @@ def receivers() -> list[Receiver]:
     Raises:
         ConfigError: hidapi is not installed.
     """
+    return receivers_among(hidapi().enumerate(VENDOR, 0))
+
+
+def receivers_among(devices: Iterable[Mapping[str, Any]]) -> list[Receiver]:
+    """Return the receivers among devices as hidapi lists them, each once, by name."""
     found = {
         Receiver(
             os.fsdecode(each["path"]),
@@ -89,8 +94,8 @@ def receivers() -> list[Receiver]:
             each["product_string"] or "",
             each["product_id"],
         )
-        for each in hidapi().enumerate(VENDOR, 0)
-        if each["product_id"] in (RECEIVER, TRACKER)
+        for each in devices
+        if each["vendor_id"] == VENDOR and each["product_id"] in (RECEIVER, TRACKER)
     }
     return sorted(found, key=lambda receiver: (receiver.name, receiver.path))
 
