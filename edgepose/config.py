@@ -7,7 +7,7 @@ WearerConfig(source=SourceConfig(port="/dev/ttyUSB0"), calibration=Path("calib.j
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from edgepose.utils.text_files import read_toml
 from edgepose.utils.toml_values import NUMBER, SWITCH, TEXT, TEXTS, WHOLE, checked_value, texts_by_name
 
 ANY_OUTPUT = "give at least one output, such as --csv FILE, --udp HOST:PORT or --view"
-ONE_SOURCE = "give one source: --port PORT, --can BUS, --listen, --connect, --ble ADDRESS or --hid NAME, or --file PATH"
+ONE_SOURCE = "give one source: --port PORT, --can BUS, --listen, --connect, --ble, --hid or --file PATH"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -390,13 +390,9 @@ def _text(key: str, value: str, folder: Path) -> Any:
         value = str(folder / value)
     if key in ("file", "sensors", "calibration"):
         return Path(value)
-    parse: dict[str, Callable[[str], Any]] = {
-        "protocol": lambda name: str(folder / name) if name.endswith(".toml") else checked_protocol(name),
-        "control": parse_host_and_port,
-    }
-    if key not in parse:
-        return value
     try:
-        return parse[key](value)
+        if key == "protocol":
+            return str(folder / value) if value.endswith(".toml") else checked_protocol(value)
+        return parse_host_and_port(value) if key == "control" else value
     except EdgeposeError as error:
         raise ConfigError(f"{key}: {error}") from None

@@ -135,6 +135,7 @@ def open_source(
     listen: str | None = None,
     connect: str | None = None,
     ble: str | None = None,
+    hid: str | None = None,
     wanted: Callable[[], float] | None = None,
     without: Sequence[str] = (),
 ) -> Source:
@@ -146,13 +147,11 @@ def open_source(
         can: CAN bus, INTERFACE:CHANNEL.
         bitrate: speed of the bus, bit/s; None means the protocol's usual speed, or 500000.
         fd: receive CAN FD frames too.
-        file: recording of any format ("-" is CSV on stdin), raw serial capture (.bin, .raw) or log of a CAN
-            bus.
+        file: recording ("-" is CSV on stdin), raw serial capture (.bin, .raw) or log of a CAN bus.
         realtime: replay a file at its own pace.
         protocol: name of a wire format, a TOML file that describes text lines, or "auto".
         sensors: map of devices to placements; lines in it need no flag.
-        lenient: accept incomplete input: a recording's good rows, with any number of sensors; lines that send
-            nothing are warned about and waited for.
+        lenient: accept a recording's good rows, of any sensors; warn about lines that send nothing, and wait.
         blocking: wait for a batch as the module's docstring says; if false, one comes at once, maybe empty.
         listen: addresses of this machine to receive datagrams on, HOST:PORT, separated by commas.
         connect: devices to connect to over TCP, HOST:PORT, separated by commas.

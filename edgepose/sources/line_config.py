@@ -67,6 +67,7 @@ def line_specs(
     listen: str | None = None,
     connect: str | None = None,
     ble: str | None = None,
+    hid: str | None = None,
 ) -> list[LineSpec]:
     """Return the lines to read from; the arguments are those of `open_source`.
 

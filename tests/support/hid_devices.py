@@ -26,7 +26,7 @@ _NUMBER_AT, _REQUEST_AT = 0, 24  # in what a filter sees of a system call
 
 
 def take_files_for_hid_devices() -> None:
-    """From now on, this thread and those that it starts do so; for a new process, an argument `preexec_fn`."""
+    """From now on, this thread and those that it starts do so; also for `preexec_fn` of a process."""
     steps = [
         (_LOAD, 0, 0, _NUMBER_AT),
         (_JUMP_IF_EQUAL, 0, 3, _IOCTL[platform.machine()]),

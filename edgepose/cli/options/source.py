@@ -73,9 +73,38 @@ without_option = click.option(
 """The flag --without."""
 
 
+def _network_flags() -> list[Callable[[Callable[..., Any]], Callable[..., Any]]]:
+    """Return the flags for sensors without a serial port or CAN bus."""
+    return [
+        click.option(
+            "--listen",
+            metavar="HOST:PORT[,...]",
+            help="Receive the sensors' UDP datagrams at this address of this machine, such as "
+            "192.168.1.10:9000; 0.0.0.0 is all of its addresses.",
+        ),
+        click.option(
+            "--connect",
+            metavar="HOST:PORT[,...]",
+            help="Connect to the sensors over TCP, such as 192.168.1.21:7000, in the order of --port.",
+        ),
+        click.option(
+            "--ble",
+            metavar="ADDRESS[,...]",
+            help="Connect to these Movella DOT sensors over Bluetooth, such as D4:22:CD:00:12:34, in the "
+            "order of --port. Needs edgepose[ble].",
+        ),
+        click.option(
+            "--hid",
+            metavar="NAME[,NAME...]",
+            help="USB receivers of the trackers, by serial number or path as edgepose devices lists them, or "
+            "slimevr for the only one. Needs pip install 'edgepose[hid]'.",
+        ),
+    ]
+
+
 def source_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the flags for the source of samples; the command gets them as `source: SourceConfig`."""
-    flags = [
+    flags: list[Callable[[Callable[..., Any]], Callable[..., Any]]] = [
         click.option(
             "--port",
             metavar="PORT[,PORT...]",
@@ -100,29 +129,7 @@ def source_options(command: Callable[..., Any]) -> Callable[..., Any]:
             "protocol's usual speed, or 500000]",
         ),
         click.option("--fd", is_flag=True, help="Accept CAN FD frames, too."),
-        click.option(
-            "--listen",
-            metavar="HOST:PORT[,...]",
-            help="Receive the sensors' UDP datagrams at this address of this machine, such as "
-            "192.168.1.10:9000; 0.0.0.0 is all of its addresses.",
-        ),
-        click.option(
-            "--connect",
-            metavar="HOST:PORT[,...]",
-            help="Connect to the sensors over TCP, such as 192.168.1.21:7000, in the order of --port.",
-        ),
-        click.option(
-            "--ble",
-            metavar="ADDRESS[,...]",
-            help="Connect to these Movella DOT sensors over Bluetooth, such as D4:22:CD:00:12:34, in the "
-            "order of --port. Needs edgepose[ble].",
-        ),
-        click.option(
-            "--hid",
-            metavar="NAME[,NAME...]",
-            help="USB receivers of the trackers, by serial number or path as edgepose devices lists them, or "
-            "slimevr for the only one. Needs pip install 'edgepose[hid]'.",
-        ),
+        *_network_flags(),
         click.option(
             "--file",
             type=click.Path(path_type=Path),

@@ -1,8 +1,9 @@
-"""SlimeVR's USB receivers. hidapi itself reads ptys that it takes for them, see `tests.support.hid_devices`."""
+"""SlimeVR's USB receivers: hidapi reads ptys that it takes for them, see `tests.support.hid_devices`."""
 
 import os
 import re
 import sys
+from pathlib import Path
 
 import hidraw
 import pytest
@@ -137,7 +138,11 @@ def test_what_hidapi_lists():
         ("slimevr", tracker, "slimevr: no such receiver; plugged in: 77"),
         ("slimevr", found, "slimevr: 2 receivers: 77, A1B2C3D4E5F60718; name the one to read from"),
         ("78", found, "78: no such receiver; plugged in: 77, A1B2C3D4E5F60718"),
-        (LISTED["serial_number"], twins, "2 receivers: /dev/hidraw0, /dev/hidraw1; name the one to read from"),
+        (
+            LISTED["serial_number"],
+            twins,
+            "2 receivers: /dev/hidraw0, /dev/hidraw1; name the one to read from",
+        ),
     ):
         with pytest.raises(DeviceError, match=message):
             path_of(name, among)
@@ -155,7 +160,7 @@ def test_receivers_that_cannot_be_opened(tmp_path):
             pass
 
     with Receiver(tmp_path / "receiver") as receiver:
-        os.chmod(receiver.port.name, 0)
+        Path(receiver.port.name).chmod(0)
         with pytest.raises(DeviceError) as error:
             with_hid_devices(open_without_permission)
     assert "receiver: no permission to open it; join the group dialout" in str(error.value)
