@@ -28,7 +28,7 @@ def test_words_codes_and_streams_are_the_same(tmp_path):
 
 
 def test_it_can_be_killed():
-    command = [sys.executable, "-m", "edgepose", "convert", "-", "--to", "csv"]
+    command = [sys.executable, "-m", "edgepose", "check", "--file", "-"]
     with processes.Popen(command, stdin=subprocess.PIPE) as process:
         assert process.poll() is None
         process.send_signal(signal.SIGKILL)

@@ -343,8 +343,8 @@ def test_page_of_a_bvh_file(command, tmp_path):
         ("nothing.csv", 1, "cannot read poses from nothing.csv"),
         ("a.csv --out no/a.html", 1, "its folder does not exist"),
         ("a.csv --out a.csv", 2, "--out would overwrite a.csv"),
-        ("a.csv --height 17", 1, "height 17 m is not between"),
-        ("a.csv --leg-length 17", 1, "leg length 17 m does not fit a height of 1.75 m"),
+        ("a.csv --height 17", 2, "17.0 is not in the range 0.8<=x<=2.5 metres"),
+        ("a.csv --leg-length 1.4", 1, "leg length 1.4 m does not fit a height of 1.75 m"),
     ],
 )
 def test_wrong_use(command, tmp_path, words, code, says):

@@ -189,8 +189,8 @@ def test_bones_of_the_wearer(command, tmp_path):
     body = default_body(1.5, leg_length_m=0.75)
     np.testing.assert_allclose(tree.offsets[order][1:] / 100, body.offsets[1:], atol=1e-6)
     result = command("convert", tmp_path / "a.csv", "--to", "bvh", "--out", out, "--height", 150)
-    assert result.returncode == 1
-    assert result.stderr.startswith("edgepose: height 150 m is not between")
+    assert result.returncode == 2
+    assert "'--height': 150.0 is not in the range 0.8<=x<=2.5 metres" in result.stderr
 
 
 @pytest.mark.parametrize("where", [False, True])

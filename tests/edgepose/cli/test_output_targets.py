@@ -331,7 +331,7 @@ def test_full_disk(case):
         (["--osc", "127.255.255.255:39539"], "127.255.255.255"),
         (["--tcp", "192.0.2.1:8888"], "cannot listen for viewers"),
         (["--bvh", "nowhere/a.bvh"], "its folder does not exist"),
-        (["--height", "17"], "height 17"),
+        (["--leg-length", "1.4"], "leg length 1.4 m does not fit"),
         (["--model", "nosuch"], "no such model"),
     ],
 )

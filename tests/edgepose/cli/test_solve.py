@@ -264,7 +264,7 @@ def test_one_frame_is_solved(command, wearer, tmp_path):
         (("--csv", "-", "--weights", "speed=1"), "is not NAME=NUMBER"),
         (("--csv", "-", "--weights", "acc=-1"), "is not NAME=NUMBER"),
         (("--csv", "-", "--body", "me.pkl", "--height", "1.8"), "a body from a file has its own shape"),
-        (("--csv", "-", "--body", "me.pkl", "--leg-length", "0"), "a body from a file has its own shape"),
+        (("--csv", "-", "--body", "me.pkl", "--leg-length", "0.9"), "a body from a file has its own shape"),
     ],
 )
 def test_wrong_use(command, wearer, tmp_path, words, message):

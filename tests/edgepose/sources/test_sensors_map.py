@@ -71,7 +71,7 @@ def test_two_hubs_and_a_bus(read):
     ]
     assert "--bitrate (now 1000000)" in found[2].check[0]
     assert [protocol.name for protocol in found[2].protocols] == ["native-can"]
-    given = "--port, --can, --listen, --connect and --ble: a, virtual:x"
+    given = "--port, --can, --listen, --connect, --ble and --hid: a, virtual:x"
     with pytest.raises(EdgeposeError, match=f"left_lower_leg: b is not one of the lines given with {given}"):
         line_specs("a", None, "virtual:x", None, False, "auto", rig)
 
