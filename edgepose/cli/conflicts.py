@@ -19,7 +19,13 @@ if TYPE_CHECKING:
     from edgepose.config import WearerConfig
     from edgepose.sources.sensor_map import SensorMap
 
-_KINDS = {"bytes": "port", "frames": "bus", "datagrams": "address", "reports": "receiver"}
+_KINDS = {
+    "bytes": "port",
+    "frames": "bus",
+    "datagrams": "address",
+    "notifications": "address",
+    "reports": "receiver",
+}
 """Names of lines by the unit of their data."""
 
 _SHARED = ("bus", "receiver")

@@ -704,7 +704,7 @@ def test_a_recording_at_its_own_pace_says_how_late_it_is_taken(tmp_path, kind):
 
 def test_options():
     for options in ({"port": "a", "file": "b.csv"}, {"can": "a:b", "file": "b.csv"}):
-        with pytest.raises(EdgeposeError, match="--connect or --ble, or --file"):
+        with pytest.raises(EdgeposeError, match="--connect, --ble or --hid, or --file"):
             open_source(**options)
     with pytest.raises(EdgeposeError, match="--connect, --ble or --file"):
         open_source()
