@@ -1,7 +1,7 @@
 """Measures speed on this machine, and writes the tables and the picture of the pages about speed.
 
 \b
-    chrt -r 5 python tools/refresh_benchmarks.py           # about ten minutes; run nothing else meanwhile
+    python tools/refresh_benchmarks.py                     # eight minutes; run nothing else meanwhile
     python tools/refresh_benchmarks.py --from speed.json   # write the pages from earlier measurements
 
 Runs `edgepose bench`, bench_sizes.py and bench_wearers.py, keeps their figures in one file, and writes the
