@@ -693,7 +693,7 @@ def main(
         raise click.UsageError("give --udp or --tcp, not both")
     if ble and (protocol != "dot" or udp or tcp):
         raise click.UsageError("--ble is for --protocol dot, without --udp and --tcp")
-    if wire_format.transport == "udp" and not udp and not ble:
+    if wire_format.transport in ("udp", "hid") and not udp and not ble:
         raise click.UsageError(f"{protocol} needs --udp HOST:PORT")
     if corrupt and wire_format.transport == "can":
         raise click.UsageError("CAN controllers drop frames with wrong bits; use --loss")

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from edgepose.cli.commands.run import run
+from edgepose.sources.hid_receiver import RULE
 
 BOARD = Path(__file__).parents[2] / "examples" / "board"
 UNIT, RULES = BOARD / "edgepose.service", BOARD / "60-edgepose.rules"
@@ -37,7 +38,8 @@ def test_the_unit_starts_a_command_that_exists():
 
 def test_every_rule_is_a_list_of_matches_and_settings():
     rules = [line for line in RULES.read_text().splitlines() if line and not line.startswith("#")]
-    assert len(rules) == 2
+    assert len(rules) == 3
+    assert RULE in rules
     for rule in rules:
         parts = [re.fullmatch(r'([A-Z]+(?:\{\w+\})?)(==|\+?=)"([^"]+)"', part) for part in rule.split(", ")]
         assert all(parts), rule
