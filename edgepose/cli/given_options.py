@@ -22,7 +22,7 @@ def check_given(command: click.Command, ctx: click.Context, arguments: Sequence[
     Raises:
         click.UsageError: an option or a value is wrong in this way, or the arguments cannot be parsed.
     """
-    values, _, given = command.make_parser(ctx).parse_args(list(arguments))
+    values, rest, given = command.make_parser(ctx).parse_args(list(arguments))
     for parameter in given:
         value = values.get(str(parameter.name))
         if "" in (value if isinstance(value, list | tuple) else [value]):
@@ -34,3 +34,7 @@ def check_given(command: click.Command, ctx: click.Context, arguments: Sequence[
             continue
         if count > 1 and not parameter.multiple:
             raise click.UsageError(f"{parameter.opts[0]} is given {count} times, but only once counts", ctx)
+    if isinstance(command, click.Group) and rest:
+        inner = command.get_command(ctx, rest[0])
+        if inner is not None:
+            check_given(inner, click.Context(inner, info_name=rest[0], parent=ctx), rest[1:])

@@ -12,6 +12,7 @@ import pytest
         (("calibrate", "--port", "a", "--port", "b"), "--port"),
         (("convert", "a.csv", "--to", "npz", "--to=csv"), "--to"),
         (("train", "--config", "a", "--config", "a"), "--config"),
+        (("bench", "orientation", "--data", "a", "--data", "b"), "--data"),
     ],
 )
 def test_an_option_twice(command, tmp_path, words, flag):
@@ -29,6 +30,7 @@ def test_an_option_twice(command, tmp_path, words, flag):
         (("run", "--file", "a.npz", "--csv", "a.csv", "--csv="), "--csv"),
         (("view", ""), "POSES"),
         (("calibrate", "--file", ""), "--file"),
+        (("bench", "orientation", "--data", ""), "--data"),
     ],
 )
 def test_an_empty_value_is_no_folder(command, tmp_path, words, name):
