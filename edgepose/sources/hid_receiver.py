@@ -60,6 +60,11 @@ class Receiver(NamedTuple):
         """The name that stays the same wherever it is plugged in, if there is one."""
         return self.serial_number or self.path
 
+    @property
+    def names(self) -> tuple[str, str]:
+        """The names by which it can be chosen."""
+        return self.serial_number, self.path
+
 
 def hidapi() -> Any:
     """Import hidapi.
@@ -90,14 +95,19 @@ def receivers_among(devices: Iterable[Mapping[str, Any]]) -> list[Receiver]:
     found = {
         Receiver(
             os.fsdecode(each["path"]),
-            each["serial_number"] or "",
-            each["product_string"] or "",
+            _one_line(each["serial_number"]),
+            _one_line(each["product_string"]),
             each["product_id"],
         )
         for each in devices
         if each["vendor_id"] == VENDOR and each["product_id"] in (RECEIVER, TRACKER)
     }
     return sorted(found, key=lambda receiver: (receiver.name, receiver.path))
+
+
+def _one_line(text: str | None) -> str:
+    """Return a text of a device, which may hold anything, without line breaks and spaces around words."""
+    return " ".join((text or "").split())
 
 
 def path_of(name: str, found: Sequence[Receiver]) -> str:
@@ -113,7 +123,7 @@ def path_of(name: str, found: Sequence[Receiver]) -> str:
     if name == ANY:
         fitting = [each for each in found if each.product_id == RECEIVER]
     else:
-        fitting = [each for each in found if name in (each.serial_number, each.path)]
+        fitting = [each for each in found if name in each.names]
         if not fitting and "/" in name:  # a link to it, which udev has made
             return name
     if not fitting:

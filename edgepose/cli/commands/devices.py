@@ -14,11 +14,12 @@ from edgepose.cli.terminal.messages import say, show
 from edgepose.errors import ConfigError, EdgeposeError
 
 if TYPE_CHECKING:
+    from edgepose.sources.hid_receiver import Receiver
     from edgepose.sources.probe import ProbeResult
 
 
 @click.command()
-@click.argument("names", nargs=-1, metavar="[PORT|INTERFACE:CHANNEL]...")
+@click.argument("names", nargs=-1, metavar="[PORT|INTERFACE:CHANNEL|RECEIVER]...")
 @click.option(
     "--probe",
     is_flag=True,
@@ -80,9 +81,14 @@ def _show_bluetooth(lines: _Lines) -> None:
 
 
 def _show_local(lines: _Lines, names: tuple[str, ...], probe: bool) -> None:
-    """Show the named ports and buses, or all."""
-    ports = dict.fromkeys((name for name in names if not _is_bus(name)), "") if names else _ports()
-    buses = [name for name in names if _is_bus(name)] if names else None
+    """Show the named ports, buses and receivers, or all."""
+    from edgepose.sources.hid_receiver import ANY
+
+    receivers = _receivers(ANY in names)
+    of_receivers = {ANY, *(word for each in receivers or () for word in each.names)}
+    others = [name for name in names if name not in of_receivers]
+    ports = dict.fromkeys((name for name in others if not _is_bus(name)), "") if names else _ports()
+    buses = [name for name in others if _is_bus(name)] if names else None
     if ports or not names:
         lines.begin("ports", "Serial ports (edgepose run --port NAME):", max(map(len, ports), default=0))
         for name, description in ports.items():
@@ -102,24 +108,33 @@ def _show_local(lines: _Lines, names: tuple[str, ...], probe: bool) -> None:
         for name in buses:
             lines.add(name, "", _probe_bus if probe else None)
         lines.end("none found; adapters on a serial port are named slcan:PORT")
-    if not names:
-        _show_receivers(lines, probe)
+    named = of_receivers.intersection(names)
+    if receivers is not None and (named or not names):
+        _show_receivers(lines, [each for each in receivers if not named or named & {ANY, *each.names}], probe)
+        if named and not receivers:
+            lines.add_missing(ANY, "no receiver is plugged in")
+        lines.end("none found")
 
 
-def _show_receivers(lines: _Lines, probe: bool) -> None:
-    """Show the USB receivers, if hidapi is installed."""
+def _receivers(needed: bool) -> list[Receiver] | None:
+    """Return the USB receivers; None if hidapi is missing, unless it is needed."""
     from edgepose.sources.hid_receiver import receivers
 
     try:
-        found = receivers()
+        return receivers()
     except ConfigError:
-        return
-    names = [receiver.name for receiver in found]
-    lines.begin("receivers", "USB receivers (edgepose run --hid NAME):", max(map(len, names), default=0))
+        if needed:
+            raise
+        return None
+
+
+def _show_receivers(lines: _Lines, found: list[Receiver], probe: bool) -> None:
+    """Show USB receivers."""
+    width = max((len(receiver.name) for receiver in found), default=0)
+    lines.begin("receivers", "USB receivers (edgepose run --hid NAME):", width)
     for receiver in found:
         description = "  ".join(dict.fromkeys((receiver.product, receiver.path)))
         lines.add(receiver.name, description, _probe_receiver if probe else None)
-    lines.end("none found")
 
 
 _KINDS = ("ports", "buses", "listen", "connect", "ble", "receivers")

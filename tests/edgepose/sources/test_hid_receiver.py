@@ -133,6 +133,8 @@ def test_what_hidapi_lists():
     assert path_of("slimevr", found[1:] + tracker) == "/dev/hidraw0"
     assert path_of("77", tracker) == "/dev/hidraw1"
     twins = receivers_among([LISTED, LISTED | {"path": b"/dev/hidraw1"}])
+    hostile = receivers_among([LISTED | {"serial_number": " 7\n8 ", "product_string": "A\r\n\nB"}])
+    assert (hostile[0].name, hostile[0].product) == ("7 8", "A B")
     for name, among, message in (
         ("slimevr", [], "slimevr: no receiver is plugged in"),
         ("slimevr", tracker, "slimevr: no such receiver; plugged in: 77"),
@@ -166,6 +168,17 @@ def test_receivers_that_cannot_be_opened(tmp_path):
     assert "receiver: no permission to open it; join the group dialout" in str(error.value)
     assert str(error.value).endswith(RULE)
     assert "\n" not in str(error.value)
+
+
+def test_devices_knows_the_names_of_receivers(command):
+    result = command("devices", "slimevr", os.devnull)
+    assert result.stdout.splitlines() == [
+        "Serial ports (edgepose run --port NAME):",
+        f"  {os.devnull}",
+        "USB receivers (edgepose run --hid NAME):",
+        "  slimevr  no receiver is plugged in",
+    ]
+    assert (result.returncode, result.stderr) == (1, "edgepose: cannot listen to slimevr\n")
 
 
 def test_without_hidapi(monkeypatch):
