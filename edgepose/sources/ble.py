@@ -121,6 +121,7 @@ class DotSensor:
         client = BleakClient(self._address, self._on_disconnect, timeout=FIND_S)
         async with _radio.connecting:
             await client.connect()
+        self._lost = not client.is_connected  # bleak reports attempts of its own that it repeats, too
         try:
             await asyncio.wait_for(self._start(client), FIND_S)
         except BaseException:
