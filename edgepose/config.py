@@ -20,6 +20,7 @@ from edgepose.sinks.output_files import check_output
 from edgepose.sinks.receivers import check_receivers
 from edgepose.sinks.registry import SINKS
 from edgepose.skeleton import DEFAULT_HEIGHT, Body, check_measures, default_body
+from edgepose.sources import LINES
 from edgepose.sources.protocol_detection import checked_protocol
 from edgepose.utils.output_targets import is_stream
 from edgepose.utils.similar_names import choices
@@ -90,7 +91,7 @@ class SourceConfig:
     @property
     def lines(self) -> tuple[str | None, ...]:
         """Names of the live lines, by kind."""
-        return self.port, self.can, self.listen, self.connect, self.ble, self.hid
+        return tuple(getattr(self, kind) for kind in LINES)
 
     @property
     def name(self) -> str:

@@ -48,6 +48,12 @@ Batches = Generator[Batch, None, None]
 POLL_S = 0.02
 """Longest time between two batches of a live source, seconds."""
 
+LINES = ("port", "can", "listen", "connect", "ble", "hid")
+"""Kinds of live lines: the names of their flags, and of their keys in sensor maps."""
+
+LINE_FLAGS = "--port, --can, --listen, --connect, --ble or --hid"
+"""The flags, for messages."""
+
 
 class SourceCounters(NamedTuple):
     """Counts of the packets received so far.
@@ -165,7 +171,7 @@ def open_source(
         EdgeposeError: no input or more than one; an unknown protocol or kind of file; an invalid map.
     """
     if file is not None and any(name is not None for name in (port, can, listen, connect, ble, hid)):
-        raise EdgeposeError("give one input: --port, --can, --listen, --connect, --ble or --hid, or --file")
+        raise EdgeposeError(f"give one input: {LINE_FLAGS}, or --file")
     # Imported only here: each kind of input has dependencies of its own.
     from edgepose.sources.sensor_map import read_map
 

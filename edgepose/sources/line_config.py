@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple
 
 from edgepose.errors import ConfigError
+from edgepose.sources import LINE_FLAGS
 from edgepose.sources.line_decoder import PlacementById
 from edgepose.sources.line_reader import LineSpec, Transport
 from edgepose.sources.protocol_detection import candidate_protocols
@@ -22,7 +23,6 @@ BITRATE = 500_000
 
 QUEUE = 512
 """Number of arrivals from a socket that may wait: most of a second of the packets of six sensors."""
-
 
 DOT = "dot"
 """Name of the protocol of Movella DOT sensors."""
@@ -86,7 +86,7 @@ def line_specs(
         _check_map(sensor_map, lines)
     count = len(lines.all)
     if not count:
-        raise ConfigError("give one input: --port, --can, --listen, --connect, --ble, --hid or --file")
+        raise ConfigError(f"give one input: {LINE_FLAGS}, or --file")
     for bus in lines.can:
         if ":" not in bus:
             raise ConfigError(f"{bus}: give --can as INTERFACE:CHANNEL, such as socketcan:can0")
@@ -127,7 +127,7 @@ def _check_map(sensor_map: SensorMap, lines: Lines) -> None:
         if device.line is not None and device.line not in known:
             raise ConfigError(
                 f"{sensor_map.path}: {name}: {device.name} is not one of the lines given "
-                f"with --port, --can, --listen, --connect, --ble and --hid: {', '.join(lines.all)}"
+                f"with {LINE_FLAGS}: {', '.join(lines.all)}"
             )
         if device.sender is not None and not lines.listen:
             raise ConfigError(

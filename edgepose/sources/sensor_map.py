@@ -11,13 +11,12 @@ from typing import Any, NamedTuple
 
 from edgepose.errors import ConfigError
 from edgepose.placements import PLACEMENTS, ROOT, SENSORS
+from edgepose.sources import LINES
 from edgepose.sources.line_decoder import PlacementById
 from edgepose.utils.similar_names import choices
 from edgepose.utils.text_files import read_toml
+from edgepose.utils.toml_values import TEXT, WHOLE, checked_value
 from firmware_protocols.registry import Protocol
-
-LINES = ("port", "can", "listen", "connect", "ble", "hid")
-"""Keys that name a line."""
 
 _DIRECTION = "(left|right|up|down|forward|back)"
 _MOUNTING = re.compile(f"x {_DIRECTION}, z {_DIRECTION}")
@@ -207,20 +206,15 @@ def _same(device: Device, other: Device) -> bool:
 
 
 def _device(where: str, entry: object) -> Device:
-    table = _table(where, entry, Device._fields)
+    table = _table(where, entry, dict.fromkeys(Device._fields, TEXT) | {"id": WHOLE})
     device = Device(**table)
-    for key in (*LINES, "sender", "mounting"):
-        _check_type(where, table, key, str, "text in quotes")
-    _check_type(where, table, "id", int, "a whole number")
     if device.id is not None and device.id < 0:
         raise ConfigError(f"{where}: id must be 0 or more, not {device.id}")
     given = [key for key in LINES if getattr(device, key) is not None]
     if given[1:]:
         raise ConfigError(f"{where}: give {' or '.join(given)}, not both")
     if not given and device.id is None and device.sender is None:
-        raise ConfigError(
-            f"{where}: no device named; give its port, can, listen, connect, ble, hid, sender or id"
-        )
+        raise ConfigError(f"{where}: no device named; give its {', '.join(LINES)}, sender or id")
     if device.sender is not None:
         if given not in ([], ["listen"]):
             raise ConfigError(f"{where}: sender is for datagrams; it does not go with {given[0]}")
@@ -248,24 +242,17 @@ def _sender(where: str, text: str) -> str:
 
 
 def _port(where: str, entry: object) -> PortSettings:
-    table = _table(where, entry, PortSettings._fields)
-    _check_type(where, table, "protocol", str, "text in quotes")
-    _check_type(where, table, "baud", int, "a whole number")
+    table = _table(where, entry, {"protocol": TEXT, "baud": WHOLE})
     if table.get("baud", 1) < 1:
         raise ConfigError(f"{where}: baud must be 1 or more, not {table['baud']}")
     return PortSettings(**table)
 
 
-def _table(where: str, entry: object, keys: tuple[str, ...]) -> dict[str, Any]:
+def _table(where: str, entry: object, keys: Mapping[str, str]) -> dict[str, Any]:
+    """Return a table whose values have the types of their keys, see `checked_value`."""
     if not isinstance(entry, dict):
         raise ConfigError(f'{where}: must be a table, such as  {{ port = "/dev/ttyUSB0" }}')
     for key in entry:
         if key not in keys:
             raise ConfigError(f"{where}: unknown key {key!r}; {choices(key, keys, 'keys are')}")
-    return entry
-
-
-def _check_type(where: str, table: Mapping[str, Any], key: str, kind: type, what: str) -> None:
-    # A bool is an int to isinstance.
-    if key in table and type(table[key]) is not kind:
-        raise ConfigError(f"{where}: {key} must be {what}, not {table[key]!r}")
+    return {key: checked_value(f"{where}: {key}", value, keys[key]) for key, value in entry.items()}

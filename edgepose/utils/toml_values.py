@@ -21,17 +21,20 @@ def checked_value(key: str, value: object, what: str) -> Any:
         what: `TEXT`, `SWITCH`, `WHOLE`, `NUMBER` or `TEXTS`.
 
     Raises:
-        ConfigError: the value has another type, or is a text that is empty or has NUL characters.
+        ConfigError: the value has another type, is a text that is empty or has NUL characters, or a number
+            too large for a float.
     """
-    several = what == TEXTS and isinstance(value, list)
-    for item in value if several and isinstance(value, list) else [value]:
+    for item in value if what == TEXTS and isinstance(value, list) else [value]:
         if type(item) not in _TYPES.get(what, (str,)):  # not isinstance, to which a bool is an int
             raise ConfigError(f"{key} must be {what}, not {value!r}")
         if item == "":
             raise ConfigError(f"{key} is empty: give a value, or leave it out")
         if isinstance(item, str) and "\0" in item:
             raise ConfigError(f"{key} must be text without NUL characters, not {item!r}")
-    return float(value) if what == NUMBER and isinstance(value, int | float) else value
+    try:
+        return float(value) if what == NUMBER and isinstance(value, int | float) else value
+    except OverflowError:
+        raise ConfigError(f"{key} is too large for a number") from None
 
 
 def texts_by_name(key: str, value: object) -> dict[str, Any]:

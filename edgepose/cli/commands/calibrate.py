@@ -43,6 +43,7 @@ from edgepose.errors import EdgeposeError
 from edgepose.orientation.stage import OrientationStage
 from edgepose.placements import PLACEMENTS
 from edgepose.sinks.output_files import check_output
+from edgepose.sources import LINE_FLAGS
 from edgepose.sources.sensor_map import SensorMap, read_map
 from edgepose.utils.similar_names import choices
 
@@ -51,8 +52,6 @@ PAGE_PORT = 8090
 
 _RESETS = ("live", "motion", "steps", "mounting")
 """Ways to reset headings that are no file."""
-
-_LINES = "--port, --can, --listen, --connect, --ble or --hid"
 
 
 def _body_frame(ctx: click.Context, param: click.Parameter, value: str | None) -> str | None:
@@ -322,10 +321,11 @@ def _check_use(source: SourceConfig, plan: CalibrationPlan, page: tuple[str, int
         flag = "--motion" if plan.start is None else "--from"
         raise click.UsageError(f"{flag} needs a recording that is read at once: --file without --realtime")
     if page is not None and not source.live:
-        raise click.UsageError(f"--page guides a wearer in front of live sensors: give {_LINES}")
+        raise click.UsageError(f"--page guides a wearer in front of live sensors: give {LINE_FLAGS}")
     if plan.heading_reset == "live" and not source.live:
         raise click.UsageError(
-            f"--heading-reset live needs {_LINES}; give a recording of the sensors lying side by side instead"
+            f"--heading-reset live needs {LINE_FLAGS}; give a recording of the sensors lying side by side "
+            "instead"
         )
     moves = plan.heading_reset in ("motion", "steps")
     if plan.motion is not None and not moves:

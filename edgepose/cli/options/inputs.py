@@ -9,7 +9,9 @@ from typing import Any
 
 import click
 
-_SOURCES = ("file", "port", "can", "listen", "connect", "ble", "hid")
+from edgepose.sources import LINES
+
+_SOURCES = ("file", *LINES)
 
 _ARGUMENT: dict[str, Any] = {
     "nargs": -1,

@@ -117,6 +117,7 @@ def test_addresses_and_lines_are_read_as_flags(rig):
         ({"baud": True}, "baud must be a whole number, not True"),
         ({"baud": 0}, "baud: 0 is not in the range x>=1"),
         ({"height": "tall"}, "height must be a number, not 'tall'"),
+        ({"height": 10**400}, "height is too large for a number"),
         ({"height": 175}, "height 175 m is not between 0.8 and 2.5 m"),
         ({"leg-length": 85}, "leg length 85 m is not between 0.3 and 1.5 m"),
         ({"csv": ""}, "csv is empty: give a value, or leave it out"),

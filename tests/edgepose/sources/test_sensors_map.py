@@ -71,7 +71,7 @@ def test_two_hubs_and_a_bus(read):
     ]
     assert "--bitrate (now 1000000)" in found[2].check[0]
     assert [protocol.name for protocol in found[2].protocols] == ["native-can"]
-    given = "--port, --can, --listen, --connect, --ble and --hid: a, virtual:x"
+    given = "--port, --can, --listen, --connect, --ble or --hid: a, virtual:x"
     with pytest.raises(EdgeposeError, match=f"left_lower_leg: b is not one of the lines given with {given}"):
         line_specs("a", None, "virtual:x", None, False, "auto", rig)
 
@@ -100,6 +100,8 @@ def test_two_hubs_and_a_bus(read):
         ("ports = 1\n" + IDS, "ports must be tables"),
         (IDS + "\n[ports.a]\nspeed = 1", r"ports\.a: unknown key 'speed'; keys are protocol, baud"),
         (IDS + "\n[ports.a]\nbaud = 0", r"ports\.a: baud must be 1 or more"),
+        (PORTS.replace("/dev/ttyUSB1", ""), "right_forearm: port is empty: give a value, or leave it out"),
+        (PORTS.replace("USB1", "\\u0000"), "right_forearm: port must be text without NUL characters"),
         (IDS + "\n[ports.a]\nprotocol = 7", r"ports\.a: protocol must be text"),
     ],
 )  # fmt: skip
