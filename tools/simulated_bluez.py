@@ -27,6 +27,9 @@ _UUID = "1517{}-4947-11e9-8646-d663bd873d93".format
 ADVERTISE_S = 0.1
 """Time between two advertisements of a device, seconds."""
 
+ABORT_S = 0.05
+"""Time from the error about an aborted connection to its end, seconds."""
+
 Interfaces = dict[str, dict[str, Any]]
 
 
@@ -40,6 +43,7 @@ class SimulatedDot:
         in_range: whether the adapter sees it.
         connected: whether a program is connected to it.
         notifies: whether a program has subscribed to its long payloads.
+        aborts: number of next connections that BlueZ gives up at once, as under radio interference.
     """
 
     def __init__(self, address: str, name: str = "Movella DOT", *, measures: bool = True) -> None:
@@ -48,6 +52,7 @@ class SimulatedDot:
         self.path = f"{ADAPTER}/dev_{address.replace(':', '_')}"
         self.messages: list[bytes] = []
         self.in_range, self.connected, self.notifies = True, False, False
+        self.aborts = 0
 
     @property
     def measuring(self) -> bool:
@@ -278,8 +283,13 @@ class SimulatedBluez:
         if call.member == "Connect":
             if not dot.in_range:
                 raise _Failed("org.bluez.Error.Failed", "br-connection-create-socket")
-            dot.connected = True
             self._changed(dot.path, "org.bluez.Device1", {"Connected": ("b", True)})
+            if dot.aborts:
+                dot.aborts -= 1
+                after = (dot.path, "org.bluez.Device1", {"Connected": ("b", False)})
+                self._loop.call_later(ABORT_S, self._changed, *after)
+                raise _Failed("org.bluez.Error.Failed", "le-connection-abort-by-local")
+            dot.connected = True
             return lambda: self._resolve(dot)
         if call.member == "Disconnect":
             return lambda: self._disconnect(dot, dot.in_range)
