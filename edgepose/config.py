@@ -74,7 +74,7 @@ class SourceConfig:
         lines = any(name is not None for name in self.lines)
         for name, line in (("baud", "port"), ("bitrate", "can"), ("fd", "can")):
             value = getattr(self, name)
-            if name != "fd" and value is not None and value < 1:
+            if name != "fd" and value is not None and not value >= 1:  # NaN, too
                 raise ConfigError(f"{name}: {value} is not in the range x>=1")
             if value and getattr(self, line) is None and (lines or self.file is not None):
                 raise ConfigError(f"--{name} is for --{line}")

@@ -124,7 +124,7 @@ def path_of(name: str, found: Sequence[Receiver]) -> str:
         fitting = [each for each in found if each.product_id == RECEIVER]
     else:
         fitting = [each for each in found if name in each.names]
-        if not fitting and "/" in name:  # a link to it, which udev has made
+        if not fitting and "/" in name and "\0" not in name:  # a link to it, which udev has made
             return name
     if not fitting:
         raise DeviceError(f"{name}: {_missing('receiver', found)}")

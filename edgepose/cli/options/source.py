@@ -97,7 +97,7 @@ def _network_flags() -> list[Callable[[Callable[..., Any]], Callable[..., Any]]]
             "--hid",
             metavar="NAME[,NAME...]",
             help="USB receivers of the trackers, by serial number or path as edgepose devices lists them, or "
-            "slimevr for the only one. Needs pip install 'edgepose[hid]'.",
+            "slimevr for the only one. Needs edgepose[hid].",
         ),
     ]
 

@@ -139,6 +139,7 @@ def test_what_hidapi_lists():
         ("slimevr", [], "slimevr: no receiver is plugged in"),
         ("slimevr", tracker, "slimevr: no such receiver; plugged in: 77"),
         ("slimevr", found, "slimevr: 2 receivers: 77, A1B2C3D4E5F60718; name the one to read from"),
+        ("/dev/\0", [], "no receiver is plugged in"),
         ("78", found, "78: no such receiver; plugged in: 77, A1B2C3D4E5F60718"),
         (
             LISTED["serial_number"],
