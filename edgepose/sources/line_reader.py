@@ -74,11 +74,11 @@ class LineSpec(NamedTuple):
         open: opens it.
         protocols: wire formats that the line may use.
         placements: the line's map from ids to placements, once the protocol is known.
-        unit: "bytes", "frames" or "datagrams", for messages.
+        unit: "bytes", "frames", "datagrams", "notifications" or "reports", for messages.
         check: advice for the user if no data comes, and if none of it can be decoded.
         senders: for sockets, the maps of `placements` by sender; None for lines without senders.
-        most_waiting: number of arrivals from which on the rest stays in the system's buffer. Only sockets
-            have a limit: no other line can be flooded faster than it is decoded.
+        most_waiting: number of arrivals from which on the rest stays in the system's buffer. Only lines of
+            the network and of Bluetooth have a limit: no other can be flooded faster than it is decoded.
     """
 
     name: str

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import os
 import socket
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -29,9 +28,8 @@ def failure_text(error: OSError | UnicodeError, host: str) -> str:
     """Return the reason why a host cannot be found, listened on or sent to."""
     if getattr(error, "errno", None) == errno.EINVAL and ":" in host and "%" not in host:
         return f"it needs the network interface by which it is reached, such as {host}%eth0"
-    if isinstance(error, OSError) and error.errno is not None and error.errno > 0:
-        return os.strerror(error.errno)  # its own text has the address again, if a server could not be made
-    return str(getattr(error, "strerror", None) or error)
+    # socket.create_server adds the address, which the message has anyway.
+    return str(getattr(error, "strerror", None) or error).partition(" (while attempting")[0]
 
 
 def bound_socket(host: str, port: int) -> socket.socket:
