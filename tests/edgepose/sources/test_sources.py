@@ -706,7 +706,7 @@ def test_options():
     for options in ({"port": "a", "file": "b.csv"}, {"can": "a:b", "file": "b.csv"}):
         with pytest.raises(EdgeposeError, match="--connect, --ble or --hid, or --file"):
             open_source(**options)
-    with pytest.raises(EdgeposeError, match="--connect, --ble, --hid or --file"):
+    with pytest.raises(EdgeposeError, match="--ble or --hid, or --file"):
         open_source()
     for options in ({"port": "a"}, {"can": "virtual:a"}, {"file": "a.csv"}):
         with pytest.raises(EdgeposeError, match="unknown protocol 'x'; known are auto, native, "):
