@@ -25,7 +25,8 @@ HEADING_LIMITS_DEG = np.array([60.0 if "forearm" in name else 30.0 for name in P
 SLIP_DEG = 30.0
 """Tilt from which on a sensor has slipped if all others fit the pose."""
 
-_FEWEST = 4
+FEWEST = 4
+"""Fewest sensors of a rig that judge each other."""
 
 _MOST_TURNED_DEG = np.array([100.0, 100.0, 30.0, 30.0, 90.0, 30.0])
 """The same for headings: a head looks aside, forearms twist."""
@@ -165,7 +166,7 @@ def telling(worn: Sequence[str]) -> set[str]:
     """
     forearms = set(PLACEMENTS[:2])
     names = set(worn) & set(PLACEMENTS)
-    if len(names) < _FEWEST or not names & forearms:
+    if len(names) < FEWEST or not names & forearms:
         return set()
     return names if names >= forearms else names - forearms
 

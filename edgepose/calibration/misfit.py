@@ -79,14 +79,15 @@ class MisfitDetector:
             self._frames.append(frame)
             while self._frames[0].time_s < frame.time_s - REST_S:
                 self._frames.popleft()
-        lines = self._check_slips(frame, bones)
+        complete = not (True in frame.held.tolist() and (frame.held & self._worn).any())
+        lines = self._check_slips(frame, bones) if complete else []
         if frame.time_s < self._next_s:
             return lines
         self._next_s = frame.time_s + _EVERY_S
         passed_s = frame.time_s - self._start_s
         lines += self._check_bones(frame, bones)
-        pair = self._same_limb.update(frame.time_s, frame.orientation, frame.held | ~self._worn)
-        lines += [] if pair is None else [f"warning: {' and '.join(pair)} {SAME_LIMB}"]
+        if complete and (pair := self._same_limb.update(frame.time_s, frame.orientation, ~self._worn)):
+            lines.append(f"warning: {' and '.join(pair)} {SAME_LIMB}")
         if not self._compared and passed_s >= COMPARE_S:
             lines += self._comparison()
         if self._looking:
@@ -103,8 +104,6 @@ class MisfitDetector:
         return [f"warning: {line}" for line in self._compare()]
 
     def _check_slips(self, frame: ImuFrame, bones: Array) -> list[str]:
-        if True in frame.held.tolist() and (frame.held & self._worn).any():
-            return []
         found = self._slip_monitor.update(frame.time_s, bones)
         if not found or self._swapped:
             return []

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgepose import rotations as rot
+from edgepose.calibration.fit import FEWEST
 from edgepose.placements import PLACEMENTS
 from edgepose.rotations import Array
 
@@ -38,26 +39,26 @@ class SameLimb:
         self._first: Array | None = None  # the same, when each pair began to move as one
         self._steps = dict.fromkeys(combinations(range(len(PLACEMENTS)), 2), 0)
 
-    def update(self, time_s: float, orientation: Array, held: NDArray[np.bool_]) -> tuple[str, str] | None:
+    def update(self, time_s: float, orientation: Array, missing: NDArray[np.bool_]) -> tuple[str, str] | None:
         """Return the two sensors that are now found to sit on one limb; None if none are.
 
         Args:
-            time_s: time of a frame, seconds.
+            time_s: time of a frame in which no sensor of the rig is held, seconds.
             orientation: (6, 4) unit quaternions, sensor to inertial.
-            held: (6,) sensors that sent nothing new, or that the rig lacks.
+            missing: (6,) sensors that the rig lacks; too few of the others are not judged.
         """
         if time_s < self._next_s:
             return None
         self._next_s = time_s + STEP_S - 1e-6
         now, before = _against_each_other(orientation), self._before
         self._before = now
-        if before is None or np.count_nonzero(~held) < 3:
+        if before is None or np.count_nonzero(~missing) < FEWEST:
             return None
         if self._first is None:
             self._first = now.copy()
-        turned = (_angles_deg(now, self._first) > RIGID_DEG) | held | held[:, None]
+        turned = (_angles_deg(now, self._first) > RIGID_DEG) | missing | missing[:, None]
         self._first[turned] = now[turned]
-        moved = (_angles_deg(now, before) > MOVED_DEG) | held  # against a silent sensor nothing shows
+        moved = (_angles_deg(now, before) > MOVED_DEG) | missing  # against a missing sensor nothing shows
         still = np.count_nonzero(~moved, axis=1) - ~moved.diagonal()  # against how many each did not turn
         for i, j in self._steps:
             if turned[i, j]:

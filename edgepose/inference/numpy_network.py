@@ -247,8 +247,8 @@ class Birnn(NumpyNetwork):
     def _oldest(self, state: State, count: int) -> tuple[Results, State]:
         """Return the results for the `count` oldest waiting frames, and the state without them.
 
-        Each pose uses as many frames behind its own. Forward states carry over; the backward pass of each
-        frame starts afresh at the last frame it uses.
+        Of W waiting frames, each pose uses the W - count behind its own. Forward states carry over; the
+        backward pass of each frame starts afresh at the last frame it uses.
         """
         batch = len(state[0])
         back = self._cells["backward1"].run(_fields(state[4], count))[0]

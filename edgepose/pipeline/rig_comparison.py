@@ -62,7 +62,7 @@ def _not_judged(calibration: Calibration) -> list[str]:
     worn = [name for name in PLACEMENTS if name not in calibration.without]
     judged = telling(worn)
     hidden = [name for name in worn if name not in judged]
-    parts = [f"a slip of {'any' if not judged else ', '.join(hidden)} does not show"] if hidden else []
+    parts = [f"a slip of {', '.join(hidden)} does not show" if judged else "no slip shows"] if hidden else []
     if not calibration.north and not any(name.endswith("forearm") for name in worn):
         parts.append("without a forearm, the straight pose does not correct drift")
     return parts

@@ -39,7 +39,8 @@ class SensorState(NamedTuple):
     Attributes:
         quat: unit quaternion w, x, y, z, sensor to inertial.
         is_held: its last sample is too old, or there is none: `quat` is a repetition.
-        arrival_s: time on the source's clock at which the newest sample that counts came, seconds.
+        arrival_s: time on the source's clock at which the newest sample that counts came, seconds; -inf if
+            the sensor is held.
         last_force: specific force of its last sample, m/s^2.
         entries: samples from which the force is computed, oldest first; empty if there is nothing new.
     """

@@ -134,10 +134,10 @@ class Ground:
             ground = min(ground, 0.0)
         parts = NEVER_BELOW[2:] if standing else NEVER_BELOW
         depth = ground + self.height_of(points, parts) - position[1]
-        way = _limited(max(depth, -self._lifted), dt)
-        position[1] += way
+        rise = _limited(max(depth, -self._lifted), dt)
+        position[1] += rise
         upright = min(points[0][1], points[1][1]) < -_UPRIGHT * self._scale
-        self._lifted = 0.0 if upright else self._lifted + way
+        self._lifted = 0.0 if upright else self._lifted + rise
 
     def _settle(self, foot: _Foot, height: float, below: float) -> None:
         """Put a foot that has come to rest on the ground.
@@ -154,6 +154,6 @@ class Ground:
             foot.settled, foot.ground = True, height
 
 
-def _limited(way: float, dt: float) -> float:
+def _limited(correction: float, dt: float) -> float:
     """Return a correction, metres, that is not faster than `_RISE`."""
-    return min(max(way, -_RISE * dt), _RISE * dt)
+    return min(max(correction, -_RISE * dt), _RISE * dt)

@@ -377,3 +377,16 @@ def test_two_sensors_on_one_limb(calibrated):
         assert [line.split(" move ")[0] for line in found] == (
             ["warning: left_lower_leg and right_lower_leg"] if shared else []
         )
+
+
+def test_two_still_limbs_are_not_one_limb_while_others_are_unknown(calibrated):
+    """Someone who stands and works: the pelvis, which is silent, would turn with neither leg."""
+    made, rng = load_calibration(calibrated), np.random.default_rng(0)
+    turns = rng.normal(scale=0.4, size=(120, 6, 3))
+    turns[:, 2:4] = 0.0
+    held = np.isin(PLACEMENTS, ["pelvis"])
+    detector, lines = MisfitDetector(made), []
+    for k, quats in enumerate(rot.matrix_to_quat(rot.rotvec_to_matrix(turns))):
+        frame = ImuFrame(k, k / 2.0, quats, np.zeros((6, 3)), held, k / 2.0)
+        lines += detector.update(frame, POSES["straight"])
+    assert not [line for line in lines if "one limb" in line]
