@@ -34,6 +34,8 @@ _LOWER = 0.01
 _UPSET = 0.15
 """A foot higher above the lowest point of the body does not stand, metres; only without contacts."""
 _PELVIS = CONTACTS.index("pelvis")
+_MOST_SQUARES = 100.0
+"""Largest sum of the squares of a pose's matrices that is taken for one of 24 rotations, which is 72."""
 
 
 class Place(NamedTuple):
@@ -71,8 +73,8 @@ class PlaceTracker:
     def update(self, time_s: float, rotations: Input, place: Input | None) -> Place:
         """Return the place in the next frame.
 
-        A frame with a time or rotations that are not finite leaves the place as it is; a `place` that is not
-        finite counts as None.
+        A frame with a time that is not finite, or matrices that are not rotations but NaN or far too large,
+        leaves the place as it is; a `place` that is not finite counts as None.
 
         Args:
             time_s: time of the frame, seconds, later than that of the frame before.
@@ -82,8 +84,8 @@ class PlaceTracker:
         numbers: list[float] | None = None if place is None else place.tolist()
         if numbers is not None and not math.isfinite(sum(numbers)):
             place = numbers = None
-        # A square is finite if all numbers are, and none is huge.
-        if math.isfinite(np.vdot(rotations, rotations)) and math.isfinite(time_s):
+        # NaN compares false, and products of larger numbers along the body might not be finite.
+        if np.vdot(rotations, rotations) < _MOST_SQUARES and math.isfinite(time_s):
             self._follow(time_s, self._points.positions(rotations), rotations[0], numbers)
         contacts = None if place is None else np.asarray(place[: len(CONTACTS)], np.float32)
         return Place(np.array(self._position), contacts)

@@ -325,6 +325,14 @@ def test_no_input_makes_the_wearer_leave_or_vanish(frames):
 def test_rotations_that_are_not_finite_leave_the_wearer_in_place(joint, number):
     pose = STRAIGHT.copy()
     pose[joint] = number
+    stays_in_place(pose)
+
+
+def test_matrices_whose_products_are_not_finite_leave_the_wearer_in_place():
+    stays_in_place(STRAIGHT * 1e60)
+
+
+def stays_in_place(pose: np.ndarray) -> None:
     tracker = PlaceTracker(BODY)
     tracker.update(0.0, STRAIGHT, ON_FEET)
     tracker.update(1.0 / RATE, pose, ON_FEET)
