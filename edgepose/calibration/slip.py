@@ -107,6 +107,8 @@ class SlipMonitor:
             time_s: time of a frame in which no sensor of the rig is held, seconds.
             bones: (6, 3, 3) its bones, R_TB, in the order of PLACEMENTS.
         """
+        if not self._windows:
+            return []  # a rig too small to judge its sensors, or all of them are reported
         if self._from_s is None or not 0.0 <= time_s - self._from_s < 2.0 * WINDOW_S:
             self._begin(time_s)
         elif time_s - self._from_s >= WINDOW_S:

@@ -167,3 +167,11 @@ def test_one_forearm_without_the_other_may_be_at_work(walked):
     assert [slip.placement for slip in slips(bones_of(made, working))] == ["right_forearm"]
     monitor = SlipMonitor(north=True, without=["left_forearm"])
     assert not [s for k, now in enumerate(bones_of(made, working)) for s in monitor.update(k / RATE, now)]
+
+
+def test_a_rig_too_small_to_judge_its_sensors_reports_none():
+    """Nothing else shows the heading of the only sensor on trunk and legs."""
+    monitor = SlipMonitor(north=True, without=["left_lower_leg", "right_lower_leg", "head"])
+    bones = cal.POSES["straight"].copy()
+    bones[0] = bones[0] @ rot.rotation_about_axis("x", np.radians(60.0))
+    assert not [slip for k in range(1000) for slip in monitor.update(k / RATE, bones)]
