@@ -101,6 +101,11 @@ def mean_rotation(quats: ArrayLike) -> Array:
     return mean if mean[0] >= 0 else -mean
 
 
+def angle_between_quats(a: Array, b: Array) -> Array:
+    """Angles (...) between unit quaternions (..., 4), from 0 to pi."""
+    return np.asarray(2.0 * np.arccos(np.minimum(np.abs(np.sum(a * b, axis=-1)), 1.0)))
+
+
 def yaw_of_quat(q: ArrayLike) -> Array:
     """Angle (...) of the rotation about Z, up, in unit quaternions (..., 4) (swing-twist decomposition)."""
     q = np.asarray(q, float)

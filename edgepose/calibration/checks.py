@@ -168,16 +168,11 @@ def _alternating_in_motion(quat: Array) -> float | None:
     if len(quat) <= _EARLIER[-1]:
         return None
     now = quat[_EARLIER[-1] :]
-    apart = [_angles_between(quat[_EARLIER[-1] - k : len(quat) - k], now) for k in (1, *_EARLIER)]
+    apart = [rot.angle_between_quats(quat[_EARLIER[-1] - k : len(quat) - k], now) for k in (1, *_EARLIER)]
     jumps = (apart[0] > math.radians(2.0 * SPREAD_LIMIT_DEG)) & (np.min(apart[1:], axis=0) < apart[0] / 4.0)
     if np.count_nonzero(jumps) < max(4, len(now) / 2):
         return None
     return math.degrees(float(np.median(apart[0][jumps])))
-
-
-def _angles_between(one: Array, other: Array) -> Array:
-    """Return the rotation angles (n,) between unit quaternions (n, 4), radians."""
-    return 2.0 * np.arccos(np.clip(np.abs(np.sum(one * other, axis=-1)), 0.0, 1.0))
 
 
 def _movement(s: SensorHold, quat: Array, spread: float) -> str | None:

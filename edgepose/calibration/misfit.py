@@ -129,7 +129,7 @@ class MisfitDetector:
 
     def _check_pose(self, passed_s: float) -> list[str]:
         worn, newest = self._worn, self._frames[-1].orientation
-        lasts = self._rest is not None and _angles_deg(self._rest, newest)[worn].max() < REST_DEG
+        lasts = self._rest is not None and _turned_deg(self._rest, newest, worn) < REST_DEG
         rest = None if lasts else _rest(self._frames, worn)
         if rest is not None:
             self._rest = rest
@@ -170,13 +170,13 @@ def _rest(frames: deque[ImuFrame], worn: NDArray[np.bool_]) -> Array | None:
     if silent or frames[-1].time_s - frames[0].time_s < REST_S - _EVERY_S:
         return None
     # A cheap check that catches most motion.
-    if _angles_deg(frames[0].orientation, frames[-1].orientation)[worn].max() > REST_DEG:
+    if _turned_deg(frames[0].orientation, frames[-1].orientation, worn) > REST_DEG:
         return None
     orientation = np.stack([frame.orientation for frame in frames])
     mean = np.stack([rot.mean_rotation(quats) for quats in orientation.swapaxes(0, 1)])
-    return mean if _angles_deg(mean, orientation)[:, worn].max() < REST_DEG else None
+    return mean if _turned_deg(mean, orientation, worn) < REST_DEG else None
 
 
-def _angles_deg(one: Array, other: Array) -> Array:
-    """Angles between unit quaternions (..., 4), degrees."""
-    return np.degrees(2.0 * np.arccos(np.clip(np.abs(np.sum(one * other, axis=-1)), 0.0, 1.0)))
+def _turned_deg(one: Array, other: Array, worn: NDArray[np.bool_]) -> float:
+    """Return the largest angle, degrees, between orientations (..., 6, 4) of the worn sensors."""
+    return float(np.degrees(rot.angle_between_quats(one, other)[..., worn].max()))

@@ -56,9 +56,11 @@ class SameLimb:
             return None
         if self._first is None:
             self._first = now.copy()
-        turned = (_angles_deg(now, self._first) > RIGID_DEG) | missing | missing[:, None]
+        turned = np.degrees(rot.angle_between_quats(now, self._first)) > RIGID_DEG
+        turned |= missing | missing[:, None]
         self._first[turned] = now[turned]
-        moved = (_angles_deg(now, before) > MOVED_DEG) | missing  # against a missing sensor nothing shows
+        moved = np.degrees(rot.angle_between_quats(now, before)) > MOVED_DEG
+        moved |= missing  # against a missing sensor nothing shows
         still = np.count_nonzero(~moved, axis=1) - ~moved.diagonal()  # against how many each did not turn
         for i, j in self._steps:
             if turned[i, j]:
@@ -74,7 +76,3 @@ class SameLimb:
 def _against_each_other(orientation: Array) -> Array:
     """Return unit quaternions (6, 6, 4) from the second sensor to the first."""
     return rot.quat_multiply(rot.quat_conjugate(orientation)[:, None], orientation[None])
-
-
-def _angles_deg(one: Array, other: Array) -> Array:
-    return np.asarray(np.degrees(2.0 * np.arccos(np.minimum(np.abs(np.sum(one * other, axis=-1)), 1.0))))

@@ -115,8 +115,8 @@ def _stands(sensors: Hold) -> Iterator[tuple[float, float]]:
         # Rounded sums may lie after the last sample.
         rows = [np.searchsorted(s.time_s, t).clip(max=len(s.time_s) - 1) for t in (grid, grid + _TURN_S)]
         one, other = s.quat[rows[0]], s.quat[rows[1]]
-        turned = 2.0 * np.arccos(np.clip(np.abs(np.sum(one * other, axis=1)), 0.0, 1.0))
-        still &= np.degrees(turned) < (_HEAD_STILL_DEG if name == "head" else _STILL_DEG)
+        turned = np.degrees(rot.angle_between_quats(one, other))
+        still &= turned < (_HEAD_STILL_DEG if name == "head" else _STILL_DEG)
     edges = np.flatnonzero(np.diff(still.astype(int), prepend=0, append=0)).reshape(-1, 2)
     for begin, end in edges:
         # The edges of the samples are no edges of the stand.

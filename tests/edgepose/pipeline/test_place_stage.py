@@ -140,7 +140,7 @@ def parts(samples: list[ImuSample], size: int) -> Iterator[list[ImuSample]]:
 
 
 def test_several_wearers_have_a_place_each(wearer, tiny):
-    """Of one body and one recording, one is put back to the origin on the walked."""
+    """Of one body and one recording, one is put back to the origin on the way."""
     shape = NetworkShape("rnn", 8, "global-6d", "passed", place=True)
     asked = iter([[]] * 100 + [[0.0]])
     stages = [PlaceStage(BODY), PlaceStage(BODY, lambda: next(asked, []))]
