@@ -29,7 +29,7 @@ from edgepose.skeleton import Body, default_body
 
 Array = NDArray[np.float64]
 
-WAYS_M = (3.0, 7.0)
+DISTANCES_M = (3.0, 7.0)
 """Lengths of the windows of a path in which its error is measured, metres."""
 
 
@@ -38,7 +38,7 @@ def place_errors(found: Array, true: Array) -> dict[str, Array]:
     steps = np.linalg.norm(np.diff(true[:, [0, 2]], axis=0), axis=1)
     distance, error = np.concatenate([[0.0], np.cumsum(steps)]), found - true
     columns = {}
-    for length in WAYS_M:
+    for length in DISTANCES_M:
         ends = np.searchsorted(distance, distance + length)
         starts = np.flatnonzero(ends < len(distance))[::10]
         moved = (error[ends[starts]] - error[starts])[:, [0, 2]]

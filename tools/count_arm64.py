@@ -77,18 +77,8 @@ class Computer(NamedTuple):
             "OPENBLAS_NUM_THREADS": "1",
             "OMP_NUM_THREADS": "1",
         }
-        command = [
-            "taskset",
-            "-c",
-            core,
-            "qemu-aarch64",
-            "-L",
-            str(self.root),
-            "-cpu",
-            self.cpu,
-            "-U",
-            "OPENBLAS_CORETYPE",
-        ]
+        command = ["taskset", "-c", core, "qemu-aarch64", "-L", str(self.root), "-cpu", self.cpu]
+        command += ["-U", "OPENBLAS_CORETYPE"]
         command += ["-plugin", f"{self.plugin},out={counts},call={CALLS[call]}"]
         command += [word for name, value in variables.items() for word in ("-E", f"{name}={value}")]
         return [*command, str(self.root / "usr/bin" / packages.parent.name)]
@@ -140,10 +130,7 @@ def memory_mb(process: int) -> float:
     for line in Path(f"/proc/{process}/smaps").read_text().splitlines():
         if re.match(r"[0-9a-f]+-[0-9a-f]+ ", line):
             _, access, _, _, _, *name = line.split(maxsplit=5)
-            own = "".join(name)
-            counts = access != "rwxp" and not own.startswith(
-                ("[", "/usr/bin/qemu", "/usr/lib/x86_64-linux-gnu")
-            )
+            counts = access != "rwxp" and not "".join(name).startswith(OWN)
         elif counts and line.startswith("Rss:"):
             total += int(line.split()[1])
     return total / 1024

@@ -10,7 +10,7 @@ With --vmc4b the BVH file is the avatar: an armature in its rest pose, whose bon
 avatar, for example from `edgepose run --realtime --osc 127.0.0.1:39539`. The picture is drawn 3 s after the
 last message.
 
-Both print the heights of the pelvis and of the lowest joint of the feet, and the way on the ground, metres.
+Both print the heights of the pelvis and of the lowest joint of the feet, and how far the wearer came, metres.
 """
 
 from __future__ import annotations
@@ -119,21 +119,21 @@ def material(name: str, colour: tuple[float, float, float]) -> bpy.types.Materia
 
 def stick(start: Vector, end: Vector, radius: float, colour: bpy.types.Material) -> None:
     """Add a cylinder with a ball at its start."""
-    way = end - start
-    if way.length > 1e-4:
+    axis = end - start
+    if axis.length > 1e-4:
         bpy.ops.mesh.primitive_cylinder_add(
-            radius=radius, depth=way.length, location=(start + end) / 2, vertices=16
+            radius=radius, depth=axis.length, location=(start + end) / 2, vertices=16
         )
         made = bpy.context.object
         made.rotation_mode = "QUATERNION"
-        made.rotation_quaternion = Vector((0.0, 0.0, 1.0)).rotation_difference(way)
+        made.rotation_quaternion = Vector((0.0, 0.0, 1.0)).rotation_difference(axis)
         made.data.materials.append(colour)
     bpy.ops.mesh.primitive_uv_sphere_add(radius=radius, location=start, segments=16, ring_count=8)
     bpy.context.object.data.materials.append(colour)
 
 
 def draw(rows: np.ndarray, poses: list[Sticks], out: Path) -> None:
-    """Draw poses and the path of the root on a floor, seen from the side of the way."""
+    """Draw poses and the path of the root on a floor, seen from the side."""
     colours = {side: material(side, colour) for side, colour in COLOURS.items()}
     for pose in poses:
         for name, ends in pose.items():
@@ -201,8 +201,10 @@ def main() -> None:
         rows, poses = from_vmc4b(armature, given.vmc4b, given.at)
     else:
         rows, poses = from_file(armature, given.at)
-    way = np.linalg.norm(rows[:, :2] - rows[0, :2], axis=1)
-    print(f"Blender {bpy.app.version_string}: {len(rows)} poses, farthest {way.max():.2f} m from the start")
+    away_m = np.linalg.norm(rows[:, :2] - rows[0, :2], axis=1)
+    print(
+        f"Blender {bpy.app.version_string}: {len(rows)} poses, farthest {away_m.max():.2f} m from the start"
+    )
     print(f"height of the pelvis {rows[:, 2].min():.3f} to {rows[:, 2].max():.3f} m")
     print(f"height of the lowest joint of the feet {rows[:, 3].min():.3f} to {rows[:, 3].max():.3f} m")
     for second, pose in zip(given.at, poses, strict=False):

@@ -28,7 +28,7 @@ NEAREST_M, FURTHEST_M = 0.7, 7.0
 """Distances from the camera at which a figure is too near or too far to be seen."""
 
 GLIDE = 0.08
-"""Share of the way to the figure that a camera moves for each pose while it catches up."""
+"""Share of the distance to the figure that a camera moves for each pose while it catches up."""
 
 CATCHES_UP, FOLLOWS, STAYS = "catches up", "follows", "stays"
 

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import click
+import msgspec
 import numpy as np
 import pytest
 import viser
@@ -31,7 +32,7 @@ from edgepose.config import OutputConfig
 from edgepose.errors import ConfigError, EdgeposeError
 from edgepose.formats.poses.registry import read_poses
 from edgepose.pipeline.remote_control import Requests
-from edgepose.pose import CONTACTS, PoseFrame, held_sensors, parse_status
+from edgepose.pose import CONTACTS, PoseFrame, PoseSequence, held_sensors, parse_status
 from edgepose.sinks.bvh import BvhSink
 from edgepose.sinks.csv import CsvSink
 from edgepose.sinks.open import open_outputs
@@ -322,6 +323,37 @@ def test_where_cameras_go():
     np.testing.assert_allclose(wanted_shift(np.array([3.0, 0.95, -2.0])), [3.0, 0.0, -2.0])
     np.testing.assert_allclose(wanted_shift(np.array([0.0, 0.5, 0.0])), 0.0)
     np.testing.assert_allclose(wanted_shift(np.array([0.0, -1.7, 0.0])), [0.0, -2.0, 0.0], atol=1e-12)
+
+
+def test_a_camera_arrives_while_one_pose_is_shown():
+    """As after a jump on a time line that is stopped: the second pose is shown until the test ends."""
+    camera = {
+        "type": "ViewerCameraMessage",
+        "wxyz": (0, 1, 0, 0),
+        "position": (0, 1, 3),
+        "look_at": (0, 1, 0),
+        "up_direction": (0, 1, 0),
+        **{"fov": 1.0, "near": 0.1, "far": 100.0, "image_height": 500, "image_width": 800},
+    }
+    still = np.tile(np.eye(3), (3, 24, 1, 1))
+    places = np.array([[0.0, 0.95, 0.0], [9.0, 0.95, 0.0], [9.0, 0.95, 0.0]])
+    times = np.array([0.0, 0.02, 1000.0])
+    poses = PoseSequence(np.arange(3), times, still, places, [frozenset()] * 3, [False] * 3)
+    with (
+        contextlib.closing(Viewer("127.0.0.1", free_port(), default_body(), next_free=True)) as viewer,
+        connect(
+            f"ws://127.0.0.1:{viewer.port}",
+            subprotocols=[f"viser-v{viser.__version__}"],
+            max_size=None,
+            max_queue=None,  # or closing would wait for the messages that are not read
+        ) as line,
+    ):
+        line.send(msgspec.msgpack.encode(camera))
+        until(viewer._server.get_clients, "the page")
+        [page] = viewer._server.get_clients().values()
+        end_s = time.monotonic() + 60
+        viewer.play(poses, None, lambda: page.camera.position[0] > 8 or time.monotonic() > end_s)
+        assert page.camera.position[0] > 8
 
 
 class Camera(NamedTuple):
