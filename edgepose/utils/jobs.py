@@ -71,8 +71,8 @@ def run_in_order(work: Callable[[JobT], ResultT], jobs: Sequence[JobT], workers:
         return
     with _submitted(work, jobs, workers) as futures:
         try:
-            for future in futures:
-                yield future.result()
+            while futures:  # without keeping the results, which may be large
+                yield futures.pop(0).result()
         except BrokenProcessPool as error:
             raise EdgeposeError(f"a {_KILLED}") from error
 
