@@ -14,7 +14,7 @@ from edgepose.rotations import matrix_to_quat, quat_to_rotvec
 from edgepose.skeleton import JOINTS
 
 _KEPT = 16
-"""Poses that are kept; each wearer needs the newest one."""
+"""Poses that are kept: few, because a pose goes to all outputs of its wearer before the next one comes."""
 
 _TEXT = ",".join(["%.6f"] * 3 * len(JOINTS))
 
