@@ -134,6 +134,11 @@ class Protocol:
     page: str = ""
 
     @property
+    def in_datagrams(self) -> bool:
+        """Whether packets come whole, in datagrams or in transfers of a USB receiver."""
+        return self.transport in ("udp", "hid")
+
+    @property
     def wrap_us(self) -> int:
         """Sample times restart at 0 after this many microseconds."""
         return self.decoder().WRAP_US

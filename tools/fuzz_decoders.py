@@ -206,7 +206,7 @@ class Feeder:
         self.fed = 0
         self.slowest_us = 0.0
         self._decoder: Decoder = protocol.decoder()
-        self._datagrams = protocol.transport == "udp"
+        self._datagrams = protocol.in_datagrams
         self._rng = rng
 
     def feed(self, pieces: list[Any]) -> list[Sample]:

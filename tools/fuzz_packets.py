@@ -246,7 +246,7 @@ def sources(protocol: Protocol, pieces: list[Any]) -> list[Any]:
     """Return contents of byte packets, or CAN frames: those of the encoder, and those of real captures."""
     if protocol.transport == "can":
         return [frame for frames in pieces for frame in frames]
-    if protocol.transport == "udp":
+    if protocol.in_datagrams:
         return [piece[0] for piece in pieces]
     framing = FRAMINGS.get(protocol.name, UNPROTECTED)
     whole = [packet for piece in pieces for packet in packets(framing, piece[0])]
@@ -282,7 +282,7 @@ def batches(
         else:
             contents = (change(rng, content) if is_damaged else content for content, is_damaged in batch)
             packets = list(map(framing.packet, contents))
-            yield damaged, [(p,) for p in packets] if protocol.transport == "udp" else [(b"".join(packets),)]
+            yield damaged, [(p,) for p in packets] if protocol.in_datagrams else [(b"".join(packets),)]
 
 
 def fuzz_packets(protocol: Protocol, pieces: list[Any], count: int, seed: int) -> Report:

@@ -215,7 +215,7 @@ def pose_kinds(folder: Path, recording: Path, run: Run) -> Iterator[Kind]:
 def wire_kinds(folder: Path, recording: Recording) -> Iterator[Kind]:
     """Yield captures and logs of all protocols, and logs of all kinds."""
     for name, protocol in PROTOCOLS.items():
-        if protocol.transport == "udp":  # no file holds datagrams
+        if protocol.in_datagrams:  # no file holds datagrams
             continue
         (folder / f"{name}.toml").write_text(id_map(line_ids(protocol)))
         sensors = f" --sensors {{seeds}}/{name}.toml"
