@@ -383,7 +383,7 @@ def test_kill_at_ten_instants(name, wearer, files, tmp_path):
         processes.run(command, check=True, capture_output=True)
         took_s = min(took_s, time.monotonic() - start_s)
     new = 0
-    for instant in np.linspace(0.05, 1.1, 10):
+    for instant in np.linspace(0.0, 1.1, 10):
         out.write_bytes(OLD)
         process = processes.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         time.sleep(instant * took_s)
